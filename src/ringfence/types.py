@@ -1,0 +1,105 @@
+"""The nouns of the library, with every shape.
+
+Axis letters everywhere: B batch, E episodes, T time, H plan horizon, N agents, O observation, S global state,
+D feature, A action, K diffusion steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+
+Array = jax.Array
+Key = jax.Array
+PyTree = Any
+Metrics = dict[str, Array]
+
+
+class Transition(NamedTuple):
+    """What one environment step gives, for a batch of environments."""
+
+    reward: Array  # (B, N) per agent; the team's reward is the mean over N
+    cost: Array  # (B,) shared; 0 means nothing dangerous happened
+    terminated: Array  # (B,) bool: the task itself ended; the time limit is never a termination
+
+
+@runtime_checkable
+class Env(Protocol):
+    """A batched simulator. States are pytrees with a leading B axis; all methods are pure and may be jitted."""
+
+    n_agents: int
+    action_dim: int
+    episode_length: int
+
+    def reset(self, key: Key, batch: int) -> PyTree: ...
+
+    def step(self, state: PyTree, action: Array) -> tuple[PyTree, Transition]:
+        """Advance by one step; `action` is (B, N, A) in the bounds of the task and is clipped to them."""
+        ...
+
+    def observe(self, state: PyTree) -> Array:
+        """(B, N, O) local observations."""
+        ...
+
+    def global_state(self, state: PyTree) -> Array:
+        """(B, S) what a centralised planner may see."""
+        ...
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What an algorithm must know of a task and its data; travels with every checkpoint."""
+
+    task: str
+    n_agents: int
+    action_dim: int
+    feature_names: tuple[str, ...]  # the entries of s̃_i, in order
+    action_low: float
+    action_high: float
+    episode_length: int
+
+    @property
+    def feature_dim(self) -> int:
+        return len(self.feature_names)
+
+
+class Batch(NamedTuple):
+    """Windows of data, in physical units."""
+
+    features: Array  # (B, H, N, D) s̃_i at t .. t+H-1; the tail past the episode's end repeats the last state
+    actions: Array  # (B, H-1, N, A) the action between rows h and h+1 (0 where padded)
+    valid: Array  # (B, H) bool: the row is a real state of the episode
+    rewards: Array  # (B, H-1) team reward of the transition h -> h+1 (0 where padded)
+    returns: Array  # (B,) normal score of the return-to-go among the data at the same time step
+    togo: Array  # (B, H) discounted return-to-go of every row, in units of its standard deviation (0 where padded)
+    time: Array  # (B,) time step of the first row
+
+
+class PolicyStep(NamedTuple):
+    """A joint action and what led to it."""
+
+    action: Array  # (B, N, A)
+    info: dict[str, Array]  # e.g. `clearance` (B,), `plan` (B, H, N, D), `plans` (B, P, H, N, D), `chosen` (B,)
+
+
+class Policy(Protocol):
+    """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history)."""
+
+    def start(self, batch: int) -> PyTree: ...
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]: ...
+
+
+@dataclass(frozen=True)
+class Algorithm:
+    """An algorithm is a value: a name, a typed config and three pure functions."""
+
+    name: str
+    Config: type
+    init: Callable[..., PyTree]  # (key, spec, config, data) -> state
+    update: Callable[..., tuple[PyTree, Metrics]]  # (state, batch, key) -> state, metrics; jit-, scan- and vmap-safe
+    policy: Callable[..., Policy]  # (state, config, spec, ...) -> Policy; normaliser statistics are inside
+    presets: dict[str, dict[str, Any]]  # named differences from the config's defaults
