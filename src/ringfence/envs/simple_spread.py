@@ -16,6 +16,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.types import Array, Key, Transition
@@ -175,5 +176,5 @@ def in_contact(position: Array) -> Array:
 def _others(pairs: Array) -> Array:
     """(..., N, N, F) -> (..., N, N-1, F): drop the diagonal, keeping the order of the others."""
     n = pairs.shape[-2]
-    index = jnp.array([[j for j in range(n) if j != i] for i in range(n)], dtype=int).reshape(n, n - 1)
-    return jnp.take_along_axis(pairs, index[..., None], axis=-2)
+    rows, columns = np.nonzero(~np.eye(n, dtype=bool))
+    return pairs[..., rows, columns, :].reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
