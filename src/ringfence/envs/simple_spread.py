@@ -93,13 +93,24 @@ class SimpleSpread:
 
     def step(self, state: SpreadState, action: Array) -> tuple[SpreadState, Transition]:
         """One step of 0.1 s; `action` (B, N, 2) in [-1, 1] is clipped. Reward and cost are read after the step."""
-        force = SENSITIVITY * jnp.clip(action, -1.0, 1.0) + contact_force(state.position)
-        velocity = (1.0 - DAMPING) * state.velocity + DT * force
-        moving = velocity if self.integrator == "velocity_first" else state.velocity
-        after = SpreadState(state.position + DT * moving, velocity, state.landmarks)
-        touching = in_contact(after.position)
-        never = jnp.zeros(after.position.shape[0], bool)
-        return after, Transition(self._reward(after, touching), self._cost(touching), never)
+        # Inside, x and y are separate arrays with the batch last: the compiler then vectorises over environments,
+        # several times faster than over the two coordinates (measured at N=3 and N=24).
+        x, y = _planes(state.position)
+        vx, vy = _planes(state.velocity)
+        ux, uy = _planes(jnp.clip(action, -1.0, 1.0))
+        push_x, push_y = _repulsion(x, y)
+        after_vx = (1.0 - DAMPING) * vx + DT * (SENSITIVITY * ux + push_x)
+        after_vy = (1.0 - DAMPING) * vy + DT * (SENSITIVITY * uy + push_y)
+        if self.integrator == "velocity_first":
+            vx, vy = after_vx, after_vy
+        x, y = x + DT * vx, y + DT * vy
+        touching = _touching(x, y)
+        after = SpreadState(_joined(x, y), _joined(after_vx, after_vy), state.landmarks)
+        return after, Transition(
+            reward=jnp.moveaxis(self._reward(x, y, *_planes(state.landmarks), touching), 0, -1),
+            cost=self._cost(touching),
+            terminated=jnp.zeros(state.position.shape[:-2], bool),
+        )
 
     def observe(self, state: SpreadState) -> Array:
         """(B, N, 4 + 2N + 4(N-1)): own velocity, own position, landmarks and others relative to self, silence."""
@@ -137,40 +148,66 @@ class SimpleSpread:
         landmarks = relative.reshape(*relative.shape[:-1], n, 2) + position[..., 0:1, :]
         return SpreadState(position, observations[..., 0:2], landmarks)
 
-    def _reward(self, state: SpreadState, touching: Array) -> Array:
-        gaps = jnp.linalg.norm(state.position[..., :, None, :] - state.landmarks[..., None, :, :], axis=-1)
-        nearest = gaps.min(axis=-2)  # (B, landmarks)
-        hits = touching.sum(-1)  # (B, N)
+    def _reward(self, x: Array, y: Array, landmark_x: Array, landmark_y: Array, touching: Array) -> Array:
+        """(N, B) from coordinates (N, B) and contacts (N, N, B)."""
+        dx, dy = x[:, None] - landmark_x, y[:, None] - landmark_y  # (agents, landmarks, B)
+        nearest = jnp.sqrt((dx**2 + dy**2).min(0))  # (landmarks, B)
+        hits = touching.sum(0).astype(nearest.dtype)
         if self.reward == "omar":
-            return jnp.minimum(1.0 / jnp.maximum(nearest, 1e-9), 10.0).sum(-1, keepdims=True) - 5.0 * hits
+            return jnp.minimum(1.0 / jnp.maximum(nearest, 1e-9), 10.0).sum(0) - 5.0 * hits
         if self.reward == "pettingzoo":
-            return -0.5 * nearest.sum(-1, keepdims=True) - 0.5 * hits
-        return jnp.broadcast_to(-nearest.mean(-1, keepdims=True), hits.shape)
+            return -0.5 * nearest.sum(0) - 0.5 * hits
+        return jnp.broadcast_to(-nearest.mean(0), hits.shape)
 
     def _cost(self, touching: Array) -> Array:
+        """(B,) float32 from contacts (N, N, B)."""
         if self.cost == "any":
-            return touching.any((-1, -2)).astype(jnp.float32)
+            return touching.any((0, 1)).astype(jnp.float32)
         if self.cost == "pairs":
-            return touching.sum((-1, -2)) / 2.0
-        return touching.any(-1).sum(-1).astype(jnp.float32)
+            return touching.sum((0, 1)).astype(jnp.float32) / 2.0
+        return touching.any(0).sum(0).astype(jnp.float32)
 
 
 def contact_force(position: Array) -> Array:
-    """(B, N, 2) soft repulsion between overlapping agents."""
-    offset = position[..., :, None, :] - position[..., None, :, :]  # from j to i
-    squared = (offset**2).sum(-1)
-    apart = squared > 0
-    distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
-    overlap = jnp.logaddexp(0.0, -(distance - CONTACT_DISTANCE) / CONTACT_MARGIN) * CONTACT_MARGIN
-    push = jnp.where(apart, CONTACT_FORCE * overlap / distance, 0.0)
-    return (push[..., None] * offset).sum(-2)
+    """(..., N, 2) soft repulsion between overlapping agents at `position` (..., N, 2)."""
+    return _joined(*_repulsion(*_planes(position)))
 
 
 def in_contact(position: Array) -> Array:
-    """(B, N, N) bool: centres nearer than 0.30, the diagonal excluded."""
-    offset = position[..., :, None, :] - position[..., None, :, :]
-    near = jnp.linalg.norm(offset, axis=-1) < CONTACT_DISTANCE
-    return near & ~jnp.eye(position.shape[-2], dtype=bool)
+    """(..., N, N) bool: centres nearer than 0.30, the diagonal excluded; `position` is (..., N, 2)."""
+    return jnp.moveaxis(_touching(*_planes(position)), (0, 1), (-2, -1))
+
+
+def _planes(vectors: Array) -> tuple[Array, Array]:
+    """(..., N, 2) -> x and y, each (N, ...)."""
+    return jnp.moveaxis(vectors[..., 0], -1, 0), jnp.moveaxis(vectors[..., 1], -1, 0)
+
+
+def _joined(x: Array, y: Array) -> Array:
+    """Inverse of `_planes`."""
+    return jnp.stack([jnp.moveaxis(x, 0, -1), jnp.moveaxis(y, 0, -1)], axis=-1)
+
+
+def _repulsion(x: Array, y: Array) -> tuple[Array, Array]:
+    """Contact force on every agent, x and y, each (N, ...). All N^2 ordered pairs: half of them are redundant, but
+    the whole fuses into one compact loop for any N."""
+    dx, dy = x[:, None] - x, y[:, None] - y  # [i, j] points from j to i
+    squared = dx**2 + dy**2
+    apart = squared > 0  # an agent and itself, or two agents at the very same point, have no direction to push in
+    distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
+    depth = (CONTACT_DISTANCE - distance) / CONTACT_MARGIN
+    # softplus in the form that cannot overflow, without the NaN handling of logaddexp
+    overlap = CONTACT_MARGIN * (jnp.maximum(depth, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(depth))))
+    push = jnp.where(apart, CONTACT_FORCE * overlap / distance, 0.0)
+    return (push * dx).sum(1), (push * dy).sum(1)
+
+
+def _touching(x: Array, y: Array) -> Array:
+    """(N, N, ...) bool from coordinates (N, ...)."""
+    n = x.shape[0]
+    distance = jnp.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
+    itself = np.eye(n, dtype=bool).reshape(n, n, *[1] * (x.ndim - 1))
+    return (distance < CONTACT_DISTANCE) & ~itself
 
 
 def _others(pairs: Array) -> Array:
