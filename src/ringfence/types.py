@@ -67,15 +67,16 @@ class Spec:
 
 
 class Batch(NamedTuple):
-    """Windows of data, in physical units."""
+    """Windows of data, in physical units; with history, H counts its rows too."""
 
     features: Array  # (B, H, N, D) s̃_i at t .. t+H-1; the tail past the episode's end repeats the last state
     actions: Array  # (B, H-1, N, A) the action between rows h and h+1 (0 where padded)
     valid: Array  # (B, H) bool: the row is a real state of the episode
     rewards: Array  # (B, H-1) team reward of the transition h -> h+1 (0 where padded)
     returns: Array  # (B,) normal score of the return-to-go among the data at the same time step
-    togo: Array  # (B, H) discounted return-to-go of every row, in units of its standard deviation (0 where padded)
-    time: Array  # (B,) time step of the first row
+    togo: Array  # (B, H) discounted return-to-go of every row (0 where padded)
+    costs: Array  # (B, H) cost charged on arriving in the row
+    time: Array  # (B,) time step of the present row
 
 
 class PolicyStep(NamedTuple):
@@ -95,11 +96,12 @@ class Policy(Protocol):
 
 @dataclass(frozen=True)
 class Algorithm:
-    """An algorithm is a value: a name, a typed config and three pure functions."""
+    """An algorithm is a value: a name, a typed config and pure functions. No base class, no registry."""
 
     name: str
-    Config: type
-    init: Callable[..., PyTree]  # (key, spec, config, data) -> state
-    update: Callable[..., tuple[PyTree, Metrics]]  # (state, batch, key) -> state, metrics; jit-, scan- and vmap-safe
-    policy: Callable[..., Policy]  # (state, config, spec, ...) -> Policy; normaliser statistics are inside
-    presets: dict[str, dict[str, Any]]  # named differences from the config's defaults
+    Config: type  # frozen dataclass; the command line is generated from it
+    init: Callable[..., PyTree]  # (key, spec, config, data, hazard) -> state, a pytree of arrays
+    make_update: Callable[..., Callable]  # (config, spec, hazard) -> update(state, batch, key) -> state, metrics
+    make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
+    make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
+    presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default

@@ -1,0 +1,17 @@
+"""Algorithms, one per file: losses first, config at the top of the file as the list of every choice."""
+
+from __future__ import annotations
+
+from ringfence.algos.bc import BC, BC_SAFE
+from ringfence.algos.icbf import ICBF, MADIFF
+from ringfence.errors import unknown
+from ringfence.types import Algorithm
+
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, BC, BC_SAFE)}
+
+
+def get(name: str) -> Algorithm:
+    """The algorithm of that name; an unknown one is refused with the nearest name."""
+    if name not in ALGORITHMS:
+        raise unknown("algorithm", name, ALGORITHMS)
+    return ALGORITHMS[name]

@@ -1,0 +1,85 @@
+"""Behaviour cloning per agent, on all episodes (`bc`) or on those within the cost limit (`bc-safe`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import features, normalise
+from ringfence.hazards import BoundHazard
+from ringfence.nets import MLP
+from ringfence.optim import Optimiser, average
+from ringfence.policies import Direct, squash
+from ringfence.types import Algorithm, Batch, Key, Metrics, PyTree, Spec
+from ringfence.windows import WindowData, at
+
+
+@dataclass(frozen=True)
+class Config:
+    """Behaviour cloning: L = E ‖a_i − π_i(s̃_i)‖² with a tanh-bounded deterministic π_i."""
+
+    view: features.View = "decentralized"  # what an agent sees: its own observation, as in OMAR's study
+    cost_limit: float | None = None  # keep episodes with cost ≤ this; None keeps all
+    horizon: int = 2  # rows of a window: now and next
+    history: int = 0  # rows of the past (unused)
+    discount: float = 0.99  # unused by the loss; windows carry returns
+    width: int = 256  # units of each hidden layer
+    depth: int = 2  # hidden layers
+    steps: int = 10_000  # updates
+    batch: int = 512  # windows per update
+    lr: float = 1e-3  # Adam
+    warmup: int = 100  # updates
+    grad_clip: float = 1.0  # global norm
+    ema: float = 0.995  # of the parameters
+
+
+def init(key: Key, spec: Spec, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
+    ka, kw = jax.random.split(key)
+    d, sizes = spec.feature_dim, [config.width] * config.depth
+    params = {"actor": MLP(ka, (d, *sizes, spec.action_dim), groups=spec.n_agents, final_scale=0.1)}
+    some = jax.random.randint(kw, (min(8192, 4 * data.steps),), 0, data.steps)
+    windows = at(data.arrays, some, 2)
+    norm = normalise.fit(np.asarray(windows.features), np.asarray(windows.valid), 0, "displacement")
+    return {
+        "params": params,
+        "ema": jax.tree.map(jnp.copy, params),
+        "opt": _optimiser(config).init(params),
+        "step": jnp.zeros((), jnp.int32),
+        "frozen": {"normaliser": norm},
+    }
+
+
+def make_update(config: Config, spec: Spec, hazard: BoundHazard):
+    opt = _optimiser(config)
+
+    def loss(params: PyTree, frozen: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
+        action = squash(params["actor"](frozen["normaliser"].state(batch.features[:, 0])), spec)
+        value = ((action - batch.actions[:, 0]) ** 2).sum(-1).mean()
+        return value, {"loss/cloning": value}
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        grads, metrics = jax.grad(loss, has_aux=True)(state["params"], state["frozen"], batch)
+        params, moments, norms = opt.update(grads, state["opt"], state["params"])
+        ema = average(state["ema"], params, config.ema, state["step"])
+        return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, metrics | norms
+
+    return update
+
+
+def make_diagnose(config: Config, spec: Spec, hazard: BoundHazard):
+    return lambda state, batch, key: {}
+
+
+def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options=None) -> Direct:
+    return Direct(state["ema"]["actor"], state["frozen"]["normaliser"], spec, feature_map)
+
+
+def _optimiser(config: Config) -> Optimiser:
+    return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+
+
+BC = Algorithm("bc", Config, init, make_update, make_diagnose, make_policy, {"default": {}})
+BC_SAFE = Algorithm("bc-safe", Config, init, make_update, make_diagnose, make_policy, {"default": {"cost_limit": 0.0}})

@@ -1,0 +1,480 @@
+"""ICBF-Diffuser: a multi-agent diffusion planner shaped by one control barrier function per agent.
+
+Losses, each with the paper's symbol:
+    L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 8)
+    L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 10)
+    L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 12)
+    L^V  reward and return-to-go of a state, by which plans are ranked; not in the paper
+
+With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
+the barrier is learned and diagnosed, but the planner is MADIFF's to the bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import barrier as cbf
+from ringfence import diffusion, features, normalise
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard
+from ringfence.nets import MLP, build_denoiser
+from ringfence.nets.heads import barrier_on, infer_action, state_values
+from ringfence.optim import Optimiser, average
+from ringfence.policies import Planner
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.windows import WindowData, at
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every choice of the method, one line each; `docs/method.md` says where each default comes from."""
+
+    # --- plan ---
+    view: features.View = "pruned"  # what s̃_i is: pruned, centralized, decentralized
+    horizon: int = 8  # H, rows of a plan, the present one included
+    history: int = 0  # rows of the past that are in-painted, too
+    coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
+    discount: float = 0.9  # of the return-to-go that plans are conditioned on and ranked by
+    observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
+
+    # --- denoiser ---
+    net: Literal["attention", "unet"] = "attention"  # agent attention over flat windows, or MADIFF's temporal U-Net
+    width: int = 256  # channels
+    depth: int = 3  # blocks (attention) or resolutions (unet)
+    diffusion_steps: int = 200  # K, cosine schedule
+    prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
+    snr_floor: float = 0.5  # x0-prediction: least weight of a noise level
+    snr_ceiling: float = 5.0  # x0-prediction: largest weight of a noise level
+    clip: float = 5.0  # bound on clean estimates, in standard deviations
+    condition_dropout: float = 0.25  # p, share of plans that do not see the return
+
+    # --- barrier ---
+    barrier: bool = True  # build h at all
+    barrier_weight: float = 0.3  # λ of the generator's share of L^C
+    barrier_start: float = 0.3  # share of training at which λ starts to rise from 0
+    barrier_full: float = 0.5  # share of training at which λ is reached
+    routing: Literal["split", "paper"] = "split"  # who gets which gradient
+    scope: Literal["individual", "shared"] = "individual"  # one h per agent, or one for all
+    delta: float = 0.1  # δ, margin of the hinges
+    retention: float = 0.9  # m, largest share of h that must be kept from step to step
+    relaxation: cbf.Relaxation = "signal"  # how retention is relaxed at noisy levels
+    two_sided: bool = True  # relax the unsafe side towards "do not get worse"
+    scaled_margin: bool = True  # margin (1−α)δ in the retention hinge instead of δ
+    weigh_by_signal: bool = True  # weight ᾱ_k on the generator's hinges
+    gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
+    gradient_batch: int = 32  # windows per update for ddim:n and chain:n
+    barrier_width: int = 128  # units of each of h's 3 hidden layers
+    barrier_batch: int = 64  # windows per update that h learns from (data and generated, each)
+    bank: int = 4096  # unsafe states kept for h
+    bank_batch: int = 128  # of them per update
+
+    # --- other networks ---
+    inverse_width: int = 128  # units of each of 2 hidden layers
+    inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
+    critic_width: int = 128  # units of each of 2 hidden layers
+
+    # --- optimisation ---
+    steps: int = 4000  # updates
+    batch: int = 192  # windows per update
+    lr: float = 1e-3  # Adam, after warm-up, before cosine decay to a tenth
+    warmup: int = 200  # updates
+    grad_clip: float = 1.0  # global norm, per network
+    ema: float = 0.995  # of all parameters; the policy uses the averages
+
+
+PRESETS: dict[str, dict] = {
+    "split": {},
+    "paper": {
+        "routing": "paper",
+        "barrier_weight": 0.1,
+        "barrier_start": 0.0,
+        "barrier_full": 0.0,
+        "delta": 0.02,
+        "two_sided": False,
+        "scaled_margin": False,
+        "weigh_by_signal": False,
+    },
+    # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
+    "madiff-unet": {
+        "net": "unet",
+        "width": 128,
+        "depth": 3,
+        "horizon": 24,
+        "coordinates": "state",
+        "prediction": "epsilon",
+        "clip": 1.0,
+        "discount": 0.99,
+        "batch": 64,
+        "lr": 2e-4,
+        "steps": 1_000_000,
+    },
+}
+
+
+def schedule(config: Config) -> np.ndarray:
+    """ᾱ (K,)."""
+    return diffusion.cosine_schedule(config.diffusion_steps)
+
+
+def retention(config: Config) -> cbf.Retention:
+    return cbf.Retention(config.retention, config.relaxation, config.two_sided)
+
+
+def init(key: Key, spec: Spec, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
+    """Parameters, their averages, optimiser state and the frozen statistics of the data."""
+    check(config)
+    kd, kb, ki, kv, kw, ku = jax.random.split(key, 6)
+    n, d, h = spec.n_agents, spec.feature_dim, config.horizon + config.history
+    params = {
+        "denoiser": build_denoiser(kd, config.net, h, d, config.width, config.depth),
+        "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n),
+        "critic": MLP(kv, (d, *[config.critic_width] * 2, 2)),
+    }
+    frozen = {"normaliser": fit_normaliser(config, data, kw), "value_scale": jnp.asarray(data.value_scale)}
+    if config.barrier:
+        groups = n if config.scope == "individual" else 1
+        params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
+        some = jax.random.randint(kw, (min(100_000, 4 * data.steps),), 0, data.arrays["features"].shape[0])
+        rows = data.arrays["features"][some], data.arrays["costs"][some]
+        bank, own = cbf.unsafe_bank(*rows, hazard, config.bank, ku)
+        frozen |= {"bank": bank, "bank_own": own}
+    return {
+        "params": params,
+        "ema": jax.tree.map(jnp.copy, params),
+        "opt": optimiser(config).init(params),
+        "step": jnp.zeros((), jnp.int32),
+        "frozen": frozen,
+    }
+
+
+def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 8192) -> normalise.Normaliser:
+    step = jax.random.randint(key, (min(windows, 4 * data.steps),), 0, data.steps)
+    batch = at(data.arrays, step, config.horizon, config.history)
+    return normalise.fit(np.asarray(batch.features), np.asarray(batch.valid), config.history, config.coordinates)
+
+
+def optimiser(config: Config) -> Optimiser:
+    return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+
+
+def check(config: Config) -> None:
+    """Refuse settings that cannot work, before anything is computed."""
+    retention(config)
+    gradient_depth(config.gradient)
+    if config.horizon < 2:
+        raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
+    if config.routing == "split" and not config.scaled_margin and config.delta / (1 - config.retention) > 2.0:
+        raise UserError(
+            f"delta={config.delta} with retention={config.retention} asks a parked agent for h >= "
+            f"{config.delta / (1 - config.retention):.3g}; lower one of them or set scaled_margin=True."
+        )
+
+
+def gradient_depth(text: str) -> tuple[str, int]:
+    """'x0' -> ('x0', 0); 'ddim:3' -> ('ddim', 3)."""
+    kind, _, count = text.partition(":")
+    if kind == "x0" and not count:
+        return kind, 0
+    if kind in ("ddim", "chain") and count.isdigit() and int(count) > 0:
+        return kind, int(count)
+    raise UserError(f"gradient='{text}' is unknown; use x0, ddim:n or chain:n with n of 1 or more, e.g. ddim:3.")
+
+
+# --- losses: (params, batch, key) -> scalar, metrics ---
+
+
+def visible_agents(config: Config, key: Key, shape: tuple[int, int]) -> Array:
+    """(B, N) bool: agents whose present is known to the planner."""
+    everyone = jnp.ones(shape, bool)
+    if config.observe == "all":
+        return everyone
+    k1, k2 = jax.random.split(key)
+    one = jax.nn.one_hot(jax.random.randint(k1, shape[:1], 0, shape[1]), shape[1], dtype=bool)
+    if config.observe == "single":
+        return one
+    return jnp.where(jax.random.bernoulli(k2, 0.5, (shape[0], 1)), everyone, one)
+
+
+def inpainted(visible: Array, history: int, rows: int) -> Array:
+    """(B, H, N, 1) bool: entries of a plan that are known: the past and present rows of visible agents."""
+    known = jnp.arange(rows) <= history
+    return (known[None, :, None] & visible[:, None, :])[..., None]
+
+
+def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: Array):
+    """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted."""
+    k1, k2, k3 = jax.random.split(key, 3)
+    mask = inpainted(visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1])
+    noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
+    keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
+    output = params["denoiser"](noised.x, noised.k, batch.returns, keep)
+    weight = (~mask & batch.valid[..., None, None]).astype(jnp.float32)
+    clip = (config.snr_floor, config.snr_ceiling)
+    loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
+    clean = diffusion.to_clean(output, noised.x, noised.signal, noised.noise, config.prediction, config.clip)
+    return loss, (jnp.where(mask, plan, clean), noised, mask)
+
+
+def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, key: Key, config: Config) -> Array:
+    """L^P = E ‖a_i − f_φi(s̃_i,t, s̃_i,t+1)‖² on data pairs, summed over the action and averaged over agents."""
+    before, after = batch.features[:, config.history], batch.features[:, config.history + 1]
+    action = batch.actions[:, config.history]
+    return ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(
+        -1
+    ).mean()
+
+
+def values(params: PyTree, batch: Batch, frozen: PyTree, config: Config) -> Array:
+    """L^V: squared errors of reward and return-to-go, both standardised, on the first step of windows."""
+    now, scale = config.history, frozen["value_scale"]
+    x = batch.features[:, now : now + 2]
+    reward, togo = state_values(params["critic"], frozen["normaliser"], scale, x)
+    on_reward = (reward[:, 1] - batch.rewards[:, now]) / scale[0, 1]
+    on_togo = (togo - batch.togo[:, now : now + 2]) / scale[1, 1]
+    return (on_reward**2).mean() + (on_togo**2).mean()
+
+
+class Generated(NamedTuple):
+    """Plans s̃^θ that carry gradients to θ, in physical units."""
+
+    features: Array  # (B, H, N, D)
+    valid: Array  # (B, H)
+    eta: Array  # (B, 1, 1) relaxation η_k of their noise level
+    weight: Array  # (B, 1, 1)
+
+
+def generated(
+    params: PyTree,
+    norm: normalise.Normaliser,
+    batch: Batch,
+    clean: Array,
+    noised: diffusion.Noised,
+    mask: Array,
+    key: Key,
+    config: Config,
+    alpha_bar: np.ndarray,
+) -> Generated:
+    """s̃^θ at the configured gradient depth."""
+    kind, n = gradient_depth(config.gradient)
+    ret, bar = retention(config), alpha_bar
+    etas = jnp.asarray(ret.eta(bar), jnp.float32)
+    if kind == "x0":
+        weight = noised.signal[..., 0] ** 2 if config.weigh_by_signal else jnp.ones_like(noised.signal[..., 0])
+        return Generated(norm.invert(clean), batch.valid, etas[noised.k][:, None, None], weight)
+    b = min(config.gradient_batch, clean.shape[0])
+    mask, known, valid = mask[:b], norm.apply(batch.features)[:b], batch.valid[:b]
+    one, zero = jnp.ones((b, 1, 1)), jnp.zeros((b, 1, 1))
+
+    def inpaint(x: Array) -> Array:
+        return jnp.where(mask, known, x)
+
+    predict = diffusion.guided(params["denoiser"], alpha_bar, batch.returns[:b], 1.0, config.prediction, config.clip)
+    if kind == "ddim":
+        x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)
+        return Generated(norm.invert(x), valid, zero, one)
+    # chain:n, one noise level for the sub-batch: n ancestral steps down from x_k, then the clean estimate there
+    k1, k2, k3 = jax.random.split(key, 3)
+    top = jax.random.randint(k1, (), n, len(bar))
+    bars = jnp.asarray(bar, jnp.float32)
+    x = jnp.sqrt(bars[top]) * known + jnp.sqrt(1 - bars[top]) * jax.random.normal(k2, known.shape)
+
+    @jax.checkpoint
+    def down(x: Array, i_key):
+        i, key = i_key
+        k = top - i
+        x = inpaint(x)
+        x0 = inpaint(predict(x, jnp.full(b, k)))
+        a, before = bars[k], bars[k - 1]
+        ratio = a / before
+        mean = jnp.sqrt(before) * (1 - ratio) / (1 - a) * x0 + jnp.sqrt(ratio) * (1 - before) / (1 - a) * x
+        deviation = jnp.sqrt((1 - before) / (1 - a) * (1 - ratio))
+        return mean + deviation * jax.random.normal(key, x.shape), None
+
+    x, _ = jax.lax.scan(down, x, (jnp.arange(n), jax.random.split(k3, n)))
+    x = inpaint(predict(inpaint(x), jnp.full(b, top - n)))
+    weight = bars[top - n] * one if config.weigh_by_signal else one
+    return Generated(norm.invert(x), valid, etas[top - n] * one, weight)
+
+
+def barrier_losses(
+    net: MLP,
+    average: MLP,
+    frozen: PyTree,
+    batch: Batch,
+    made: Generated,
+    key: Key,
+    config: Config,
+    hazard: BoundHazard,
+) -> tuple[Array, Array, Metrics]:
+    """(L_ω, L_θ, metrics): what h learns from, and what the generator learns from h.
+
+    split: h learns from labels on data, on stop-gradient generated states and on the unsafe bank; the generator
+    follows h̄, an average of h. paper: one loss, the printed hinges on generated states, gradients to both.
+    """
+    norm, ret = frozen["normaliser"], retention(config)
+    now, eta, weight = config.history, made.eta, made.weight
+    x, valid = made.features[:, now:], made.valid[:, now:]
+    argued = (ret, 0.0, config.delta, config.scaled_margin)
+    unsafe_made = safe_made = None
+    if hazard.has_formula:
+        unsafe_made, safe_made = hazard.labels(jax.lax.stop_gradient(x))
+    rows = valid[..., None]
+    if config.routing == "paper":
+        if unsafe_made is None:
+            raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
+        made_h = barrier_on(net, norm, x)
+        on_made = cbf.hinges(
+            made_h, unsafe_made, safe_made, rows, ret, eta, config.delta, config.scaled_margin, weight
+        )
+        loss_theta = on_made.safe + on_made.unsafe + on_made.retention
+        loss_omega = jnp.zeros(())
+    else:
+        slow = jax.lax.stop_gradient(average)
+        loss_theta = cbf.shaping(barrier_on(slow, norm, x), rows, ret, eta, config.delta, weight)
+    m = config.barrier_batch
+    data_x, data_rows = batch.features[:m, now:], batch.valid[:m, now:, None]
+    unsafe, safe = hazard.labels(data_x, batch.costs[:m, now:])
+    data_h = barrier_on(net if config.routing == "split" else jax.lax.stop_gradient(net), norm, data_x)
+    on_data = cbf.hinges(data_h, unsafe, safe, data_rows, *argued)
+    metrics = {f"barrier/data_{k}": v for k, v in on_data.metrics.items()}
+    if config.routing == "split":
+        pick = jax.random.randint(key, (config.bank_batch,), 0, config.bank)
+        bank, own = frozen["bank"][pick], frozen["bank_own"][pick]
+        bank_h = barrier_on(net, norm, bank)
+        bank_loss = (jax.nn.relu(config.delta + bank_h) * own).sum() / jnp.maximum(own.sum(), 1)
+        loss_omega = on_data.safe + on_data.unsafe + on_data.retention + bank_loss
+        if unsafe_made is not None:
+            made_h = barrier_on(net, norm, jax.lax.stop_gradient(x[:m]))
+            # Unlabelled noise levels teach nothing: only estimates from mostly-signal plans count, by their weight.
+            on_made = cbf.hinges(
+                made_h,
+                unsafe_made[:m],
+                safe_made[:m],
+                rows[:m],
+                *argued,
+                weight=jax.lax.stop_gradient(weight[:m]),
+            )
+            loss_omega = loss_omega + 0.5 * (on_made.safe + on_made.unsafe + on_made.retention)
+    if unsafe_made is not None:
+        metrics |= {f"barrier/made_{k}": v for k, v in on_made.metrics.items()}
+    return loss_omega, loss_theta, metrics | {"loss/barrier": loss_omega, "loss/shaping": loss_theta}
+
+
+def barrier_share(config: Config, step: Array) -> Array:
+    """λ at an update: 0 until `barrier_start`, `barrier_weight` from `barrier_full` on, linear between."""
+    progress = step / max(config.steps, 1)
+    width = max(config.barrier_full - config.barrier_start, 1e-9)
+    return config.barrier_weight * jnp.clip((progress - config.barrier_start + 1e-12) / width, 0.0, 1.0)
+
+
+def make_loss(config: Config, hazard: BoundHazard):
+    """loss(params, ema, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
+    alpha_bar = schedule(config)
+
+    def loss(params, ema, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
+        kd, kp, kc, kg = jax.random.split(key, 4)
+        norm = frozen["normaliser"]
+        denoise, (clean, noised, mask) = denoising(params, batch, norm.apply(batch.features), kd, config, alpha_bar)
+        inverse = inverse_dynamics(params, batch, norm, kp, config)
+        value = values(params, batch, frozen, config)
+        metrics = {"loss/denoising": denoise, "loss/inverse": inverse, "loss/value": value}
+        total = parts[0] * denoise + inverse + value
+        if config.barrier:
+            made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
+            if config.barrier_weight == 0:  # h is learned, θ must not hear of it
+                made = jax.lax.stop_gradient(made)
+            omega, theta, more = barrier_losses(
+                params["barrier"], ema["barrier"], frozen, batch, made, kc, config, hazard
+            )
+            share = barrier_share(config, step)
+            if config.routing == "paper" and config.barrier_weight == 0:
+                total = total + theta
+            else:
+                total = total + omega + parts[1] * share * theta
+            metrics |= more | {"barrier/weight": share}
+        return total, metrics
+
+    return loss
+
+
+def make_update(config: Config, spec: Spec, hazard: BoundHazard):
+    """update(state, batch, key) -> state, metrics; pure, one Adam step on every network."""
+    loss, opt = make_loss(config, hazard), optimiser(config)
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        (_, metrics), grads = jax.value_and_grad(loss, has_aux=True)(
+            state["params"], state["ema"], state["frozen"], batch, state["step"], key
+        )
+        params, moments, norms = opt.update(grads, state["opt"], state["params"])
+        ema = average(state["ema"], params, config.ema, state["step"])
+        state = {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}
+        return state, metrics | norms
+
+    return update
+
+
+def make_diagnose(config: Config, spec: Spec, hazard: BoundHazard):
+    """diagnose(state, batch, key) -> metrics that are too dear for every update: who pulls θ how hard."""
+    loss = make_loss(config, hazard)
+
+    def diagnose(state: PyTree, batch: Batch, key: Key) -> Metrics:
+        if not config.barrier or config.barrier_weight == 0:
+            return {}
+
+        def pull(parts):
+            fixed = {k: v for k, v in state["params"].items() if k != "denoiser"}
+
+            def of(denoiser):
+                return loss(
+                    {**fixed, "denoiser": denoiser},
+                    state["ema"],
+                    state["frozen"],
+                    batch,
+                    state["step"],
+                    key,
+                    parts,
+                )[0]
+
+            grads = jax.grad(of)(state["params"]["denoiser"])
+            return jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(grads)))
+
+        denoise, shaping = pull((1.0, 0.0)), pull((0.0, 1.0))
+        return {
+            "gradient/denoising": denoise,
+            "gradient/shaping": shaping,
+            "gradient/ratio": shaping / jnp.maximum(denoise, 1e-12),
+        }
+
+    return diagnose
+
+
+def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options):
+    """Receding-horizon planner on the averaged parameters; `options` are the evaluation-time choices."""
+    return Planner(
+        networks=state["ema"],
+        normaliser=state["frozen"]["normaliser"],
+        value_scale=state["frozen"]["value_scale"],
+        alpha_bar=tuple(schedule(config).tolist()),
+        horizon=config.horizon,
+        history=config.history,
+        prediction=config.prediction,
+        clip=config.clip,
+        discount=config.discount,
+        spec=spec,
+        feature_map=feature_map,
+        hazard=hazard,
+        options=options,
+    )
+
+
+ICBF = Algorithm("icbf", Config, init, make_update, make_diagnose, make_policy, PRESETS)
+MADIFF = Algorithm("madiff", Config, init, make_update, make_diagnose, make_policy, {
+    "default": {"barrier": False, "barrier_weight": 0.0},
+    "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
+})

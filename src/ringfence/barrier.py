@@ -1,0 +1,153 @@
+"""Individual control barrier functions h_i(s̃_i): the conditions, the retention schedule, who gets which gradient.
+
+    h ≥ 0 on safe states,  h < 0 on unsafe ones,  h(s̃_{t+1}) ≥ α h(s̃_t)  along transitions           (paper, eq. 9)
+
+`retention` is the code's name of α, which the noise schedule would otherwise share. Retention 0 is one-step set
+membership, 1 forbids any approach to the boundary; every value in [0, 1) keeps {h ≥ 0} invariant.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard
+from ringfence.types import Array, Key, Metrics
+
+Relaxation = Literal["signal", "linear", "none"]
+
+
+@dataclass(frozen=True)
+class Retention:
+    """α_k = m − η_k with 0 ≤ η_k ≤ m < 1 and η → 0 as k → 0 (paper, eq. 11).
+
+    A parked agent (h constant in time) meets the unscaled condition h ≥ α h + δ only if h ≥ δ / (1 − m): 0.2 for
+    m = 0.9, δ = 0.02. The scaled margin (1 − α) δ asks for h ≥ δ instead, whatever m is.
+
+    Where h < 0, a smaller α makes the condition *stricter*. `two_sided` therefore relaxes the unsafe side the other
+    way, up to "do not get worse":  α_k(h) = (m − η) max(h, 0) + (m + η (1 − m)/m) min(h, 0).
+    """
+
+    m: float = 0.9
+    relaxation: Relaxation = "signal"  # η_k = m (1 − ᾱ_k) | m k/(K−1) | 0
+    two_sided: bool = True
+
+    def __post_init__(self):
+        if not 0.0 <= self.m < 1.0:
+            raise UserError(f"retention m={self.m} must lie in [0, 1): at 1 a barrier could never fall; try 0.9.")
+        if self.relaxation not in ("signal", "linear", "none"):
+            raise UserError(f"Unknown relaxation '{self.relaxation}'; choose signal, linear or none.")
+
+    def eta(self, alpha_bar: np.ndarray) -> np.ndarray:
+        """η (K,) for a noise schedule ᾱ (K,)."""
+        alpha_bar = np.asarray(alpha_bar)
+        if self.relaxation == "none":
+            return np.zeros_like(alpha_bar)
+        if self.relaxation == "linear":
+            return self.m * np.arange(len(alpha_bar)) / (len(alpha_bar) - 1)
+        return self.m * (1.0 - alpha_bar)
+
+    def decay(self, h: Array, eta: Array) -> Array:
+        """α_k(h) · h: the least value that h(s̃_{t+1}) may take; `eta` broadcasts against h."""
+        kept = (self.m - eta) * h
+        if not self.two_sided or self.m == 0.0:
+            return kept
+        return jnp.where(h >= 0, kept, (self.m + eta * (1.0 - self.m) / self.m) * h)
+
+
+class Hinges(NamedTuple):
+    """The three conditions as means over their sets; accuracies are the shares that hold with zero margin."""
+
+    safe: Array
+    unsafe: Array
+    retention: Array
+    metrics: Metrics
+
+
+def hinges(
+    h: Array,
+    unsafe: Array,
+    safe: Array,
+    valid: Array,
+    retention: Retention,
+    eta: Array,
+    delta: float,
+    scaled_margin: bool,
+    weight: Array | float = 1.0,
+) -> Hinges:
+    """The hinges of eq. 10, each a mean over its own set (sums would tie the balance to the batch and its classes).
+
+    h, unsafe, safe, valid: (B, H, N). Sets follow the labels:
+        S_0 ∪ S_s:  max(0, δ − h(s̃))              on safe states
+        S_d:        max(0, δ + h(s̃))              on unsafe states
+        S_s:        max(0, margin − h(s̃_{t+1}) + α h(s̃_t))  on transitions that start in a safe state,
+    with margin δ as printed, or (1 − α) δ when scaled. `eta` (B, 1, 1) or a number; `weight` (B, 1, 1).
+    """
+    margin = (1.0 - retention.m + eta) * delta if scaled_margin else delta
+    safe, unsafe = safe & valid, unsafe & valid
+    pair = safe[:, :-1] & valid[:, 1:]
+    slack = h[:, 1:] - retention.decay(h[:, :-1], eta)
+    return Hinges(
+        _mean(jax.nn.relu(delta - h), safe, weight),
+        _mean(jax.nn.relu(delta + h), unsafe, weight),
+        _mean(jax.nn.relu(margin - slack), pair, weight),
+        {
+            "accuracy_safe": _mean(h >= 0, safe),
+            "accuracy_unsafe": _mean(h < 0, unsafe),
+            "accuracy_retention": _mean(slack >= 0, pair),
+            "share_unsafe": _mean(unsafe, valid),
+        },
+    )
+
+
+def shaping(
+    h: Array, valid: Array, retention: Retention, eta: Array, delta: float, weight: Array
+) -> Array:
+    """L_θ of the `split` preset: raise h̄ along the plan, against a frozen barrier.
+
+        mean_t max(0, δ − h̄(x̂0_t)) + mean_t max(0, (1−α) δ − h̄(x̂0_{t+1}) + α sg h̄(x̂0_t)),   t ≥ 1 in the first
+
+    h (B, H, N) = h̄ on the clean estimate, row 0 the in-painted present; `weight` (B, 1, 1), e.g. ᾱ_k. The reference
+    h̄(x̂0_t) carries no gradient, or the generator would be paid for making the present worse.
+    """
+    positive = _mean(jax.nn.relu(delta - h[:, 1:]), valid[:, 1:], weight)
+    floor = retention.decay(jax.lax.stop_gradient(h[:, :-1]), eta)
+    drop = jax.nn.relu((1.0 - retention.m + eta) * delta - h[:, 1:] + floor)
+    return positive + _mean(drop, valid[:, 1:], weight)
+
+
+def unsafe_bank(
+    features: Array, costs: Array, hazard: BoundHazard, size: int, key: Key
+) -> tuple[Array, Array]:
+    """(bank (size, N, D), own (size, N) bool): states that are unsafe for the agents marked in `own`.
+
+    One half is real unsafe states of the data (M, N, D), drawn with replacement; the rest, or all where the data has
+    none, is synthesised from the hazard's formula. Without it h goes flat as soon as the generator is safe.
+    """
+    k1, k2, k3 = jax.random.split(key, 3)
+    unsafe, _ = hazard.labels(features, costs)
+    found = jnp.flatnonzero(unsafe.any(-1))
+    parts = []
+    if len(found):
+        count = size // 2 if hazard.has_formula else size
+        pick = found[jax.random.randint(k1, (count,), 0, len(found))]
+        parts.append((features[pick], unsafe[pick]))
+    if hazard.has_formula:
+        count = size - sum(len(p[0]) for p in parts)
+        base = features[jax.random.randint(k2, (count,), 0, len(features))]
+        made = hazard.endanger(base, k3)
+        parts.append((made, hazard.labels(made)[0]))
+    if not parts:  # nothing is dangerous and nothing can be made so: an empty lesson, not an error
+        return features[:size], jnp.zeros(features[:size].shape[:2], bool)
+    return jnp.concatenate([p[0] for p in parts]), jnp.concatenate([p[1] for p in parts])
+
+
+def _mean(x: Array, mask: Array, weight: Array | float = 1.0) -> Array:
+    """Mean of x over a mask, 0 where the mask is empty; `weight` multiplies the terms, not the count."""
+    mask = mask.astype(jnp.float32)
+    return (x * mask * weight).sum() / jnp.maximum(mask.sum(), 1.0)

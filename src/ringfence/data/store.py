@@ -1,0 +1,317 @@
+"""EpisodeStore: logged episodes of several agents, validated, in one HDF5 file with a JSON card.
+
+Time runs along the first axis, episodes one after another. T is the number of steps, E of episodes:
+
+    observations (T+E, N, O)   one more row than steps in every episode: the last state is kept
+    state        (T+E, S)      global state, when known
+    actions      (T, N, A)     rewards (T, N)     costs (T,)
+    terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
+    episode_ends (E,)          cumulative number of steps
+
+The cost of step t belongs to the state that step t leads to.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ringfence import hazards
+from ringfence.errors import StoreError
+
+FORMAT = 1
+ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeStore:
+    """Logged episodes in memory; see the module's docstring for shapes. Validated when made."""
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    costs: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    episode_ends: np.ndarray
+    state: np.ndarray | None = None
+    card: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        validate(self)
+
+    # --- sizes ---
+    @property
+    def steps(self) -> int:
+        return len(self.actions)
+
+    @property
+    def episodes(self) -> int:
+        return len(self.episode_ends)
+
+    @property
+    def n_agents(self) -> int:
+        return self.observations.shape[1]
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """(E,) steps per episode."""
+        return np.diff(self.episode_ends, prepend=0)
+
+    @property
+    def episode_of_step(self) -> np.ndarray:
+        """(T,) index of the episode of every step; row of step t in `observations` is t + episode_of_step[t]."""
+        return np.repeat(np.arange(self.episodes), self.lengths)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(E,) undiscounted episode return of the team: the sum over time of the mean over agents."""
+        return self._per_episode(self.rewards.mean(1))
+
+    @property
+    def episode_costs(self) -> np.ndarray:
+        """(E,) undiscounted episode cost."""
+        return self._per_episode(self.costs)
+
+    def _per_episode(self, x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(x.astype(np.float64), np.concatenate([[0], self.episode_ends[:-1]]))
+
+    @property
+    def hazard(self) -> hazards.Hazard:
+        """The definition of danger in the card; CostColumn when the card has none."""
+        return hazards.from_dict(self.card.get("hazard", {"kind": "CostColumn"}))
+
+    def select(self, keep: np.ndarray) -> EpisodeStore:
+        """The episodes where `keep` (E,) is true."""
+        keep = np.asarray(keep, bool)
+        if not keep.any():
+            raise StoreError("No episode is left after the selection; relax the rule that selects them.")
+        steps = np.repeat(keep, self.lengths)
+        rows = np.repeat(keep, self.lengths + 1)
+        return EpisodeStore(
+            self.observations[rows],
+            self.actions[steps],
+            self.rewards[steps],
+            self.costs[steps],
+            self.terminated[steps],
+            self.truncated[steps],
+            np.cumsum(self.lengths[keep]),
+            None if self.state is None else self.state[rows],
+            self.card,
+        )
+
+    # --- making ---
+    @classmethod
+    def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
+        """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
+        costs (E, L), state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (default: none)."""
+        observations, actions = np.asarray(observations), np.asarray(actions)
+        if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
+            raise StoreError(
+                f"from_episodes got observations {observations.shape} and actions {actions.shape}; they must be "
+                "(E, L+1, N, O) and (E, L, N, A): keep the state that the last action leads to."
+            )
+        e, length, n = actions.shape[:3]
+        rewards = np.asarray(rewards)
+        if rewards.ndim == 2:
+            rewards = np.repeat(rewards[..., None], n, -1)
+        last = np.zeros((e, length), bool)
+        last[:, -1] = True
+        ended = np.zeros(e, bool) if terminated is None else np.asarray(terminated, bool)
+        flat = lambda x, lead: np.ascontiguousarray(np.asarray(x).reshape(lead, *np.shape(x)[2:]))  # noqa: E731
+        return cls(
+            flat(observations, e * (length + 1)).astype(np.float32, copy=False),
+            flat(actions, e * length).astype(np.float32, copy=False),
+            flat(rewards, e * length).astype(np.float32, copy=False),
+            flat(costs, e * length).astype(np.float32, copy=False),
+            (last & ended[:, None]).ravel(),
+            (last & ~ended[:, None]).ravel(),
+            np.arange(1, e + 1) * length,
+            None if state is None else flat(state, e * (length + 1)).astype(np.float32, copy=False),
+            complete_card(card),
+        )
+
+    @classmethod
+    def from_steps(
+        cls,
+        observations,
+        actions,
+        rewards,
+        *,
+        episode_ends,
+        final_observations,
+        costs=None,
+        state=None,
+        final_state=None,
+        terminated=None,
+        card=None,
+    ):
+        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,), state (T, S);
+        `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
+        episode ended in; `terminated` (E,) bool, default all false (ended by a time limit)."""
+        ends = np.asarray(episode_ends, np.int64)
+        observations, actions = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
+        if len(ends) == 0 or ends[-1] != len(actions):
+            raise StoreError(
+                f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {len(actions)} steps; "
+                "it must be cumulative and end with the number of steps (drop an unfinished last episode)."
+            )
+        rewards = np.asarray(rewards, np.float32)
+        if rewards.ndim == 1:
+            rewards = np.repeat(rewards[:, None], actions.shape[1], 1)
+        ended = np.zeros(len(ends), bool) if terminated is None else np.asarray(terminated, bool)
+        flags = np.zeros((2, len(actions)), bool)
+        flags[0, ends[ended] - 1] = True
+        flags[1, ends[~ended] - 1] = True
+        if state is not None and final_state is None:
+            raise StoreError("state was given without final_state; pass the global state each episode ended in, too.")
+        return cls(
+            np.insert(observations, ends, np.asarray(final_observations, np.float32), axis=0),
+            actions,
+            rewards,
+            np.zeros(len(actions), np.float32) if costs is None else np.asarray(costs, np.float32),
+            flags[0],
+            flags[1],
+            ends,
+            None if state is None else np.insert(np.asarray(state, np.float32), ends, final_state, axis=0),
+            complete_card(card),
+        )
+
+    # --- disk ---
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write one HDF5 file, whole or not at all."""
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+        os.close(handle)
+        try:
+            with h5py.File(temporary, "w") as f:
+                f.attrs["ringfence_store"] = FORMAT
+                f.attrs["card"] = json.dumps(self.card)
+                for name in (*ARRAYS, "state"):
+                    if getattr(self, name) is not None:
+                        f.create_dataset(name, data=getattr(self, name))
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+        return path
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> EpisodeStore:
+        """Read and validate; a foreign, truncated or invalid file is refused, never read in part."""
+        path = Path(path)
+        if not path.exists():
+            raise StoreError(f"No episode store at '{path}'; make one with `ringfence data make TASK`.")
+        try:
+            with h5py.File(path, "r") as f:
+                if f.attrs.get("ringfence_store") != FORMAT:
+                    raise StoreError(
+                        f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
+                    )
+                missing = [name for name in ARRAYS if name not in f]
+                if missing:
+                    raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
+                arrays = {name: f[name][()] for name in (*ARRAYS, "state") if name in f}
+                card = json.loads(f.attrs["card"])
+        except (OSError, KeyError, json.JSONDecodeError) as error:
+            raise StoreError(f"'{path}' is truncated or not HDF5 ({error}); make or import the store again.") from error
+        try:
+            return cls(**arrays, card=card)
+        except StoreError as error:
+            raise StoreError(f"'{path}': {error}") from None
+
+
+def complete_card(card: dict | None) -> dict:
+    """A card with every field present; unknown fields are kept, for provenance of any kind."""
+    base = {
+        "task": "custom",
+        "simulator": None,
+        "provenance": "user data",
+        "action_low": -1.0,
+        "action_high": 1.0,
+        "observation_names": None,
+        "state_names": None,
+        "hazard": {"kind": "CostColumn"},
+    }
+    card = {**base, **(card or {})}
+    if isinstance(card["hazard"], hazards.Hazard):
+        card["hazard"] = hazards.to_dict(card["hazard"])
+    hazards.from_dict(card["hazard"])
+    return json.loads(json.dumps(card))
+
+
+def validate(store: EpisodeStore) -> None:
+    """Raise `StoreError` naming the array, the rule it breaks and the remedy."""
+    s = store
+
+    def demand(ok: bool, message: str) -> None:
+        if not ok:
+            raise StoreError(message)
+
+    demand(s.actions.ndim == 3, f"actions has shape {s.actions.shape}, expected (T, N, A); add the missing axis.")
+    t, n = s.actions.shape[:2]
+    ends = s.episode_ends
+    demand(ends.ndim == 1 and len(ends) > 0, "episode_ends is empty; a store needs at least one whole episode.")
+    demand(bool((np.diff(ends, prepend=0) > 0).all()), "episode_ends must increase; give cumulative step counts.")
+    demand(ends[-1] == t, f"episode_ends ends at {ends[-1]}, actions has {t} steps; drop an unfinished episode.")
+    e = len(ends)
+    shapes = {
+        "observations": (t + e, n),
+        "rewards": (t, n),
+        "costs": (t,),
+        "terminated": (t,),
+        "truncated": (t,),
+    }
+    for name, expected in shapes.items():
+        got = getattr(s, name).shape
+        demand(
+            got[: len(expected)] == expected and len(got) == len(expected) + (name == "observations"),
+            f"{name} has shape {got}, expected {(*expected, 'O') if name == 'observations' else expected} for "
+            f"{t} steps, {e} episodes and {n} agents; every episode keeps one more observation than steps.",
+        )
+    if s.state is not None:
+        demand(
+            s.state.ndim == 2 and len(s.state) == t + e,
+            f"state has shape {s.state.shape}, expected ({t + e}, S); keep the state each episode ended in.",
+        )
+    for name in ("observations", "actions", "rewards", "costs", "state"):
+        array = getattr(s, name)
+        if array is not None and not np.isfinite(array).all():
+            where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+            raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
+    demand(bool((s.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
+    low, high = float(s.card.get("action_low", -1.0)), float(s.card.get("action_high", 1.0))
+    slack = 1e-4 * (high - low)
+    outside = (s.actions < low - slack) | (s.actions > high + slack)
+    if outside.any():
+        where = tuple(int(i) for i in np.argwhere(outside)[0])
+        raise StoreError(
+            f"actions{list(where)} is {s.actions[where]:.4g}, outside [{low:g}, {high:g}]; rescale the actions or set "
+            "action_low and action_high in the card."
+        )
+    both = s.terminated & s.truncated
+    demand(not both.any(), "terminated and truncated are both set somewhere; a step ends in one way, keep terminated.")
+    last = np.zeros(t, bool)
+    last[ends - 1] = True
+    over = s.terminated | s.truncated
+    if (last & ~over).any():
+        bad = int(np.flatnonzero(~over[ends - 1])[0])
+        raise StoreError(
+            f"Episode {bad} is unfinished: its last step is neither terminated nor truncated; set one or drop it."
+        )
+    demand(not (over & ~last).any(), "A step inside an episode is flagged as its end; split the episode there.")
+    for key, size in (("observation_names", s.observations.shape[2]), ("state_names", s.state is not None)):
+        names = s.card.get(key)
+        if names and key == "observation_names":
+            demand(len(names) == size, f"The card names {len(names)} observation entries, the data has {size}.")
+        if names and key == "state_names" and s.state is not None:
+            demand(
+                len(names) == s.state.shape[1], f"The card names {len(names)} state entries, not {s.state.shape[1]}."
+            )

@@ -1,0 +1,131 @@
+"""s̃_i, the state of agent i that everything else works on, from the global state or the local observation.
+
+Each entry is one number of the source, or the difference of two, and has a name; so a view is a table of indices,
+exact, differentiable and linear in the number of entries. Three views exist, because the paper argues about them:
+
+* `pruned` (default): the union of global state and own observation, without duplicates, seen from the agent;
+* `centralized`: the global state, the same for every agent;
+* `decentralized`: the agent's own observation alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.errors import UserError, unknown
+from ringfence.types import Array
+
+View = Literal["pruned", "centralized", "decentralized"]
+VIEWS = ("pruned", "centralized", "decentralized")
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureMap:
+    """Entry d of agent i is source[plus[i, d]] − source[minus[i, d]] (minus = −1: nothing is taken away)."""
+
+    view: str
+    names: tuple[str, ...]  # D
+    source: Literal["state", "observations"]
+    plus: np.ndarray  # (N, D) int
+    minus: np.ndarray  # (N, D) int
+
+    def __call__(self, observations: Array, state: Array | None) -> Array:
+        """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
+        taken = self.minus >= 0
+        if self.source == "state":
+            if state is None:
+                raise UserError(
+                    f"View '{self.view}' needs the global state, which this data does not have; "
+                    "store it or use view='decentralized'."
+                )
+            return state[..., self.plus] - state[..., np.maximum(self.minus, 0)] * taken
+        rows = np.arange(self.plus.shape[0])[:, None]
+        return observations[..., rows, self.plus]
+
+
+def simple_spread(view: str, n_agents: int) -> FeatureMap:
+    """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""
+    n = n_agents
+    if view == "decentralized":
+        names = ["own.vx", "own.vy", "own.x", "own.y"]
+        names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
+        names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
+        table = np.tile(np.arange(len(names)), (n, 1))
+        return FeatureMap(view, tuple(names), "observations", table, np.full_like(table, -1))
+    position = np.arange(2 * n).reshape(n, 2)
+    velocity, landmark = position + 2 * n, position + 4 * n
+    if view == "centralized":
+        names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
+        names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
+        table = np.tile(np.arange(6 * n), (n, 1))
+        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1))
+    if view != "pruned":
+        raise unknown("view", view, VIEWS)
+    names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
+    names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
+    names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]
+    names += [f"other{j}.dv{c}" for j in range(n - 1) for c in "xy"]  # makes the hazard's dynamics Markov
+    for i in range(n):
+        others = [j for j in range(n) if j != i]
+        p = [*velocity[i], *position[i], *landmark.ravel(), *position[others].ravel(), *velocity[others].ravel()]
+        m = [-1] * 4 + list(position[i]) * n + list(position[i]) * (n - 1) + list(velocity[i]) * (n - 1)
+        plus.append(p)
+        minus.append(m)
+    return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus))
+
+
+def from_data(
+    view: str,
+    observations: np.ndarray,
+    state: np.ndarray | None,
+    observation_names: tuple[str, ...],
+    state_names: tuple[str, ...],
+) -> FeatureMap:
+    """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned.
+
+    observations (M, N, O), state (M, S) or None; a sample of rows is enough.
+    """
+    if view not in VIEWS:
+        raise unknown("view", view, VIEWS)
+    m, n, o = observations.shape
+    own = [observations[:, :, d] for d in range(o)]
+    shared = [] if state is None else [np.repeat(state[:, d : d + 1], n, 1) for d in range(state.shape[1])]
+    if view == "decentralized" or state is None:
+        columns, names = own, observation_names
+    elif view == "centralized":
+        columns, names = shared, state_names
+    else:
+        columns, names = own + shared, observation_names + state_names
+    kept: list[int] = []
+    for d, column in enumerate(columns):
+        constant = np.ptp(column, axis=0).max() < 1e-9
+        if not constant and not any(np.array_equal(column, columns[e]) for e in kept):
+            kept.append(d)
+    if not kept:
+        raise UserError("Every observation entry is constant, so there is nothing to plan over; check the store.")
+    if view == "pruned" and state is not None:
+        # One index table needs one source: observations, then the state appended to each of them.
+        table = np.tile(np.array(kept), (n, 1))
+        return _Joint(view, tuple(names[d] for d in kept), "observations", table, np.full_like(table, -1))
+    source = "state" if view == "centralized" and state is not None else "observations"
+    table = np.tile(np.array(kept), (n, 1))
+    return FeatureMap(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Joint(FeatureMap):
+    """Features read from each agent's observation with the global state appended to it."""
+
+    def __call__(self, observations: Array, state: Array | None) -> Array:
+        if state is None:
+            raise UserError("This view was fitted with a global state; pass it when acting.")
+        o, index = observations.shape[-1], self.plus[0]
+        own = observations[..., index[index < o]]
+        shared = state[..., None, index[index >= o] - o]
+        shape = (*own.shape[:-1], shared.shape[-1])
+        xp = np if isinstance(own, np.ndarray) else jnp
+        return xp.concatenate([own, xp.broadcast_to(shared, shape)], -1)

@@ -1,0 +1,209 @@
+"""What danger means: a signed clearance ℓ(s̃_i) in physical units, and the masks that follow from it.
+
+A hazard is a small value that names the features it reads. `bind` resolves the names against a feature list once
+and gives a `BoundHazard`, whose functions are differentiable and batched over any leading axes.
+
+    ℓ < 0            unsafe (the task charges a cost)
+    ℓ >= safe_margin  safe, with room to spare
+    in between       neither: no label is given to a barrier there
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.errors import UserError, unknown
+from ringfence.types import Array, Key
+
+
+@dataclass(frozen=True)
+class Separation:
+    """Agents' centres must stay at least `radius` apart: ℓ_i = min_j ‖p_j − p_i‖ − radius (m)."""
+
+    radius: float = 0.30  # m; two agents of radius 0.15 touch at 0.30
+    safe_margin: float = 0.075  # m; safe from 1.25 radii on, the ratio MACBF uses (Qin et al. 2021)
+
+
+@dataclass(frozen=True)
+class SpeedLimit:
+    """Speed must stay below `limit`: ℓ = limit − ‖v‖ (m/s), v read from the named features."""
+
+    limit: float
+    features: tuple[str, ...] = ("torso.vx", "torso.vy")
+    safe_margin: float | None = None  # m/s; None: a fifth of the limit
+
+
+@dataclass(frozen=True)
+class CostColumn:
+    """Danger is what the logged cost says: a state reached with cost > 0 is unsafe. No formula, so no label can be
+    given to states that are not in the data."""
+
+
+@dataclass(frozen=True)
+class All:
+    """Every hazard at once: the clearance is the smallest one (of quantities that should share a unit)."""
+
+    hazards: tuple[Separation | SpeedLimit, ...]
+
+
+Hazard = Separation | SpeedLimit | CostColumn | All
+
+
+@dataclass(frozen=True, eq=False)
+class BoundHazard:
+    """A hazard resolved against a list of features.
+
+    `clearance` maps features (..., N, D) in physical units to ℓ (..., N); it is None where danger has no formula.
+    `endanger` maps (features (..., N, D), key) to nearby states that are unsafe for each agent; None likewise.
+    """
+
+    hazard: Hazard
+    clearance: Callable[[Array], Array] | None
+    endanger: Callable[[Array, Key], Array] | None
+    safe_margin: float
+
+    @property
+    def has_formula(self) -> bool:
+        return self.clearance is not None
+
+    def labels(self, features: Array, costs: Array | None = None) -> tuple[Array, Array]:
+        """(unsafe, safe), each (..., N) bool. `costs` (...) is the cost charged on arriving in the state; it is read
+        only where there is no formula."""
+        if self.clearance is not None:
+            ell = self.clearance(features)
+            return ell < 0, ell >= self.safe_margin
+        if costs is None:
+            raise UserError("CostColumn can label only states of the data; pass their costs or give a hazard formula.")
+        unsafe = jnp.broadcast_to((costs > 0)[..., None], features.shape[:-1])
+        return unsafe, ~unsafe
+
+
+def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
+    """Resolve a hazard's feature names; an absent one is refused with the nearest name."""
+    if isinstance(hazard, CostColumn):
+        return BoundHazard(hazard, None, None, 0.0)
+    if isinstance(hazard, Separation):
+        return _bind_separation(hazard, names, n_agents)
+    if isinstance(hazard, SpeedLimit):
+        return _bind_speed(hazard, names)
+    parts = [bind(h, names, n_agents) for h in hazard.hazards]
+    if not parts or not all(p.has_formula for p in parts):
+        raise UserError("All(...) needs at least one hazard and a formula for each; leave CostColumn out of it.")
+
+    def endanger(x: Array, key: Key) -> Array:
+        return parts[0].endanger(x, key)
+
+    return BoundHazard(
+        hazard,
+        lambda x: jnp.stack([p.clearance(x) for p in parts]).min(0),
+        endanger,
+        max(p.safe_margin for p in parts),
+    )
+
+
+def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
+    if n_agents < 2:
+        raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
+    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(n_agents - 1)]
+    if all(a in names and b in names for a, b in relative):
+        index = np.array([[names.index(a), names.index(b)] for a, b in relative])  # (N-1, 2)
+
+        def offsets(x: Array) -> Array:
+            return x[..., index]  # (..., N, N-1, 2)
+
+        def endanger(x: Array, key: Key) -> Array:
+            """Put one other agent, drawn at random, on its line of centres at a distance below the radius."""
+            k1, k2 = jax.random.split(key)
+            gap = offsets(x)
+            distance = jnp.linalg.norm(gap, axis=-1, keepdims=True)
+            near = jax.random.uniform(k1, distance.shape, minval=0.1, maxval=0.999) * hazard.radius
+            moved = gap / jnp.maximum(distance, 1e-6) * near
+            pick = jax.random.randint(k2, gap.shape[:-2], 0, gap.shape[-2])
+            chosen = jax.nn.one_hot(pick, gap.shape[-2], dtype=bool)[..., None]
+            return x.at[..., index].set(jnp.where(chosen, moved, gap))
+    else:
+        absolute = [(f"agent{j}.x", f"agent{j}.y") for j in range(n_agents)]
+        wanted = [n for pair in relative for n in pair]
+        for name in [n for pair in absolute for n in pair]:
+            if name not in names:
+                missing = next(n for n in wanted if n not in names)
+                raise _missing("Separation", missing, names)
+        index = np.array([[names.index(a), names.index(b)] for a, b in absolute])  # (N, 2)
+        rows, columns = np.nonzero(~np.eye(n_agents, dtype=bool))
+
+        def offsets(x: Array) -> Array:
+            p = x[..., index]  # (..., N, N, 2): every agent's copy of all positions
+            own = p[..., np.arange(n_agents), np.arange(n_agents), :]
+            gap = p - own[..., None, :]
+            return gap[..., rows, columns, :].reshape(*gap.shape[:-2], n_agents - 1, 2)
+
+        def endanger(x: Array, key: Key) -> Array:
+            k1, k2 = jax.random.split(key)
+            gap = offsets(x)
+            distance = jnp.linalg.norm(gap, axis=-1, keepdims=True)
+            near = jax.random.uniform(k1, distance.shape, minval=0.1, maxval=0.999) * hazard.radius
+            pick = jax.random.randint(k2, gap.shape[:-2], 0, n_agents - 1)[..., None, None]
+            shift = jnp.take_along_axis(gap / jnp.maximum(distance, 1e-6) * near - gap, pick, axis=-2)[..., 0, :]
+            table = columns.reshape(n_agents, n_agents - 1)
+            other = jnp.asarray(table)[np.arange(n_agents), pick[..., 0, 0]]  # (..., N) absolute index
+            mask = jax.nn.one_hot(other, n_agents, dtype=bool)[..., None]
+            p = x[..., index]
+            return x.at[..., index].set(jnp.where(mask, p + shift[..., None, :], p))
+
+    def clearance(x: Array) -> Array:
+        squared = (offsets(x) ** 2).sum(-1)
+        return jnp.sqrt(jnp.maximum(squared, 1e-12)).min(-1) - hazard.radius
+
+    return BoundHazard(hazard, clearance, endanger, hazard.safe_margin)
+
+
+def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
+    for name in hazard.features:
+        if name not in names:
+            raise _missing("SpeedLimit", name, names)
+    index = np.array([names.index(n) for n in hazard.features])
+
+    def speed(x: Array) -> Array:
+        return jnp.sqrt(jnp.maximum((x[..., index] ** 2).sum(-1), 1e-12))
+
+    def endanger(x: Array, key: Key) -> Array:
+        """Scale the velocity to between the limit and half as much again."""
+        factor = jax.random.uniform(key, x.shape[:-1], minval=1.001, maxval=1.5) * hazard.limit / speed(x)
+        return x.at[..., index].multiply(factor[..., None])
+
+    margin = 0.2 * hazard.limit if hazard.safe_margin is None else hazard.safe_margin
+    return BoundHazard(hazard, lambda x: hazard.limit - speed(x), endanger, margin)
+
+
+def _missing(kind: str, name: str, names: tuple[str, ...]) -> UserError:
+    near = unknown("feature", name, names)
+    return UserError(f"{kind} reads the feature '{name}', which this data does not have: name it in the card. {near}")
+
+
+def to_dict(hazard: Hazard) -> dict:
+    """JSON form of a hazard."""
+    if isinstance(hazard, All):
+        return {"kind": "All", "hazards": [to_dict(h) for h in hazard.hazards]}
+    return {"kind": type(hazard).__name__, **dataclasses.asdict(hazard)}
+
+
+def from_dict(data: dict) -> Hazard:
+    """Inverse of `to_dict`; an unknown kind or field is refused."""
+    kinds = {"Separation": Separation, "SpeedLimit": SpeedLimit, "CostColumn": CostColumn, "All": All}
+    data = dict(data)
+    kind = data.pop("kind", "")
+    if kind not in kinds:
+        raise unknown("hazard", str(kind), kinds)
+    if kind == "All":
+        return All(tuple(from_dict(h) for h in data.get("hazards", ())))
+    fields = {f.name for f in dataclasses.fields(kinds[kind])}
+    for name in data:
+        if name not in fields:
+            raise unknown(f"field of hazard {kind}", name, fields)
+    return kinds[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})

@@ -1,0 +1,21 @@
+"""Networks: Equinox modules whose leaves are all arrays, so a module is its own parameter pytree."""
+
+from __future__ import annotations
+
+from ringfence.errors import unknown
+from ringfence.nets.agent_attention import AgentAttention
+from ringfence.nets.mlp import MLP
+from ringfence.types import Key
+
+__all__ = ["MLP", "AgentAttention", "build_denoiser"]
+
+
+def build_denoiser(key: Key, kind: str, rows: int, features: int, width: int, depth: int):
+    """A denoiser F(x (B, H, N, D), k (B,), y (B,), keep (B,)) -> (B, H, N, D) by name."""
+    if kind == "attention":
+        return AgentAttention(key, rows, features, width, depth)
+    if kind == "unet":
+        from ringfence.nets.unet import TemporalUNet
+
+        return TemporalUNet(key, rows, features, width, depth)
+    raise unknown("denoiser", kind, ("attention", "unet"))

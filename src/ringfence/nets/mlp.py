@@ -1,0 +1,40 @@
+"""Multi-layer perceptrons, shared by all agents or one per agent."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ringfence.types import Array, Key
+
+
+class MLP(eqx.Module):
+    """ReLU network with linear output on (..., N, F); `groups` = N gives every agent weights of its own, 1 shares."""
+
+    weights: list[Array]  # (G, F_in, F_out)
+    biases: list[Array]  # (G, F_out)
+
+    def __init__(self, key: Key, sizes: tuple[int, ...], groups: int = 1, final_scale: float = 1.0):
+        """`sizes` = (in, hidden, ..., out); He initialisation, the last layer scaled by `final_scale`."""
+        self.weights, self.biases = [], []
+        keys = jax.random.split(key, len(sizes) - 1)
+        for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:]):
+            last = fan_out is sizes[-1] and len(self.weights) == len(sizes) - 2
+            gain = (1.0 / fan_in) ** 0.5 * final_scale if last else (2.0 / fan_in) ** 0.5
+            self.weights.append(jax.random.normal(k, (groups, fan_in, fan_out)) * gain)
+            self.biases.append(jnp.zeros((groups, fan_out)))
+
+    def __call__(self, x: Array) -> Array:
+        shape, groups = x.shape, self.weights[0].shape[0]
+        if groups == 1:
+            x = x.reshape(-1, shape[-1])
+            for n, (w, b) in enumerate(zip(self.weights, self.biases)):
+                x = x @ w[0] + b[0]
+                x = jax.nn.relu(x) if n < len(self.weights) - 1 else x
+            return x.reshape(*shape[:-1], x.shape[-1])
+        x = jnp.moveaxis(x.reshape(-1, groups, shape[-1]), 1, 0)  # (N, M, F): one matrix product per agent
+        for n, (w, b) in enumerate(zip(self.weights, self.biases)):
+            x = jax.lax.batch_matmul(x, w) + b[:, None]
+            x = jax.nn.relu(x) if n < len(self.weights) - 1 else x
+        return jnp.moveaxis(x, 0, 1).reshape(*shape[:-1], x.shape[-1])

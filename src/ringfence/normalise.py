@@ -1,0 +1,87 @@
+"""Fit once, freeze, apply and invert: the coordinates in which plans are diffused.
+
+A plan is H rows of features; row `now` is the current state. Two coordinate systems:
+
+* `displacement` (default): row `now` and earlier are standardised states; every later row is the displacement from
+  row `now`, standardised per horizon step and entry. The first step of a plan, from which the action is read, then
+  has unit variance like everything else, instead of being a small difference of large numbers.
+* `state`: every row is a standardised state, as in MADIFF.
+
+Both maps are affine in the rows, differentiable, and inverted exactly.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.types import Array
+
+Coordinates = Literal["displacement", "state"]
+FLOOR = 1e-3  # an entry that never varies is centred and left alone
+
+
+class Normaliser(eqx.Module):
+    """Frozen statistics, pooled over agents, so that they carry over to another number of agents."""
+
+    mean: Array  # (D,)
+    scale: Array  # (D,) standard deviation
+    step_mean: Array  # (H - 1 - now, D) of the displacement from row `now`
+    step_scale: Array  # (H - 1 - now, D)
+    now: int = eqx.field(static=True)
+    coordinates: str = eqx.field(static=True)
+
+    def state(self, features: Array) -> Array:
+        """Standardise single states (..., D)."""
+        return (features - self.mean) / self.scale
+
+    def invert_state(self, x: Array) -> Array:
+        return x * self.scale + self.mean
+
+    def apply(self, plan: Array) -> Array:
+        """(..., H, N, D) features -> diffusion coordinates."""
+        if self.coordinates == "state":
+            return self.state(plan)
+        past, future = plan[..., : self.now + 1, :, :], plan[..., self.now + 1 :, :, :]
+        moved = future - plan[..., self.now : self.now + 1, :, :]
+        x = (moved - self.step_mean[:, None]) / self.step_scale[:, None]
+        return jnp.concatenate([self.state(past), x], axis=-3)
+
+    def invert(self, x: Array) -> Array:
+        """(..., H, N, D) diffusion coordinates -> features."""
+        if self.coordinates == "state":
+            return self.invert_state(x)
+        past = self.invert_state(x[..., : self.now + 1, :, :])
+        moved = x[..., self.now + 1 :, :, :] * self.step_scale[:, None] + self.step_mean[:, None]
+        return jnp.concatenate([past, past[..., self.now : self.now + 1, :, :] + moved], axis=-3)
+
+    def step(self, before: Array, after: Array) -> Array:
+        """The one-step displacement (..., D), standardised: what inverse dynamics reads."""
+        return (after - before - self.step_mean[0]) / self.step_scale[0]
+
+
+def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> Normaliser:
+    """Statistics of windows (M, H, N, D) with `valid` (M, H); padded rows are left out."""
+    h, d = windows.shape[1], windows.shape[-1]
+    rows = windows[:, now].reshape(-1, d).astype(np.float64)
+    means, scales = [], []
+    for s in range(now + 1, h):
+        moved = (windows[:, s] - windows[:, now])[valid[:, s]].reshape(-1, d).astype(np.float64)
+        means.append(moved.mean(0) if len(moved) else np.zeros(d))
+        scales.append(moved.std(0) if len(moved) else np.ones(d))
+
+    def floor(x: np.ndarray) -> np.ndarray:
+        return np.where(x < FLOOR, 1.0, x)
+
+    as_array = lambda x: jnp.asarray(np.asarray(x), jnp.float32)  # noqa: E731
+    return Normaliser(
+        as_array(rows.mean(0)),
+        as_array(floor(rows.std(0))),
+        as_array(np.reshape(means, (-1, d))),
+        as_array(floor(np.reshape(scales, (-1, d)))),
+        now,
+        coordinates,
+    )

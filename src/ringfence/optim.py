@@ -1,0 +1,47 @@
+"""Adam with warm-up, cosine decay and a gradient-norm bound for every network apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from ringfence.types import Array, Metrics, PyTree
+
+
+@dataclass(frozen=True)
+class Optimiser:
+    """Parameters are a dict of networks; each is clipped by its own norm, so none can silence another."""
+
+    lr: float
+    warmup: int  # updates of linear rise
+    steps: int  # updates in all; the rate falls along a cosine to a tenth
+    clip: float
+
+    def _adam(self) -> optax.GradientTransformation:
+        warmup = min(self.warmup, max(self.steps // 10, 1))
+        rate = optax.warmup_cosine_decay_schedule(0.0, self.lr, warmup, max(self.steps, warmup + 1), 0.1 * self.lr)
+        return optax.chain(optax.clip_by_global_norm(self.clip), optax.adam(rate))
+
+    def init(self, params: dict[str, PyTree]) -> dict[str, PyTree]:
+        adam = self._adam()
+        return {name: adam.init(p) for name, p in params.items()}
+
+    def update(
+        self, grads: dict[str, PyTree], moments: dict[str, PyTree], params: dict[str, PyTree]
+    ) -> tuple[dict[str, PyTree], dict[str, PyTree], Metrics]:
+        """New parameters, new moments and the gradient norm of every network before clipping."""
+        adam, new, kept, norms = self._adam(), {}, {}, {}
+        for name, p in params.items():
+            step, kept[name] = adam.update(grads[name], moments[name], p)
+            new[name] = optax.apply_updates(p, step)
+            norms[f"gradient_norm/{name}"] = optax.global_norm(grads[name])
+        return new, kept, norms
+
+
+def average(ema: PyTree, params: PyTree, decay: float, step: Array) -> PyTree:
+    """Exponential moving average that follows closely at first and settles to `decay`."""
+    d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
+    return jax.tree.map(lambda a, p: d * a + (1.0 - d) * p, ema, params)

@@ -1,0 +1,232 @@
+"""Policies: batched, pure, normaliser inside.
+
+The planner draws plans, picks one, and reads the action off its first step:
+
+    time        t          t+1   t+2   ...   t+H-1
+    plan        present    row1  row2  ...   row H-1       in-painted | generated
+    executed    f_φ(present, row 1), then plan again (or follow the plan for `replan` steps)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import diffusion
+from ringfence.errors import UserError
+from ringfence.features import FeatureMap
+from ringfence.hazards import BoundHazard
+from ringfence.nets.heads import barrier_on, infer_action, state_values
+from ringfence.normalise import Normaliser
+from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    """Evaluation-time choices: one checkpoint gives the whole curve of safety against compute."""
+
+    plans: int = 1  # plans drawn per step; more than one are selected among
+    steps: int = 5  # sampler steps
+    sampler: diffusion.Sampler = "ddim"
+    guidance: float = 1.2  # ω of classifier-free guidance; 1 switches it off
+    target: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
+    temperature: float = 1.0  # scale of the first noise
+    select: Literal["clearance", "barrier", "both"] = "clearance"  # what a plan's safety is judged by
+    margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
+    prefix: int = 3  # rows of the plan that are judged
+    replan: int = 1  # steps that a plan is followed for
+    execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
+
+    def __post_init__(self):
+        for name, least in (("plans", 1), ("steps", 1), ("prefix", 1), ("replan", 1)):
+            if getattr(self, name) < least:
+                raise UserError(f"{name}={getattr(self, name)} must be at least {least}.")
+        if self.select not in ("clearance", "barrier", "both"):
+            raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
+        if self.execution not in ("centralized", "decentralized"):
+            raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
+
+
+class Planner(eqx.Module):
+    """Receding-horizon diffusion planner with selection among plans."""
+
+    networks: dict[str, Any]  # denoiser, inverse, critic, maybe barrier
+    normaliser: Normaliser
+    value_scale: Array  # (2, 2)
+    alpha_bar: tuple[float, ...] = eqx.field(static=True)
+    horizon: int = eqx.field(static=True)
+    history: int = eqx.field(static=True)
+    prediction: str = eqx.field(static=True)
+    clip: float = eqx.field(static=True)
+    discount: float = eqx.field(static=True)
+    spec: Spec = eqx.field(static=True)
+    feature_map: FeatureMap = eqx.field(static=True)
+    hazard: BoundHazard = eqx.field(static=True)
+    options: PlanOptions = eqx.field(static=True)
+
+    def __check_init__(self):
+        o = self.options
+        if o.replan > self.horizon - 1:
+            raise UserError(f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}.")
+        if o.plans > 1 and o.select != "clearance" and "barrier" not in self.networks:
+            raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
+        if o.plans > 1 and o.select != "barrier" and not self.hazard.has_formula:
+            raise UserError(f"select='{o.select}' needs a hazard with a formula; use select='barrier'.")
+
+    def start(self, batch: int) -> PyTree:
+        n, d = self.spec.n_agents, self.spec.feature_dim
+        rows = self.history + self.horizon
+        return {
+            "past": jnp.zeros((batch, self.history, n, d)),
+            "plan": jnp.zeros((batch, rows, n, d)),
+            "age": jnp.zeros((), jnp.int32),
+        }
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds."""
+        o = self.options
+        present = self.feature_map(observations, state)
+        first = memory["age"] == 0
+        past = memory["past"]
+        if self.history:
+            past = jnp.where(first, jnp.repeat(present[:, None], self.history, 1), past)
+        if o.replan == 1:
+            plan, info = self.plan(past, present, key)
+            ahead = plan[:, self.history + 1]
+        else:
+            fresh = memory["age"] % o.replan == 0
+            plan, info = jax.lax.cond(
+                fresh,
+                lambda: self.plan(past, present, key),
+                lambda: (memory["plan"], self._no_news(present.shape[0])),
+            )
+            ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
+        action = infer_action(self.networks["inverse"], self.normaliser, present, ahead)
+        action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
+        if self.history:
+            past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
+        return {"past": past, "plan": plan, "age": memory["age"] + 1}, PolicyStep(action, info)
+
+    def plan(self, past: Array, present: Array, key: Key) -> tuple[Array, dict[str, Array]]:
+        """Draw plans from the present (B, N, D) and pick one: (B, rows, N, D) features, and how it was picked."""
+        o, (b, n, d), rows = self.options, present.shape, self.history + self.horizon
+        context = jnp.concatenate([past, present[:, None]], 1)
+        local = o.execution == "decentralized"
+        copies = o.plans * (n if local else 1)  # every agent imagines the whole team, n times the work
+        visible = jnp.ones((b, copies, n), bool)
+        if local:
+            visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), o.plans, 0), visible.shape)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
+        x = x.reshape(b, copies, rows, n, d)
+        if local:
+            x = x.reshape(b, n, o.plans, rows, n, d)
+            x = jnp.stack([x[:, i, :, :, i] for i in range(n)], -2)  # each agent keeps its own part of its own plans
+        if o.plans == 1:
+            return x[:, 0], self._no_news(b) | {"plans": x}
+        safety, value = self.judge(x)
+        if local:
+            chosen = pick(safety, value[..., None], o.margin)  # (B, N): agents choose apart
+            plan = jnp.take_along_axis(x, chosen[:, None, None, :, None], 1)[:, 0]
+            return plan, {"plans": x, "chosen": chosen[:, 0], "clearance": safety.max(1).min(-1)}
+        team = safety.min(-1)
+        chosen = pick(team, value, o.margin)
+        plan = jnp.take_along_axis(x, chosen[:, None, None, None, None], 1)[:, 0]
+        return plan, {"plans": x, "chosen": chosen, "clearance": jnp.take_along_axis(team, chosen[:, None], 1)[:, 0]}
+
+    def sample(self, context: Array, visible: Array, key: Key) -> Array:
+        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D)."""
+        o, (b, _, n, d) = self.options, context.shape
+        rows = self.history + self.horizon
+        known = self.normaliser.state(context)
+        mask = (jnp.arange(rows) <= self.history)[None, :, None, None] & visible[:, None, :, None]
+        known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
+        bar = np.asarray(self.alpha_bar)
+        target = jnp.full(b, o.target)
+        predict = diffusion.guided(self.networks["denoiser"], bar, target, o.guidance, self.prediction, self.clip)
+        x = diffusion.sample(
+            predict,
+            lambda x: jnp.where(mask, known, x),
+            (b, rows, n, d),
+            bar,
+            key,
+            o.steps,
+            o.sampler,
+            o.temperature,
+        )
+        return self.normaliser.invert(x)
+
+    def judge(self, x: Array) -> tuple[Array, Array]:
+        """Plans (B, P, rows, N, D) -> safety (B, P, N), the least over the judged rows, and value (B, P).
+
+        Value: Σ_h γ^h r̂(row) along the plan, then γ^H V̂(last row), in the data's units.
+        """
+        o, now = self.options, self.history
+        ahead = x[:, :, now + 1 : now + 1 + o.prefix]
+        scores = []
+        if o.select in ("clearance", "both"):
+            scores.append(self.hazard.clearance(ahead))
+        if o.select in ("barrier", "both"):
+            scores.append(barrier_on(self.networks["barrier"], self.normaliser, ahead))
+        safety = jnp.stack(scores).min(0).min(2)
+        reward, togo = state_values(self.networks["critic"], self.normaliser, self.value_scale, x[:, :, now + 1 :])
+        weight = self.discount ** jnp.arange(reward.shape[-1])
+        return safety, (reward * weight).sum(-1) + weight[-1] * self.discount * togo[..., -1]
+
+    def _no_news(self, batch: int) -> dict[str, Array]:
+        n, d, rows = self.spec.n_agents, self.spec.feature_dim, self.history + self.horizon
+        return {
+            "plans": jnp.zeros((batch, self.options.plans, rows, n, d)),
+            "chosen": jnp.zeros(batch, jnp.int32),
+            "clearance": jnp.full(batch, jnp.nan),
+        }
+
+
+def pick(safety: Array, value: Array, margin: float) -> Array:
+    """argmax of value among plans (axis 1) with safety ≥ margin; where there is none, argmax of safety."""
+    fine = safety >= margin
+    best = jnp.where(fine, value, -jnp.inf).argmax(1)
+    return jnp.where(fine.any(1), best, safety.argmax(1))
+
+
+class Direct(eqx.Module):
+    """An actor network on the present features, one per agent, squashed into the action bounds."""
+
+    actor: Any
+    normaliser: Normaliser
+    spec: Spec = eqx.field(static=True)
+    feature_map: FeatureMap = eqx.field(static=True)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        x = self.normaliser.state(self.feature_map(observations, state))
+        return memory, PolicyStep(squash(self.actor(x), self.spec), {})
+
+
+def squash(x: Array, spec: Spec) -> Array:
+    """tanh into [action_low, action_high]."""
+    middle, half = (spec.action_high + spec.action_low) / 2, (spec.action_high - spec.action_low) / 2
+    return middle + half * jnp.tanh(x)
+
+
+class Constant(eqx.Module):
+    """Does nothing, or acts uniformly at random: the reference rows of every table."""
+
+    spec: Spec = eqx.field(static=True)
+    random: bool = eqx.field(static=True, default=False)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        s = self.spec
+        shape = (observations.shape[0], s.n_agents, s.action_dim)
+        if self.random:
+            return memory, PolicyStep(jax.random.uniform(key, shape, minval=s.action_low, maxval=s.action_high), {})
+        return memory, PolicyStep(jnp.zeros(shape), {})

@@ -1,0 +1,220 @@
+"""The run folder: everything downstream reads these files and nothing else.
+
+    config.json     algorithm, preset, config, task, spec, hazard, seed, data card
+    env.json        versions, hardware, git commit
+    metrics.jsonl   one line per logged chunk of updates
+    ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
+    results.json    what `ringfence eval` measured, one entry per variant
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import re
+import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
+
+from ringfence import __version__
+from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.types import PyTree
+
+KEEP = 2  # checkpoints
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder on disk."""
+
+    path: Path
+
+    @property
+    def name(self) -> str:
+        return self.path.name
+
+    @property
+    def config(self) -> dict:
+        """Contents of config.json."""
+        return read_json(self.path / "config.json", "is no run folder; give the folder that `ringfence train` made")
+
+    @property
+    def results(self) -> dict[str, dict]:
+        """Evaluations by variant; empty before the first `ringfence eval`."""
+        file = self.path / "results.json"
+        return read_json(file, "is damaged; evaluate the run again") if file.exists() else {}
+
+    @property
+    def metrics(self) -> list[dict]:
+        """Logged training metrics, oldest first; a line cut short by an interruption is dropped."""
+        file, rows = self.path / "metrics.jsonl", []
+        for line in file.read_text().splitlines() if file.exists() else []:
+            try:
+                rows.append(json.loads(line))
+            except json.JSONDecodeError:
+                break
+        return rows
+
+    def checkpoints(self) -> list[tuple[int, Path]]:
+        """(step, file), oldest first."""
+        found = []
+        for file in (self.path / "ckpt").glob("step-*.safetensors"):
+            match = re.fullmatch(r"step-(\d+)\.safetensors", file.name)
+            if match:
+                found.append((int(match[1]), file))
+        return sorted(found)
+
+    def save_checkpoint(self, step: int, state: PyTree) -> Path:
+        """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
+        folder = self.path / "ckpt"
+        folder.mkdir(parents=True, exist_ok=True)
+        arrays = {name: np.ascontiguousarray(leaf) for name, leaf in named_leaves(state)}
+        final = folder / f"step-{step:08d}.safetensors"
+        temporary = folder / f".step-{step:08d}.part"
+        try:
+            save_file(arrays, temporary, {"step": str(step)})
+            os.replace(temporary, final)
+        except BaseException as error:
+            temporary.unlink(missing_ok=True)
+            if isinstance(error, (OSError, SafetensorError)):
+                raise UserError(
+                    f"The checkpoint '{final}' could not be written ({error}); free some space and run the same "
+                    "command again: training resumes from the last checkpoint."
+                ) from error
+            raise
+        for _, old in self.checkpoints()[:-KEEP]:
+            old.unlink(missing_ok=True)
+        return final
+
+    def load_checkpoint(self, template: PyTree, step: int | None = None) -> tuple[int, PyTree]:
+        """(step, state) of the last checkpoint, or of `step`; arrays must match the template in name and shape."""
+        found = self.checkpoints()
+        if step is not None:
+            found = [c for c in found if c[0] == step]
+        if not found:
+            raise CheckpointError(f"'{self.path}' holds no checkpoint; train it with `ringfence train` first.")
+        at, file = found[-1]
+        try:
+            arrays = load_file(file)
+        except (SafetensorError, OSError) as error:
+            raise CheckpointError(f"'{file}' is truncated or damaged ({error}); delete it to use the one before.") from (
+                error
+            )
+        leaves = []
+        for name, leaf in named_leaves(template):
+            if name not in arrays:
+                raise CheckpointError(f"'{file}' lacks the array '{name}'; it was made by another model: train again.")
+            if arrays[name].shape != leaf.shape:
+                raise CheckpointError(
+                    f"'{file}': '{name}' has shape {arrays[name].shape}, this run's config gives {leaf.shape}; the "
+                    "checkpoint belongs to another task or config."
+                )
+            leaves.append(jax.numpy.asarray(arrays[name], leaf.dtype))
+        return at, jax.tree.unflatten(jax.tree.structure(template), leaves)
+
+    def add_result(self, variant: str, result: dict) -> None:
+        write_json(self.path / "results.json", {**self.results, variant: result})
+
+
+def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
+    """Leaves with their paths, e.g. ('params/denoiser/blocks/0/qkv', array)."""
+    return [
+        ("/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), leaf)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    ]
+
+
+def read_json(path: Path, problem: str) -> dict:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise UserError(f"'{path.parent}' {problem} ({type(error).__name__}: {path.name}).") from error
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "w") as f:
+            json.dump(data, f, indent=1)
+        os.replace(temporary, path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
+    """A config dataclass from named changes; strings are read as the field's type, unknown names are refused."""
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    values = {}
+    for name, value in changes.items():
+        if name not in fields:
+            raise unknown(f"config field of {of}", name, fields)
+        default = fields[name].default
+        values[name] = _parse(name, value, default) if isinstance(value, str) else value
+    return kind(**values)
+
+
+def _parse(name: str, text: str, default: Any) -> Any:
+    try:
+        if isinstance(default, bool):
+            return {"true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}[text.lower()]
+        if isinstance(default, int):
+            return int(float(text)) if float(text).is_integer() else int(text)
+        if isinstance(default, float):
+            return float(text)
+        if default is None:
+            return None if text.lower() == "none" else float(text)
+    except (ValueError, KeyError):
+        raise UserError(
+            f"{name}='{text}' cannot be read as {type(default).__name__}; its default is {default!r}."
+        ) from None
+    return text
+
+
+def environment() -> dict:
+    """Versions and hardware, for env.json."""
+    import importlib.metadata as metadata
+
+    packages = ("jax", "jaxlib", "equinox", "optax", "numpy", "scipy", "h5py", "safetensors")
+    return {
+        "ringfence": __version__,
+        "python": platform.python_version(),
+        "packages": {p: metadata.version(p) for p in packages},
+        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "system": platform.platform(terse=True),
+        "git": _git(),
+    }
+
+
+def processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _git() -> str | None:
+    here = Path(__file__).resolve().parent
+    try:
+        out = subprocess.run(
+            ["git", "-C", str(here), "describe", "--always", "--dirty"], capture_output=True, text=True, timeout=5
+        )
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return out.stdout.strip() or None

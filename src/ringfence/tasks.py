@@ -1,0 +1,116 @@
+"""What there is to solve: a simulator, a definition of danger, a data tier, and the constants of its table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from ringfence import features, hazards
+from ringfence.data.store import EpisodeStore
+from ringfence.envs import SimpleSpread
+from ringfence.errors import UserError, unknown
+from ringfence.types import Env, Spec
+
+
+@dataclass(frozen=True)
+class Task:
+    """One row of the benchmark. Normalised return: (r − return_min)/(return_max − return_min); normalised cost:
+    (c + cost_offset)/(cost_limit + cost_offset), both per episode."""
+
+    name: str
+    env: Env | None  # None: a task that exists only as data
+    hazard: hazards.Hazard
+    tier: str = ""
+    return_min: float = 0.0
+    return_max: float = 1.0
+    cost_limit: float = 1.0  # l
+    cost_offset: float = 0.0  # k
+    published_return: tuple[float, float] | None = None  # mean and deviation of the public data set
+    transitions: int = 1_000_000  # of the full data set
+    about: str = ""
+    action_low: float = -1.0
+    action_high: float = 1.0
+    extra: dict = field(default_factory=dict, hash=False, compare=False)
+
+    def normalised_return(self, r):
+        return (r - self.return_min) / (self.return_max - self.return_min)
+
+    def normalised_cost(self, c):
+        return (c + self.cost_offset) / (self.cost_limit + self.cost_offset)
+
+    def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
+        """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
+        if isinstance(self.env, SimpleSpread):
+            return features.simple_spread(view, self.env.n_agents)
+        if store is None:
+            raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
+        rows = slice(0, 20_000)
+        width = 0 if store.state is None else store.state.shape[1]
+        names = store.card["observation_names"] or [f"obs{d}" for d in range(store.observations.shape[2])]
+        state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
+        state = None if store.state is None else store.state[rows]
+        return features.from_data(view, store.observations[rows], state, tuple(names), tuple(state_names))
+
+    def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
+        env = self.env
+        if env is not None:
+            n, a, length = env.n_agents, env.action_dim, env.episode_length
+        elif store is not None:
+            n, a, length = store.n_agents, store.actions.shape[2], int(store.lengths.max())
+        else:
+            raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
+        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length)
+
+
+# OMAR's constants (Pan et al. 2022, as printed by MADIFF): a random and an expert policy's return.
+_SPREAD = dict(hazard=hazards.Separation(0.30), return_min=159.8, return_max=516.8, cost_limit=1.0)
+
+
+def _spread(tier: str, mean: float, deviation: float, about: str, transitions: int = 1_000_000) -> Task:
+    return Task(
+        f"simple_spread-{tier}",
+        SimpleSpread(),
+        tier=tier,
+        published_return=(mean, deviation),
+        about=about,
+        transitions=transitions,
+        **_SPREAD,
+    )
+
+
+TASKS = {
+    t.name: t
+    for t in (
+        _spread("expert", 530.95, 71.41, "a fully trained MATD3 policy"),
+        _spread("medium", 273.39, 92.06, "a partially trained MATD3 policy"),
+        _spread("medium-replay", 203.74, 80.49, "a learner's experience up to the medium level", 97_500),
+        _spread("random", 159.57, 60.46, "uniformly random actions"),
+    )
+}
+
+
+def get(name: str) -> Task:
+    """The task of that name; an unknown one is refused with the nearest name."""
+    if name not in TASKS:
+        raise unknown("task", name, TASKS)
+    return TASKS[name]
+
+
+def from_store(store: EpisodeStore) -> Task:
+    """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
+    name = store.card["task"]
+    if name in TASKS:
+        return TASKS[name]
+    returns = store.returns
+    low, high = float(returns.min()), float(returns.max())
+    return Task(
+        name,
+        None,
+        store.hazard,
+        return_min=low,
+        return_max=high if high > low else low + 1.0,
+        cost_limit=1.0,
+        transitions=store.steps,
+        about=str(store.card.get("provenance", "")),
+        action_low=float(store.card["action_low"]),
+        action_high=float(store.card["action_high"]),
+    )

@@ -1,0 +1,283 @@
+"""The only training loop: compiled chunks of updates, several seeds, logs, checkpoints, exact resume.
+
+Every update's randomness follows from (seed, step) alone, so a run that was killed and resumed equals one that was
+not, and chunk lengths change nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import algos, hazards, tasks
+from ringfence.data.store import EpisodeStore
+from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.progress import Progress
+from ringfence.runs import Run, build_config, environment, write_json
+from ringfence.tasks import Task
+from ringfence.types import Algorithm, PyTree, Spec
+from ringfence.windows import WindowData, draw
+
+
+@dataclass(frozen=True)
+class Job:
+    """One algorithm on one task: everything that defines a run but its seed."""
+
+    algorithm: Algorithm
+    preset: str
+    config: Any
+    task: Task
+    spec: Spec
+    feature_map: Any
+    hazard: hazards.BoundHazard
+
+    def describe(self, seed: int, card: dict) -> dict:
+        """What config.json holds."""
+        return {
+            "algorithm": self.algorithm.name,
+            "preset": self.preset,
+            "config": dataclasses.asdict(self.config),
+            "task": self.task.name,
+            "spec": dataclasses.asdict(self.spec),
+            "hazard": hazards.to_dict(self.hazard.hazard),
+            "feature_map": None if self.task.env is not None else _describe_map(self.feature_map),
+            "seed": seed,
+            "data": card,
+        }
+
+
+def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, store: EpisodeStore | None = None) -> Job:
+    """Resolve names to values; every bad name or value is refused here, before work starts."""
+    a = algos.get(algorithm)
+    preset = preset or next(iter(a.presets))
+    if preset not in a.presets:
+        raise unknown(f"preset of {a.name}", preset, a.presets)
+    config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)
+    feature_map = task.feature_map(config.view, store)
+    spec = task.spec(feature_map, store)
+    hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
+    return Job(a, preset, config, task, spec, feature_map, hazard)
+
+
+def train(
+    algorithm: str,
+    data: EpisodeStore,
+    *,
+    preset: str | None = None,
+    seeds: tuple[int, ...] = (0,),
+    out: str | Path = "runs",
+    changes: dict | None = None,
+    together: bool = False,
+    chunk: int | None = None,
+    checkpoint_every: int | None = None,
+    tensorboard: bool = False,
+    quiet: bool = False,
+    on_chunk: Callable[[int, dict], None] | None = None,
+) -> list[Run]:
+    """Train `algorithm` on `data` for every seed; returns one finished run folder per seed.
+
+    A folder that exists is resumed from its last checkpoint if it holds the same job, and refused otherwise.
+    `together` trains all seeds in one program (same results up to rounding; faster only where the networks are too
+    small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default.
+    """
+    job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
+    runs = [_prepare(Run(folder_of(out, job, seed)), job, seed, data) for seed in seeds]
+    limit = getattr(job.config, "cost_limit", None)
+    used = data if limit is None else data.select(data.episode_costs <= limit)
+    windows = WindowData(used, job.feature_map, job.config.discount)
+    steps = job.config.steps
+    chunk = chunk or max(1, steps // 40)
+    options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
+    if together:
+        _loop(job, windows, runs, seeds, options)
+    else:
+        program = None
+        for run, seed in zip(runs, seeds):
+            program = _loop(job, windows, [run], [seed], options, program)
+    return runs
+
+
+@dataclass(frozen=True)
+class _Options:
+    chunk: int
+    checkpoint_every: int
+    tensorboard: bool
+    quiet: bool
+    on_chunk: Callable[[int, dict], None] | None
+
+
+def make_program(job: Job):
+    """(advance, diagnose): compiled functions over a leading axis of seeds.
+
+    advance(state, keys, arrays, count) makes `count` updates, a traced number, so that one compilation serves every
+    chunk length; it returns the new state and the chunk's mean metrics.
+    """
+    config = job.config
+    update = job.algorithm.make_update(config, job.spec, job.hazard)
+    look = job.algorithm.make_diagnose(config, job.spec, job.hazard)
+
+    def one(state: PyTree, root, arrays):
+        key = jax.random.fold_in(root, state["step"])
+        kd, ku = jax.random.split(key)
+        return update(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
+
+    def advance(state, roots, arrays, count):
+        several = lambda s: jax.vmap(one, in_axes=(0, 0, None))(s, roots, arrays)  # noqa: E731
+        if roots.shape[0] == 1:  # no vmap of one: its matrix products would be batched ones, which are slower
+
+            def several(s):
+                out = one(jax.tree.map(lambda x: x[0], s), roots[0], arrays)
+                return jax.tree.map(lambda x: x[None], out)
+
+        shapes = jax.eval_shape(several, state)[1]
+        zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, jnp.float32), shapes)
+
+        def body(_, carry):
+            state, total = carry
+            state, metrics = several(state)
+            return state, jax.tree.map(jnp.add, total, metrics)
+
+        state, total = jax.lax.fori_loop(0, count, body, (state, zeros))
+        return state, jax.tree.map(lambda x: x / jnp.maximum(count, 1), total)
+
+    def diagnose(state, roots, arrays):
+        def of(state, root):
+            kd, ku = jax.random.split(jax.random.fold_in(root, state["step"]))
+            return look(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
+
+        return jax.vmap(of)(state, roots)
+
+    return jax.jit(advance, donate_argnums=0), jax.jit(diagnose)
+
+
+def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program=None):
+    program = program or make_program(job)
+    advance, diagnose = program
+    roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+    fresh = [job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.hazard) for r in roots]
+    starts, states = [], []
+    for run, state in zip(runs, fresh):
+        if run.checkpoints():
+            step, state = run.load_checkpoint(state)
+        starts.append(int(state["step"]))
+        states.append(state)
+    if len(set(starts)) > 1:
+        raise CheckpointError(
+            f"The runs stand at different steps ({sorted(set(starts))}), so they cannot go on in one program; "
+            "resume them one by one."
+        )
+    step, steps = starts[0], job.config.steps
+    state = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    for run in runs:
+        _trim_metrics(run, step)
+    writers = [_tensorboard(run) for run in runs] if options.tensorboard else []
+    label = f"{job.algorithm.name}/{job.preset} {job.task.name} " + (
+        f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
+    )
+    saved = step if starts[0] else -1
+    with Progress(label, steps, step, options.quiet) as bar:
+        try:
+            while step < steps:
+                count = min(options.chunk - step % options.chunk, steps - step)
+                begun = time.perf_counter()
+                state, metrics = advance(state, roots, windows.arrays, count)
+                step += count
+                metrics = {**metrics, **diagnose(state, roots, windows.arrays)}
+                metrics = {k: np.asarray(v) for k, v in metrics.items()}
+                seconds = time.perf_counter() - begun
+                for i, run in enumerate(runs):
+                    row = {"step": step, "seconds": seconds / len(runs), "updates": count}
+                    row |= {k: float(v[i]) for k, v in metrics.items()}
+                    with open(run.path / "metrics.jsonl", "a") as f:
+                        f.write(json.dumps(row) + "\n")
+                    if writers:
+                        for k, v in row.items():
+                            writers[i].add_scalar(k, v, step)
+                means = {k: float(v.mean()) for k, v in metrics.items()}
+                bad = [k for k, v in means.items() if not np.isfinite(v)]
+                if bad:
+                    raise UserError(f"Training diverged: {bad[0]} is not finite at step {step}; lower lr.")
+                bar.advance(count, means)
+                if options.on_chunk:
+                    options.on_chunk(step, means)
+                if step // options.checkpoint_every > (step - count) // options.checkpoint_every or step == steps:
+                    _save(runs, step, state)
+                    saved = step
+        except KeyboardInterrupt:
+            if saved < step and not _deleted(state):
+                _save(runs, step, state)
+            raise
+    if saved < step:
+        _save(runs, step, state)
+    for w in writers:
+        w.close()
+    return program
+
+
+def _deleted(state: PyTree) -> bool:
+    """An interruption inside a compiled call leaves donated buffers behind; there is nothing to save then."""
+    return any(x.is_deleted() for x in jax.tree.leaves(state))
+
+
+def _save(runs: list[Run], step: int, state: PyTree) -> None:
+    for i, run in enumerate(runs):
+        run.save_checkpoint(step, jax.tree.map(lambda x: np.asarray(x[i]), state))
+
+
+def folder_of(out: str | Path, job: Job, seed: int) -> Path:
+    """runs/simple_spread-medium/icbf-split/seed-0"""
+    name = job.algorithm.name if job.preset == "default" else f"{job.algorithm.name}-{job.preset}"
+    return Path(out) / job.task.name / name / f"seed-{seed}"
+
+
+def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
+    mine = json.loads(json.dumps(job.describe(seed, data.card)))
+    if (run.path / "config.json").exists():
+        there = run.config
+        different = [k for k in mine if there.get(k) != mine[k]]
+        if different:
+            what = different[0]
+            if what == "config":
+                what = next(k for k in mine["config"] if there["config"].get(k) != mine["config"][k])
+            raise UserError(
+                f"'{run.path}' holds another run (its {what} differs); give another --out or delete that folder."
+            )
+    else:
+        write_json(run.path / "config.json", mine)
+        write_json(run.path / "env.json", environment())
+    return run
+
+
+def _trim_metrics(run: Run, step: int) -> None:
+    """Drop log lines past the checkpoint that training resumes from."""
+    rows = [r for r in run.metrics if r["step"] <= step]
+    file = run.path / "metrics.jsonl"
+    if file.exists():
+        file.write_text("".join(json.dumps(r) + "\n" for r in rows))
+
+
+def _tensorboard(run: Run):
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise UserError("TensorBoard logs need an extra package; run pip install 'ringfence[tensorboard]'.") from None
+    return SummaryWriter(str(run.path / "tensorboard"))
+
+
+def _describe_map(feature_map) -> dict:
+    return {
+        "view": feature_map.view,
+        "names": list(feature_map.names),
+        "source": feature_map.source,
+        "plus": feature_map.plus.tolist(),
+        "minus": feature_map.minus.tolist(),
+    }
