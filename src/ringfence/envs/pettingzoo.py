@@ -1,0 +1,139 @@
+"""Simple Spread behind PettingZoo's parallel API, over the same core as the vectorised simulator.
+
+For tools that expect one environment and dictionaries of agents. Rollouts of many episodes should use
+`ringfence.envs.SimpleSpread` directly: it is orders of magnitude faster.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+from gymnasium import spaces
+from pettingzoo import ParallelEnv
+
+from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadState
+from ringfence.errors import UserError
+
+LANDMARK_RADIUS = 0.05
+FRAME_SIZE = 480  # pixels, both sides
+
+Dicts = tuple[dict[str, Any], ...]
+
+
+def parallel_env(render_mode: str | None = None, **options: Any) -> SimpleSpreadParallel:
+    """A `SimpleSpreadParallel`; `options` are the fields of `SimpleSpread` (n_agents, integrator, reward, ...)."""
+    return SimpleSpreadParallel(render_mode=render_mode, **options)
+
+
+class SimpleSpreadParallel(ParallelEnv):
+    """Simple Spread as `agent_0` .. `agent_{N-1}`.
+
+    Observations are float32 (O,), actions force directions in [-1, 1]^2 (clipped), rewards floats. Every agent's info
+    carries `cost` (shared by the team) and `clearance` (own smallest centre distance to another agent minus 0.30;
+    infinite for a single agent). Episodes are truncated at `episode_length` and never terminate.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "name": "ringfence_simple_spread", "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None, **options: Any):
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise UserError(f"There is no render_mode='{render_mode}'; use 'rgb_array', or None to draw nothing.")
+        self.core = SimpleSpread(**options)
+        self.render_mode = render_mode
+        self.possible_agents = names = [f"agent_{i}" for i in range(self.core.n_agents)]
+        self.agents: list[str] = []
+        observation, state = (self.core.observation_dim,), (len(self.core.state_names),)
+        # One object per agent, made once: the API demands identity, so that seeding a space lasts.
+        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, observation, np.float32) for a in names}
+        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (2,), np.float32) for a in names}
+        self.state_space = spaces.Box(-np.inf, np.inf, state, np.float32)
+        self._key: jax.Array | None = None
+        self._state: SpreadState | None = None
+        self._steps = 0
+        core = self.core
+        self._reset = jax.jit(lambda key: core.reset(key, 1))
+        self._step = jax.jit(core.step)
+        self._observe = jax.jit(core.observe)
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
+        """Start an episode; a seed fixes this and all later episodes. `options` is accepted and ignored."""
+        if seed is not None or self._key is None:
+            # Without a seed the first episode is drawn from the system's entropy, as Gymnasium's environments do.
+            entropy = np.random.SeedSequence().generate_state(1)[0] if seed is None else seed
+            self._key = jax.random.key(int(entropy))
+        self._key, key = jax.random.split(self._key)
+        self._state, self._steps, self.agents = self._reset(key), 0, self.possible_agents[:]
+        return self._observations(), self._infos(cost=0.0)
+
+    def step(self, actions: dict[str, Any]) -> Dicts:
+        """Advance by 0.1 s with one action (2,) per agent."""
+        if not self.agents:
+            raise UserError("The episode is over or was never started; call reset() before step().")
+        missing = [a for a in self.agents if a not in actions]
+        if missing:
+            raise UserError(f"step() got no action for {', '.join(missing)}; pass one entry per live agent.")
+        joint = np.stack([np.asarray(actions[a], np.float32) for a in self.agents])[None]
+        self._state, transition = self._step(self._state, joint)
+        self._steps += 1
+        agents, over = self.agents, self._steps >= self.core.episode_length
+        reward = np.asarray(transition.reward)[0]
+        result = (
+            self._observations(),
+            {a: float(r) for a, r in zip(agents, reward)},
+            dict.fromkeys(agents, False),
+            dict.fromkeys(agents, over),
+            self._infos(cost=float(transition.cost[0])),
+        )
+        if over:
+            self.agents = []
+        return result
+
+    def state(self) -> np.ndarray:
+        """(6N,) float32: positions, velocities, landmarks; see `SimpleSpread.state_names`."""
+        if self._state is None:
+            raise UserError("There is no state before the first episode; call reset() first.")
+        return np.asarray(self.core.global_state(self._state)[0], np.float32)
+
+    def render(self) -> np.ndarray | None:
+        """(480, 480, 3) uint8 for render_mode "rgb_array": agents blue, in contact red, landmarks grey."""
+        if self.render_mode is None or self._state is None:
+            return None
+        position, landmarks = np.asarray(self._state.position[0]), np.asarray(self._state.landmarks[0])
+        touching = self._clearance() < 0
+        # Zoom out rather than lose an agent that leaves the arena.
+        extent = max(1.15 * self.core.half_width, float(np.abs(position).max()) + 2 * AGENT_RADIUS)
+        axis = (np.arange(FRAME_SIZE) + 0.5) / FRAME_SIZE * 2 * extent - extent
+        x, y = axis[None, :], -axis[:, None]  # y points up
+        frame = np.full((FRAME_SIZE, FRAME_SIZE, 3), 255, np.uint8)
+        for place in landmarks:
+            frame[(x - place[0]) ** 2 + (y - place[1]) ** 2 < LANDMARK_RADIUS**2] = (90, 90, 90)
+        for place, bad in zip(position, touching):
+            colour = np.array((200, 60, 50) if bad else (70, 100, 200))
+            inside = (x - place[0]) ** 2 + (y - place[1]) ** 2 < AGENT_RADIUS**2
+            frame[inside] = (0.25 * frame[inside] + 0.75 * colour).astype(np.uint8)  # landmarks show through
+        return frame
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        observations = np.asarray(self._observe(self._state)[0], np.float32)
+        return dict(zip(self.possible_agents, observations))
+
+    def _infos(self, cost: float) -> dict[str, dict[str, float]]:
+        return {a: {"cost": cost, "clearance": float(c)} for a, c in zip(self.possible_agents, self._clearance())}
+
+    def _clearance(self) -> np.ndarray:
+        """(N,) smallest centre distance to another agent minus 0.30."""
+        position = np.asarray(self._state.position[0])
+        distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
+        np.fill_diagonal(distance, np.inf)
+        return distance.min(1) - CONTACT_DISTANCE
