@@ -62,7 +62,7 @@ def test_recorded_actions_repeat_the_learners_run(run):
 
 def test_updates_move_the_critics_towards_the_reward():
     """With no future (discount 0) and enough updates, the critics' values approach the scaled rewards."""
-    config = MATD3Config(hidden=32, envs=16, random_rounds=1, updates=600, batch=128, discount=0.0)
+    config = MATD3Config(hidden=32, envs=16, random_rounds=1, updates=400, batch=128, discount=0.0)
     key = jax.random.key(0)
     learner, memory = behaviour._init_learner(ENV, config, key), behaviour._empty_memory(ENV, 16)
     rounds = jnp.arange(1)
@@ -75,8 +75,7 @@ def test_updates_move_the_critics_towards_the_reward():
     assert error < 0.5 * jnp.abs(target - target.mean()).mean()
 
 
-@pytest.mark.parametrize("agents", [2, 5])
-def test_any_number_of_agents(agents):
+def test_any_number_of_agents(agents=5):
     env = SimpleSpread(n_agents=agents)
     run = train_behaviour(env, TINY, jax.random.key(0), 400)
     data = collect(env, snapshot(run, -1, 0.1), 5, jax.random.key(1), batch=3)
@@ -168,7 +167,9 @@ def test_replay_matches_the_public_returns(replay):
 
 def test_a_smaller_replay_keeps_the_mix(replay):
     few = replay_episodes(ENV, 390)
-    assert statistics(few)["return_mean"] == pytest.approx(203.7, rel=0.05)
+    whole = statistics(replay)
+    error = whole["return_std"] / 390**0.5
+    assert abs(statistics(few)["return_mean"] - whole["return_mean"]) < 3 * error
     np.testing.assert_allclose(few["state"][[0, -1]], replay["state"][[0, -1]], atol=1e-4)
 
 
