@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,8 +79,14 @@ def test_updates_move_the_critics_towards_the_reward():
 
 def test_any_number_of_agents(agents=5):
     env = SimpleSpread(n_agents=agents)
-    run = train_behaviour(env, TINY, jax.random.key(0), 400)
-    data = collect(env, snapshot(run, -1, 0.1), 5, jax.random.key(1), batch=3)
+    key = jax.random.key(0)
+    learner, memory = behaviour._init_learner(env, TINY, key), behaviour._empty_memory(env, 8)
+    # Traced, not compiled: shapes are what may depend on the number of agents.
+    traced = jax.eval_shape(
+        partial(behaviour._train_rounds, env, TINY), learner, memory, jnp.arange(2), jax.random.split(key, 2)
+    )
+    assert jax.tree.map(jnp.shape, traced[:2]) == jax.tree.map(jnp.shape, (learner, memory))
+    data = collect(env, BehaviourPolicy(learner.actors, 0.1), 5, jax.random.key(1), batch=3)
     assert data["actions"].shape == (5, 25, agents, 2)
     assert data["observations"].shape == (5, 26, agents, env.observation_dim)
     assert data["state"].shape == (5, 26, 6 * agents)
