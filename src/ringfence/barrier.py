@@ -105,9 +105,7 @@ def hinges(
     )
 
 
-def shaping(
-    h: Array, valid: Array, retention: Retention, eta: Array, delta: float, weight: Array
-) -> Array:
+def shaping(h: Array, valid: Array, retention: Retention, eta: Array, delta: float, weight: Array) -> Array:
     """L_θ of the `split` preset: raise h̄ along the plan, against a frozen barrier.
 
         mean_t max(0, δ − h̄(x̂0_t)) + mean_t max(0, (1−α) δ − h̄(x̂0_{t+1}) + α sg h̄(x̂0_t)),   t ≥ 1 in the first
@@ -121,9 +119,7 @@ def shaping(
     return positive + _mean(drop, valid[:, 1:], weight)
 
 
-def unsafe_bank(
-    features: Array, costs: Array, hazard: BoundHazard, size: int, key: Key
-) -> tuple[Array, Array]:
+def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, key: Key) -> tuple[Array, Array]:
     """(bank (size, N, D), own (size, N) bool): states that are unsafe for the agents marked in `own`.
 
     One half is real unsafe states of the data (M, N, D), drawn with replacement; the rest, or all where the data has

@@ -82,9 +82,7 @@ def denoising_loss(
     return (error * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
-def guided(
-    net: Callable, alpha_bar: Array, y: Array, guidance: float, prediction: Prediction, clip: float
-) -> Predict:
+def guided(net: Callable, alpha_bar: Array, y: Array, guidance: float, prediction: Prediction, clip: float) -> Predict:
     """Classifier-free guidance as one batched call: out(∅) + ω (out(y) − out(∅)); ω = 1 skips the second half."""
 
     def predict(x: Array, k: Array) -> Array:
@@ -93,9 +91,7 @@ def guided(
         if isinstance(guidance, (int, float)) and guidance == 1.0:
             output = net(x, k, y, keep)
         else:
-            both = net(
-                jnp.concatenate([x, x]), jnp.tile(k, 2), jnp.tile(y, 2), jnp.concatenate([keep, ~keep])
-            )
+            both = net(jnp.concatenate([x, x]), jnp.tile(k, 2), jnp.tile(y, 2), jnp.concatenate([keep, ~keep]))
             conditional, free = jnp.split(both, 2)
             output = free + guidance * (conditional - free)
         return to_clean(output, x, signal, noise, prediction, clip)

@@ -129,3 +129,21 @@ class _Joint(FeatureMap):
         shape = (*own.shape[:-1], shared.shape[-1])
         xp = np if isinstance(own, np.ndarray) else jnp
         return xp.concatenate([own, xp.broadcast_to(shared, shape)], -1)
+
+
+def from_dict(data: dict) -> FeatureMap:
+    """The map that a run's config.json describes."""
+    kind = _Joint if data["joint"] else FeatureMap
+    return kind(data["view"], tuple(data["names"]), data["source"], np.array(data["plus"]), np.array(data["minus"]))
+
+
+def to_dict(map: FeatureMap) -> dict:
+    """JSON form of a map."""
+    return {
+        "view": map.view,
+        "names": list(map.names),
+        "source": map.source,
+        "plus": map.plus.tolist(),
+        "minus": map.minus.tolist(),
+        "joint": isinstance(map, _Joint),
+    }

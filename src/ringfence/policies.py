@@ -72,7 +72,9 @@ class Planner(eqx.Module):
     def __check_init__(self):
         o = self.options
         if o.replan > self.horizon - 1:
-            raise UserError(f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}.")
+            raise UserError(
+                f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
+            )
         if o.plans > 1 and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if o.plans > 1 and o.select != "barrier" and not self.hazard.has_formula:

@@ -1,10 +1,10 @@
 """The run folder: everything downstream reads these files and nothing else.
 
-    config.json     algorithm, preset, config, task, spec, hazard, seed, data card
-    env.json        versions, hardware, git commit
-    metrics.jsonl   one line per logged chunk of updates
-    ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
-    results.json    what `ringfence eval` measured, one entry per variant
+config.json     algorithm, preset, config, task, spec, hazard, seed, data card
+env.json        versions, hardware, git commit
+metrics.jsonl   one line per logged chunk of updates
+ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
+results.json    what `ringfence eval` measured, one entry per variant
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class Run:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
         folder = self.path / "ckpt"
         folder.mkdir(parents=True, exist_ok=True)
-        arrays = {name: np.ascontiguousarray(leaf) for name, leaf in named_leaves(state)}
+        arrays = {name: np.array(leaf, order="C") for name, leaf in named_leaves(state)}
         final = folder / f"step-{step:08d}.safetensors"
         temporary = folder / f".step-{step:08d}.part"
         try:
@@ -106,9 +106,9 @@ class Run:
         try:
             arrays = load_file(file)
         except (SafetensorError, OSError) as error:
-            raise CheckpointError(f"'{file}' is truncated or damaged ({error}); delete it to use the one before.") from (
-                error
-            )
+            raise CheckpointError(
+                f"'{file}' is truncated or damaged ({error}); delete it to use the one before."
+            ) from (error)
         leaves = []
         for name, leaf in named_leaves(template):
             if name not in arrays:

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import algos, hazards, tasks
+from ringfence import algos, features, hazards, tasks
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.progress import Progress
@@ -49,7 +49,7 @@ class Job:
             "task": self.task.name,
             "spec": dataclasses.asdict(self.spec),
             "hazard": hazards.to_dict(self.hazard.hazard),
-            "feature_map": None if self.task.env is not None else _describe_map(self.feature_map),
+            "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "seed": seed,
             "data": card,
         }
@@ -163,7 +163,9 @@ def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Optio
     program = program or make_program(job)
     advance, diagnose = program
     roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-    fresh = [job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.hazard) for r in roots]
+    fresh = [
+        job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.hazard) for r in roots
+    ]
     starts, states = [], []
     for run, state in zip(runs, fresh):
         if run.checkpoints():
@@ -271,13 +273,3 @@ def _tensorboard(run: Run):
     except ImportError:
         raise UserError("TensorBoard logs need an extra package; run pip install 'ringfence[tensorboard]'.") from None
     return SummaryWriter(str(run.path / "tensorboard"))
-
-
-def _describe_map(feature_map) -> dict:
-    return {
-        "view": feature_map.view,
-        "names": list(feature_map.names),
-        "source": feature_map.source,
-        "plus": feature_map.plus.tolist(),
-        "minus": feature_map.minus.tolist(),
-    }

@@ -6,6 +6,8 @@ rows past its end repeat its last one and are marked invalid.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,8 +15,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from ringfence.data.store import EpisodeStore
-from ringfence.features import FeatureMap
-from ringfence.types import Array, Batch, Key
+from ringfence.types import Array, Batch, Key, Spec
 
 MIN_COHORT = 30  # return scores are ranks among at least this many steps
 
@@ -26,7 +27,7 @@ class WindowData:
     argument, so that the data is never baked into a compiled program.
     """
 
-    def __init__(self, store: EpisodeStore, features: FeatureMap, discount: float):
+    def __init__(self, store: EpisodeStore, features: Callable, discount: float):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
         step = np.arange(store.steps)
@@ -51,6 +52,20 @@ class WindowData:
             "first_row": jnp.asarray(starts[episode] + episode, jnp.int32),  # (T,)
             "last_row": jnp.asarray(store.episode_ends[episode] + episode, jnp.int32),  # (T,)
         }
+
+
+def blank(spec: Spec, steps: int = 40) -> WindowData:
+    """Data of the right shapes that says nothing: one episode of noise, from which a model's skeleton is built."""
+    rng = np.random.default_rng(0)
+    n, d = spec.n_agents, spec.feature_dim
+    store = EpisodeStore.from_episodes(
+        rng.normal(size=(1, steps + 1, n, d)),
+        np.zeros((1, steps, n, spec.action_dim)),
+        np.zeros((1, steps)),
+        np.zeros((1, steps)),
+        card={"action_low": min(spec.action_low, 0.0), "action_high": max(spec.action_high, 0.0)},
+    )
+    return WindowData(store, lambda observations, state: observations, 0.9)
 
 
 def draw(arrays: dict[str, Array], key: Key, batch: int, horizon: int, history: int = 0) -> Batch:

@@ -225,9 +225,9 @@ def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, k
     """L^P = E ‖a_i − f_φi(s̃_i,t, s̃_i,t+1)‖² on data pairs, summed over the action and averaged over agents."""
     before, after = batch.features[:, config.history], batch.features[:, config.history + 1]
     action = batch.actions[:, config.history]
-    return ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(
-        -1
-    ).mean()
+    return (
+        ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(-1).mean()
+    )
 
 
 def values(params: PyTree, batch: Batch, frozen: PyTree, config: Config) -> Array:
@@ -329,9 +329,7 @@ def barrier_losses(
         if unsafe_made is None:
             raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
         made_h = barrier_on(net, norm, x)
-        on_made = cbf.hinges(
-            made_h, unsafe_made, safe_made, rows, ret, eta, config.delta, config.scaled_margin, weight
-        )
+        on_made = cbf.hinges(made_h, unsafe_made, safe_made, rows, ret, eta, config.delta, config.scaled_margin, weight)
         loss_theta = on_made.safe + on_made.unsafe + on_made.retention
         loss_omega = jnp.zeros(())
     else:
@@ -474,7 +472,15 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 
 
 ICBF = Algorithm("icbf", Config, init, make_update, make_diagnose, make_policy, PRESETS)
-MADIFF = Algorithm("madiff", Config, init, make_update, make_diagnose, make_policy, {
-    "default": {"barrier": False, "barrier_weight": 0.0},
-    "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
-})
+MADIFF = Algorithm(
+    "madiff",
+    Config,
+    init,
+    make_update,
+    make_diagnose,
+    make_policy,
+    {
+        "default": {"barrier": False, "barrier_weight": 0.0},
+        "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
+    },
+)

@@ -1,0 +1,300 @@
+"""The command line: parses, calls, prints. Everything here can be done from Python with the same words."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from ringfence.errors import UserError
+
+out = Console(highlight=False)
+Positional = tyro.conf.Positional
+
+
+def tasks() -> None:
+    """List the tasks with their hazards, limits and constants."""
+    from ringfence import tasks
+
+    table = Table("task", "data", "public return", "hazard", "cost limit l", "offset k", "r_min", "r_max")
+    for t in tasks.TASKS.values():
+        mean, deviation = t.published_return
+        table.add_row(
+            t.name, f"{t.about}, {t.transitions:,} steps", f"{mean:.1f} ± {deviation:.1f}", str(t.hazard),
+            f"{t.cost_limit:g}", f"{t.cost_offset:g}", f"{t.return_min:g}", f"{t.return_max:g}",
+        )
+    out.print(table)
+
+
+def make(
+    task: Positional[str], size: int | None = None, seed: int = 0, out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None
+) -> None:
+    """Regenerate a task's data set (cached).
+
+    Args:
+        task: its name, as `ringfence tasks` lists it.
+        size: transitions; the full data set by default.
+        seed: of the collection.
+        out_file: write here instead of the cache.
+    """
+    from ringfence import tasks
+    from ringfence.data.make import make
+
+    store, path = make(tasks.get(task), size, seed, out_file)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True)
+
+
+def import_omar(directory: Positional[Path], out_file: Annotated[Path, tyro.conf.arg(name="out")]) -> None:
+    """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
+
+    Args:
+        directory: e.g. simple_spread/expert/seed_0_data.
+        out_file: the store to write.
+    """
+    from ringfence.data.omar import import_omar
+
+    store = import_omar(directory)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(out_file)}", soft_wrap=True)
+
+
+def info(file: Positional[Path]) -> None:
+    """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
+    from ringfence.data.audit import audit
+    from ringfence.data.store import EpisodeStore
+
+    report = audit(EpisodeStore.load(file))
+    for name, value in report.facts.items():
+        out.print(f"{name:24} {value}", soft_wrap=True)
+    for warning in report.warnings:
+        out.print(f"[yellow]warning[/] {warning}", soft_wrap=True)
+
+
+def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
+    """Train MATD3 from scratch and write the behaviour policies and the replay that the package ships.
+
+    Args:
+        out_dir: folder for the files.
+    """
+    from ringfence.data.behaviour import train_tier_policies
+
+    for tier, facts in train_tier_policies(out_dir).items():
+        out.print(f"{tier:16} " + "  ".join(f"{k} {v:.4g}" for k, v in facts.items()), soft_wrap=True)
+
+
+def train(
+    algorithm: Positional[str],
+    data: Positional[str],
+    seeds: int = 1,
+    first_seed: int = 0,
+    preset: str | None = None,
+    set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    out: Path = Path("runs"),
+    together: bool = False,
+    tensorboard: bool = False,
+) -> None:
+    """Train an algorithm on a task or on a store of your own; an interrupted run is resumed by the same command.
+
+    Args:
+        algorithm: icbf, madiff, bc or bc-safe.
+        data: a task (its data set is regenerated if need be) or a store's file.
+        seeds: how many, starting with first_seed.
+        first_seed: the first one.
+        preset: named differences from the defaults, e.g. split or paper.
+        set: config fields, e.g. --set barrier_weight=0.5 steps=8000.
+        out: folder of runs.
+        together: train all seeds in one program.
+        tensorboard: write TensorBoard logs, too.
+    """
+    from ringfence import training
+
+    changes = _assignments(set)
+    _early(algorithm, preset, changes)
+    runs = training.train(
+        algorithm, _store(data), preset=preset, seeds=tuple(range(first_seed, first_seed + seeds)), out=out,
+        changes=changes, together=together, tensorboard=tensorboard,
+    )
+    for run in runs:
+        print(run.path)
+
+
+def evaluate(
+    runs: Positional[list[Path]],
+    episodes: int = 200,
+    split: Literal["test", "validation"] = "test",
+    record: int = 4,
+    plans: int | None = None,
+    steps: int | None = None,
+    sampler: str | None = None,
+    guidance: float | None = None,
+    target: float | None = None,
+    temperature: float | None = None,
+    select: str | None = None,
+    margin: float | None = None,
+    prefix: int | None = None,
+    replan: int | None = None,
+    execution: str | None = None,
+) -> None:
+    """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
+
+    Args:
+        runs: run folders, or folders that hold some.
+        episodes: at least 200 for a table.
+        split: test resets, or validation resets for choosing settings.
+        record: episodes kept for the animation of the report.
+        plans: drawn per step; the best safe one is followed.
+        steps: of the sampler.
+        sampler: ddim, ddpm or dpm++.
+        guidance: ω of classifier-free guidance.
+        target: return condition, as a normal score.
+        temperature: scale of the first noise.
+        select: plans are judged by clearance, barrier or both.
+        margin: least safety score that is good enough.
+        prefix: rows of a plan that are judged.
+        replan: steps for which a plan is followed.
+        execution: centralized or decentralized.
+    """
+    from ringfence.evaluate import evaluate as run_evaluation
+
+    given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
+    table = Table("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
+    for run in _runs(runs):
+        r = run_evaluation(run, episodes=episodes, split=split, record=record, quiet=False, **given)
+        table.add_row(
+            str(run.path), r["variant"], f"{r['return_mean']:.1f}", f"{r['cost_mean']:.3f}", f"{r['avoidable_cost']:.3f}",
+            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})", f"{r['return_norm']:.3f}", f"{r['cost_norm']:.3f}",
+        )
+    out.print(table)
+
+
+PLAN_OPTIONS = (
+    "plans", "steps", "sampler", "guidance", "target", "temperature", "select", "margin", "prefix", "replan", "execution",
+)
+
+
+def report(runs: Positional[list[Path]], out_file: Annotated[Path, tyro.conf.arg(name="out")] = Path("report.html")) -> None:
+    """One self-contained HTML page from evaluated runs.
+
+    Args:
+        runs: run folders, or folders that hold some.
+        out_file: the page.
+    """
+    from ringfence.report import build_report
+
+    print(build_report(_runs(runs), out_file))
+
+
+def doctor() -> None:
+    """Versions, devices, what is missing and how to get it."""
+    import importlib.metadata as metadata
+
+    from ringfence.data.make import cache_dir
+    from ringfence.runs import environment
+
+    told = environment()
+    for name in ("ringfence", "python", "system", "processor", "cores", "git"):
+        out.print(f"{name:12} {told[name]}")
+    for name, version in told["packages"].items():
+        out.print(f"{name:12} {version}")
+    out.print(f"{'devices':12} {', '.join(told['devices'])}")
+    out.print(f"{'cache':12} {cache_dir()}", soft_wrap=True)
+    for package, extra, use in (("tensorboardX", "tensorboard", "TensorBoard logs"), ("mpe2", "test", "parity tests")):
+        try:
+            out.print(f"{package:12} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            out.print(f"{package:12} [yellow]missing[/], for {use}: pip install 'ringfence\\[{extra}]'")
+
+
+def demo(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("demo"), tier: str = "expert", quick: bool = False) -> None:
+    """The whole job on Simple Spread: data, training without and with barrier, evaluation, report.
+
+    Args:
+        out_dir: folder for runs and the page.
+        tier: expert, medium, medium-replay or random.
+        quick: a smoke test of a minute or two, with numbers that mean nothing.
+    """
+    from ringfence.demo import run
+
+    run(out_dir, tier, quick)
+
+
+DATA = {"make": make, "import-omar": import_omar, "info": info, "train-behaviour": train_behaviour}
+COMMANDS = {
+    "tasks": tasks, "train": train, "eval": evaluate, "report": report, "demo": demo, "doctor": doctor,
+}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        if arguments[:1] == ["data"]:
+            tyro.extras.subcommand_cli_from_dict(
+                DATA, prog="ringfence data", description="Episode stores: make, import, inspect.", args=arguments[1:]
+            )
+        else:
+            tyro.extras.subcommand_cli_from_dict(
+                COMMANDS | {"data": lambda: main(["data", "--help"])}, prog="ringfence",
+                description="Safe offline multi-agent reinforcement learning.", args=arguments,
+            )
+    except UserError as error:
+        Console(stderr=True, highlight=False).print(f"[red]error:[/] {error}", soft_wrap=True, markup=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(1)
+
+
+def _assignments(pairs: list[str]) -> dict[str, str]:
+    changes = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set steps=8000.")
+        changes[name] = value
+    return changes
+
+
+def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
+    """Refuse bad names before a data set is made for them."""
+    from ringfence import algos
+    from ringfence.errors import unknown
+    from ringfence.runs import build_config
+
+    a = algos.get(algorithm)
+    if preset is not None and preset not in a.presets:
+        raise unknown(f"preset of {a.name}", preset, a.presets)
+    build_config(a.Config, changes, a.name)
+
+
+def _store(data: str):
+    from ringfence import tasks
+    from ringfence.data.make import make
+    from ringfence.data.store import EpisodeStore
+
+    if Path(data).suffix in (".h5", ".hdf5") or Path(data).is_file():
+        return EpisodeStore.load(data)
+    return make(tasks.get(data))[0]
+
+
+def _runs(paths: list[Path]) -> list:
+    from ringfence.runs import Run
+
+    found = []
+    for path in paths:
+        if not path.exists():
+            raise UserError(f"'{path}' does not exist; give a folder that `ringfence train` made.")
+        files = [path / "config.json"] if (path / "config.json").exists() else sorted(path.rglob("config.json"))
+        if not files:
+            raise UserError(f"'{path}' holds no run; give a folder that `ringfence train` made.")
+        found += [Run(f.parent) for f in files]
+    return found
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,245 @@
+"""The evaluation protocol: fixed resets shared by all methods, raw numbers first, unsafe starts apart.
+
+Test resets and validation resets come from disjoint keys; settings are chosen on validation, tables are made on test.
+Every episode is counted; *avoidable* cost is that of the episodes that do not start unsafe.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import algos, features, hazards, stats, tasks, training
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard
+from ringfence.policies import Planner, PlanOptions
+from ringfence.progress import Progress
+from ringfence.runs import Run, build_config
+from ringfence.tasks import Task
+from ringfence.types import Policy, Spec
+from ringfence.windows import blank
+
+PROTOCOL = 1  # results of different protocols are never mixed in one table
+RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
+CHUNK = 50  # episodes per compiled batch
+
+
+def rollout(
+    policy: Policy,
+    env,
+    episodes: int,
+    split: str = "test",
+    seed: int = 0,
+    record: int = 0,
+    label: str = "",
+    quiet: bool = True,
+) -> dict[str, np.ndarray]:
+    """Play `episodes` episodes: `returns`, `costs` (E, L) per step, `states` (E, L+1, S); the first `record` episodes
+    also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise, never the resets."""
+    if split not in RESETS:
+        raise UserError(f"split='{split}' does not exist; use test or validation.")
+    reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
+
+    def play(policy, index, batch, keep):
+        state = env.reset(jax.random.fold_in(reset_root, index), batch)
+
+        def step(carry, key):
+            memory, state = carry
+            memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
+            after, out = env.step(state, decided.action)
+            kept = {"reward": out.reward.mean(-1), "cost": out.cost, "state": env.global_state(after)}
+            if keep:
+                kept |= {k: v[:keep] for k, v in decided.info.items()}
+            return (memory, after), kept
+
+        keys = jax.random.split(jax.random.fold_in(act_root, index), env.episode_length)
+        _, kept = jax.lax.scan(step, (policy.start(batch), state), keys)
+        kept = {k: jnp.moveaxis(v, 0, 1) for k, v in kept.items()}
+        kept["state"] = jnp.concatenate([env.global_state(state)[:, None], kept["state"]], 1)
+        return kept
+
+    compiled = jax.jit(play, static_argnums=(2, 3))
+    chunks, done, recorded = [], 0, {}
+    with Progress(label or "evaluating", episodes, 0, quiet) as bar:
+        while done < episodes:
+            # Always whole chunks, so that the first n episodes are the same ones whatever number is asked for.
+            kept = jax.device_get(compiled(policy, done // CHUNK, CHUNK, min(record, CHUNK) if not done else 0))
+            if not done:
+                recorded = {k: v for k, v in kept.items() if k not in ("reward", "cost", "state")}
+            chunks.append({k: kept[k] for k in ("reward", "cost", "state")})
+            bar.advance(min(CHUNK, episodes - done))
+            done += CHUNK
+    out = {k: np.concatenate([c[k] for c in chunks])[:episodes] for k in chunks[0]}
+    return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | recorded
+
+
+def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.ndarray) -> dict:
+    """The protocol's numbers from per-step rewards and costs (E, L) and who started unsafe (E,)."""
+    returns, costs = played["rewards"].sum(1, dtype=np.float64), played["costs"].sum(1, dtype=np.float64)
+    n, fine = len(returns), ~hazard_at_start
+    violated = costs > 0
+    avoidable = costs[fine] if fine.any() else np.zeros(1)
+    return {
+        "episodes": n,
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_interval": stats.bootstrap_mean(returns),
+        "return_norm": float(task.normalised_return(returns.mean())),
+        "cost_mean": float(costs.mean()),
+        "cost_interval": stats.bootstrap_mean(costs),
+        "cost_norm": float(task.normalised_cost(costs.mean())),
+        "cost_cvar10": stats.cvar(costs),
+        "violation_rate": float(violated.mean()),
+        "violation_interval": stats.clopper_pearson(int(violated.sum()), n),
+        "violation_upper": stats.upper_bound(int(violated.sum()), n),
+        "unsafe_starts": int(hazard_at_start.sum()),
+        "avoidable_cost": float(avoidable.mean()),
+        "avoidable_interval": stats.bootstrap_mean(avoidable),
+        "avoidable_violation_upper": stats.upper_bound(int((avoidable > 0).sum()), len(avoidable)),
+        "constants": {
+            "return_min": task.return_min,
+            "return_max": task.return_max,
+            "cost_limit": task.cost_limit,
+            "cost_offset": task.cost_offset,
+        },
+        "per_episode": {
+            "return": [round(float(x), 3) for x in returns],
+            "cost": [float(x) for x in costs],
+            "unsafe_start": [bool(x) for x in hazard_at_start],
+        },
+    }
+
+
+def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
+    """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
+    view = task.feature_map("pruned")
+    bound = hazards.bind(task.hazard, view.names, view.plus.shape[0])
+    unsafe, _ = bound.labels(jnp.asarray(view(None, states)))
+    return np.asarray(unsafe.any(-1))
+
+
+def evaluate_policy(
+    policy: Policy,
+    task: Task,
+    episodes: int = 200,
+    split: str = "test",
+    seed: int = 0,
+    record: int = 0,
+    label: str = "",
+    quiet: bool = True,
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """(summary, what was recorded) of a policy on a task's simulator."""
+    if task.env is None:
+        raise UserError(f"Task '{task.name}' exists only as data, so nothing can be evaluated; use a simulated task.")
+    if episodes < 1:
+        raise UserError(f"episodes={episodes} must be at least 1.")
+    begun = time.perf_counter()
+    played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
+    result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
+    result |= {"protocol": PROTOCOL, "task": task.name, "split": split, "seed": seed}
+    return result | {"eval_seconds": time.perf_counter() - begun}, played
+
+
+def load(run: Run | str, step: int | None = None, **options):
+    """(job, policy) of a finished run; `options` are fields of PlanOptions, read at evaluation time."""
+    run = run if isinstance(run, Run) else Run(Path(run))
+    job = load_job(run)
+    template = job.algorithm.init(jax.random.key(0), job.spec, job.config, blank(job.spec), job.hazard)
+    _, state = run.load_checkpoint(template, step)
+    return job, make_policy(job, state, options)
+
+
+def load_job(run: Run) -> training.Job:
+    """The job that a run folder holds, rebuilt from its config.json."""
+    told = run.config
+    algorithm = algos.get(told["algorithm"])
+    config = build_config(algorithm.Config, told["config"], algorithm.name)
+    spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
+    if told["feature_map"] is None:
+        task = tasks.get(told["task"])
+        feature_map = task.feature_map(config.view)
+    else:
+        card = told["data"]
+        task = Task(
+            told["task"],
+            None,
+            hazards.from_dict(told["hazard"]),
+            action_low=card["action_low"],
+            action_high=card["action_high"],
+        )
+        feature_map = features.from_dict(told["feature_map"])
+    hazard: BoundHazard = hazards.bind(hazards.from_dict(told["hazard"]), spec.feature_names, spec.n_agents)
+    return training.Job(algorithm, told["preset"], config, task, spec, feature_map, hazard)
+
+
+def make_policy(job: training.Job, state, options: dict) -> Policy:
+    """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
+    chosen = build_config(PlanOptions, options, "the planner")
+    return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
+
+
+def variant_name(job: training.Job, policy: Policy, split: str = "test") -> str:
+    """Evaluation-time choices that differ from the defaults, e.g. `split+plans8`; for direct policies the preset."""
+    name = job.preset
+    if isinstance(policy, Planner):
+        for f in dataclasses.fields(PlanOptions):
+            value = getattr(policy.options, f.name)
+            if value != f.default:
+                name += f"+{f.name}{value}"
+    return name if split == "test" else f"{name}@{split}"
+
+
+def evaluate(
+    run: Run,
+    *,
+    episodes: int = 200,
+    split: Literal["test", "validation"] = "test",
+    record: int = 0,
+    quiet: bool = True,
+    step: int | None = None,
+    **options,
+) -> dict:
+    """Evaluate a run folder and add the result to its results.json, under the variant's name."""
+    job, policy = load(run, step, **options)
+    variant = variant_name(job, policy, split)
+    seed = run.config["seed"]
+    label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
+    result, played = evaluate_policy(policy, job.task, episodes, split, seed, record, label, quiet)
+    result |= {
+        "algorithm": job.algorithm.name,
+        "variant": variant,
+        "options": dataclasses.asdict(policy.options) if isinstance(policy, Planner) else {},
+        "train_seconds": sum(r["seconds"] for r in run.metrics),
+        "parameters": _parameters(policy),
+    }
+    run.add_result(variant, result)
+    if record:
+        keep = {k: v[:record] for k, v in played.items()}
+        np.savez_compressed(run.path / f"rollout-{variant}.npz", **keep)
+    return result
+
+
+def _parameters(policy: Policy) -> int:
+    return int(sum(np.size(x) for x in jax.tree.leaves(policy)))
+
+
+def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
+    """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
+    env = task.env
+    state = env.reset(jax.random.key(0), 1)
+    seen = env.observe(state), env.global_state(state)
+    act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, *seen, key)[1].action)
+    memory, keys = policy.start(1), jax.random.split(jax.random.key(1), calls + 10)
+    took = []
+    for key in keys:
+        begun = time.perf_counter()
+        act(policy, memory, seen, key).block_until_ready()
+        took.append((time.perf_counter() - begun) * 1e3)
+    p50, p99 = np.percentile(took[10:], [50, 99])
+    return {"plan_ms_p50": float(p50), "plan_ms_p99": float(p99)}

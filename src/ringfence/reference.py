@@ -1,0 +1,64 @@
+"""The rows that every table needs: the behaviour data itself, doing nothing, acting at random."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+
+from ringfence.data import behaviour
+from ringfence.data.store import EpisodeStore
+from ringfence.evaluate import PROTOCOL, evaluate_policy, summarise, unsafe_starts
+from ringfence.policies import Constant
+from ringfence.runs import read_json, write_json
+from ringfence.tasks import Task
+from ringfence.types import Array, Key, PolicyStep, PyTree
+
+FILE = "reference.json"
+
+
+class Behaviour(eqx.Module):
+    """A shipped behaviour policy, played with the noise that it collected data with."""
+
+    policy: behaviour.BehaviourPolicy
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        return memory, PolicyStep(self.policy.act(observations, key), {})
+
+
+def of_data(store: EpisodeStore, task: Task) -> dict:
+    """The protocol's numbers of the logged episodes themselves (their own resets, not the test resets)."""
+    length = int(store.lengths.max())
+    pad = np.arange(length) < store.lengths[:, None]
+    rewards, costs = np.zeros(pad.shape), np.zeros(pad.shape)
+    rewards[pad], costs[pad] = store.rewards.mean(1), store.costs
+    if store.state is not None and task.env is not None:
+        first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+        starts = unsafe_starts(task, store.state[first])
+    else:
+        starts = np.zeros(store.episodes, bool)
+    result = summarise({"rewards": rewards, "costs": costs}, task, starts)
+    del result["per_episode"]  # up to 40 000 episodes: the summary is enough
+    return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
+
+
+def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:
+    """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes."""
+    file = Path(out) / task.name / FILE
+    if file.exists():
+        known = read_json(file, "is damaged; delete it")
+        if known.get("do-nothing", {}).get("episodes") == episodes and known["behaviour data"]["data"] == store.card:
+            return known
+    spec = task.spec(task.feature_map("pruned"))
+    policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
+    if task.tier in behaviour.TARGETS:
+        policies["behaviour policy"] = Behaviour(behaviour.shipped_policy(task.tier))
+    rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
+    for name, policy in policies.items():
+        rows[name], _ = evaluate_policy(policy, task, episodes, label=name, quiet=quiet)
+    write_json(file, rows)
+    return rows

@@ -1,0 +1,293 @@
+"""The table: one row per algorithm and variant, all seeds pooled; what must not be mixed is refused here."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ringfence import stats
+from ringfence.errors import UserError
+from ringfence.runs import Run, read_json
+
+SPLITS = ("test", "validation")
+NAMES = {
+    "bc": "BC",
+    "bc-safe": "BC on safe episodes",
+    "matd3bc": "MA-TD3BC",
+    "omar": "OMAR",
+    "madiff": "MADIFF (no barrier)",
+    "icbf": "ICBF-Diffuser",
+}
+ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
+NEEDED = ("episodes", "return_mean", "cost_mean", "avoidable_cost", "violation_rate", "constants", "protocol", "task")
+
+
+@dataclass
+class Row:
+    """An algorithm and variant over its seeds, or a reference policy. Intervals are 95 %."""
+
+    name: str  # in plain words
+    variant: str  # as in results.json; empty for references
+    algorithm: str
+    preset: str
+    reference: bool
+    split: str
+    seeds: tuple[int, ...]
+    episodes: int
+    returns: float
+    returns_interval: tuple[float, float]
+    cost: float
+    cost_interval: tuple[float, float]
+    avoidable: float
+    avoidable_interval: tuple[float, float]
+    violations: int
+    violation_upper: float  # exact, one-sided
+    unsafe_starts: int
+    cvar: float
+    returns_norm: float
+    cost_norm: float
+    safe: bool  # the upper end of the cost's interval is within the limit
+    parameters: int | None = None
+    train_seconds: float | None = None
+    plan_ms: float | None = None
+    members: list[tuple[Run, dict]] = field(default_factory=list)
+    style: tuple[int, int] = (0, 0)  # colour, marker
+
+    @property
+    def violation_rate(self) -> float:
+        return self.violations / self.episodes
+
+    @property
+    def label(self) -> str:
+        """Name and variant in one line, e.g. `ICBF-Diffuser split+plans4`."""
+        return f"{self.name} {self.variant}".strip()
+
+
+@dataclass
+class Section:
+    """One task: everything that may stand in one table, and the runs it came from."""
+
+    task: str
+    hazard: dict
+    card: dict
+    constants: dict[str, float]
+    protocol: int
+    runs: list[Run]
+    tables: dict[str, list[Row]]  # by split
+    references: list[Row]
+
+    @property
+    def rows(self) -> list[Row]:
+        return [r for split in SPLITS for r in self.tables.get(split, [])]
+
+
+def sections(runs: Iterable[Run]) -> list[Section]:
+    """One section per task, in the order in which the runs name them."""
+    tasks: dict[str, list[Run]] = {}
+    for run in _distinct(runs):
+        tasks.setdefault(run.config["task"], []).append(run)
+    if not tasks:
+        raise UserError("No run was given, so there is nothing to report; pass run folders made by `ringfence train`.")
+    return [_section(task, members) for task, members in tasks.items()]
+
+
+def _distinct(runs: Iterable[Run]) -> list[Run]:
+    """Folders become runs; the same folder named twice counts once."""
+    found = {}
+    for run in runs:
+        run = run if isinstance(run, Run) else Run(Path(run))
+        found.setdefault(run.path.resolve(), run)
+    return list(found.values())
+
+
+def _section(task: str, runs: list[Run]) -> Section:
+    first, results = runs[0], {}
+    for run in runs:
+        results[run.path] = run.results
+        if not results[run.path]:
+            raise UserError(f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first.")
+    entries = [(run, name, result) for run in runs for name, result in results[run.path].items()]
+    for run, name, result in entries:
+        _check(f"'{run.path}' variant '{name}'", result, task)
+        if result["split"] not in SPLITS:
+            raise UserError(f"'{run.path}' variant '{name}' has split '{result['split']}', not test or validation.")
+        if "per_episode" not in result:
+            raise UserError(f"'{run.path}' variant '{name}' lacks its episodes; run `ringfence eval {run.path}` again.")
+    leader = entries[0][2]
+    for run, name, result in entries:
+        _agree(f"'{run.path}' variant '{name}'", result, leader, f"'{first.path}'")
+    card = first.config.get("data") or {}
+    for run in runs:
+        told = (run.config.get("data") or {}).get("provenance")
+        if told != card.get("provenance"):
+            raise UserError(
+                f"'{run.path}' was trained on other data ({told}) than '{first.path}' ({card.get('provenance')}); "
+                "make one report for each data set."
+            )
+    references = _references(runs, task, leader, first)
+    tables = {}
+    differing = _differing(runs)
+    for split in SPLITS:
+        groups: dict[tuple, list[tuple[Run, dict]]] = {}
+        for run, name, result in entries:
+            if result["split"] == split:
+                config = json.dumps(run.config["config"], sort_keys=True)
+                groups.setdefault((run.config["algorithm"], name, config), []).append((run, result))
+        rows = [_row(name, members, differing) for (_, name, _), members in groups.items()]
+        if rows:
+            tables[split] = sorted(rows, key=_place)
+    section = Section(
+        task, first.config.get("hazard") or {}, card, leader["constants"], leader["protocol"], runs, tables, references
+    )
+    _paint(section)
+    return section
+
+
+def _check(who: str, result: dict, task: str) -> None:
+    missing = [k for k in NEEDED if k not in result]
+    if missing:
+        raise UserError(f"{who} lacks '{missing[0]}', so it was made by another version; evaluate it again.")
+    if result["task"] != task:
+        raise UserError(f"{who} holds a result of task '{result['task']}', not of '{task}'; evaluate the run again.")
+
+
+def _agree(who: str, result: dict, leader: dict, of: str) -> None:
+    if result["protocol"] != leader["protocol"]:
+        raise UserError(
+            f"{who} was evaluated under protocol {result['protocol']}, {of} under protocol {leader['protocol']}; "
+            "such numbers cannot stand in one table: evaluate both with one version."
+        )
+    if result["constants"] != leader["constants"]:
+        raise UserError(f"{who} was normalised with other constants than {of}; evaluate both with one version.")
+
+
+def _references(runs: list[Run], task: str, leader: dict, first: Run) -> list[Row]:
+    rows, read = {}, set()
+    for run in runs:
+        file = run.path.resolve().parent.parent / "reference.json"
+        if file in read or not file.exists():
+            continue
+        read.add(file)
+        for name, result in read_json(file, "holds a damaged reference file; delete it and make it again").items():
+            _check(f"'{file}' row '{name}'", result, task)
+            _agree(f"'{file}' row '{name}'", result, leader, f"'{first.path}'")
+            rows.setdefault(name, _numbers([result]) | {"split": result.get("split", "test")})
+    return [
+        Row(name=name, variant="", algorithm="", preset="", reference=True, seeds=(), **numbers)
+        for name, numbers in rows.items()
+    ]
+
+
+def _differing(runs: list[Run]) -> dict[tuple[str, str], list[str]]:
+    """Config fields in which runs of the same algorithm and preset differ: they get rows of their own."""
+    configs: dict[tuple[str, str], list[dict]] = {}
+    for run in runs:
+        configs.setdefault((run.config["algorithm"], run.config["preset"]), []).append(run.config["config"])
+    return {
+        key: [k for k in several[0] if any(c.get(k) != several[0][k] for c in several)]
+        for key, several in configs.items()
+    }
+
+
+def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
+    told = members[0][0].config
+    seeds = [run.config["seed"] for run, _ in members]
+    for k, seed in enumerate(seeds):
+        if seed in seeds[:k]:
+            raise UserError(
+                f"'{members[k][0].path}' and '{members[seeds.index(seed)][0].path}' are the same job with the same "
+                f"seed {seed}; give only one of them."
+            )
+    shown = re.sub(r"^default\b\+?|@validation$", "", variant).removesuffix("@validation")
+    apart = differing.get((told["algorithm"], told["preset"]), [])
+    if apart:
+        shown += " [" + ", ".join(f"{k}={told['config'][k]}" for k in apart) + "]"
+    results = [result for _, result in members]
+    return Row(
+        name=NAMES.get(told["algorithm"], told["algorithm"]),
+        variant=shown.strip(),
+        algorithm=told["algorithm"],
+        preset=told["preset"],
+        reference=False,
+        split=results[0]["split"],
+        seeds=tuple(sorted(seeds)),
+        parameters=results[0].get("parameters"),
+        train_seconds=_mean(results, "train_seconds"),
+        plan_ms=_mean(results, "plan_ms_p50"),
+        members=members,
+        **_numbers(results),
+    )
+
+
+def _mean(results: list[dict], key: str) -> float | None:
+    values = [r[key] for r in results if r.get(key) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _numbers(results: list[dict]) -> dict:
+    """Pooled numbers of several seeds; intervals resample episodes within each seed."""
+    first = results[0]
+    c = first["constants"]
+    if len(results) == 1:
+        n = first["episodes"]
+        violations = round(first["violation_rate"] * n)
+        numbers = {
+            "episodes": n,
+            "returns": first["return_mean"],
+            "returns_interval": tuple(first["return_interval"]),
+            "cost": first["cost_mean"],
+            "cost_interval": tuple(first["cost_interval"]),
+            "avoidable": first["avoidable_cost"],
+            "avoidable_interval": tuple(first["avoidable_interval"]),
+            "violations": violations,
+            "unsafe_starts": first["unsafe_starts"],
+            "cvar": first["cost_cvar10"],
+        }
+    else:
+        seed = np.concatenate([np.full(len(r["per_episode"]["cost"]), k) for k, r in enumerate(results)])
+        returns, cost, unsafe = (
+            np.concatenate([np.asarray(r["per_episode"][k], kind) for r in results])
+            for k, kind in (("return", float), ("cost", float), ("unsafe_start", bool))
+        )
+        fine = ~unsafe if not unsafe.all() else np.ones_like(unsafe)
+        avoidable = cost[fine] * (not unsafe.all())
+        numbers = {
+            "episodes": len(cost),
+            "returns": float(returns.mean()),
+            "returns_interval": stats.bootstrap_mean(returns, strata=seed),
+            "cost": float(cost.mean()),
+            "cost_interval": stats.bootstrap_mean(cost, strata=seed),
+            "avoidable": float(avoidable.mean()),
+            "avoidable_interval": stats.bootstrap_mean(avoidable, strata=seed[fine]),
+            "violations": int((cost > 0).sum()),
+            "unsafe_starts": int(unsafe.sum()),
+            "cvar": stats.cvar(cost),
+        }
+    return numbers | {
+        "violation_upper": stats.upper_bound(numbers["violations"], numbers["episodes"]),
+        "returns_norm": (numbers["returns"] - c["return_min"]) / (c["return_max"] - c["return_min"]),
+        "cost_norm": (numbers["cost"] + c["cost_offset"]) / (c["cost_limit"] + c["cost_offset"]),
+        "safe": numbers["cost_interval"][1] <= c["cost_limit"],
+    }
+
+
+def _place(row: Row) -> tuple:
+    rank = ORDER.index(row.algorithm) if row.algorithm in ORDER else len(ORDER)
+    numbers_as_numbers = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", row.variant)]
+    return rank, row.algorithm, row.preset != "paper", [(isinstance(p, str), p) for p in numbers_as_numbers]
+
+
+def _paint(section: Section) -> None:
+    """A colour per algorithm and preset, a marker per variant of it; the same ones in every figure."""
+    colours: dict[tuple, int] = {}
+    markers: dict[tuple, dict[str, int]] = {}
+    for row in section.rows:
+        family = row.algorithm, row.preset
+        colour = colours.setdefault(family, len(colours))
+        of = markers.setdefault(family, {})
+        row.style = colour, of.setdefault(row.variant, len(of))
