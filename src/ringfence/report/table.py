@@ -111,7 +111,7 @@ def _section(task: str, runs: list[Run]) -> Section:
         results[run.path] = run.results
         if not results[run.path]:
             raise UserError(f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first.")
-    entries = [(run, name, result) for run in runs for name, result in results[run.path].items()]
+    entries = [(run, name, {"variant": name, **r}) for run in runs for name, r in results[run.path].items()]
     for run, name, result in entries:
         _check(f"'{run.path}' variant '{name}'", result, task)
         if result["split"] not in SPLITS:
@@ -203,7 +203,7 @@ def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
                 f"'{members[k][0].path}' and '{members[seeds.index(seed)][0].path}' are the same job with the same "
                 f"seed {seed}; give only one of them."
             )
-    shown = re.sub(r"^default\b\+?|@validation$", "", variant).removesuffix("@validation")
+    shown = re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
     apart = differing.get((told["algorithm"], told["preset"]), [])
     if apart:
         shown += " [" + ", ".join(f"{k}={told['config'][k]}" for k in apart) + "]"

@@ -1,0 +1,259 @@
+"""The report is tested on run folders of small made-up files: nothing is trained."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from ringfence import stats
+from ringfence.errors import UserError
+from ringfence.report import animation, build_report
+from ringfence.report.table import sections
+from ringfence.runs import Run
+
+TASK = "simple_spread-medium"
+CONSTANTS = {"return_min": 159.8, "return_max": 516.8, "cost_limit": 1.0, "cost_offset": 0.0}
+NAMES = ["own.vx", "own.vy", "own.x", "own.y"]
+
+
+def result(returns, costs, unsafe=None, **more) -> dict:
+    returns, costs = np.asarray(returns, float), np.asarray(costs, float)
+    unsafe = np.zeros(len(costs), bool) if unsafe is None else np.asarray(unsafe)
+    fine = costs[~unsafe]
+    return {
+        "episodes": len(returns),
+        "return_mean": returns.mean(),
+        "return_interval": [returns.min(), returns.max()],
+        "cost_mean": costs.mean(),
+        "cost_interval": [costs.min(), costs.max()],
+        "cost_cvar10": stats.cvar(costs),
+        "violation_rate": float((costs > 0).mean()),
+        "unsafe_starts": int(unsafe.sum()),
+        "avoidable_cost": fine.mean(),
+        "avoidable_interval": [fine.min(), fine.max()],
+        "constants": CONSTANTS,
+        "per_episode": {"return": returns.tolist(), "cost": costs.tolist(), "unsafe_start": unsafe.tolist()},
+        "protocol": 1,
+        "task": TASK,
+        "split": "test",
+        "options": {},
+        "parameters": 12345,
+        "train_seconds": 60.0,
+    } | more
+
+
+def folder(
+    root, algorithm="icbf", preset="split", seed=0, results=None, task=TASK, provenance="made up", **config
+) -> Run:
+    """A run folder without checkpoint."""
+    name = algorithm if preset == "default" else f"{algorithm}-{preset}"
+    path = root / "runs" / task / name / f"seed-{seed}"
+    path.mkdir(parents=True)
+    told = {
+        "algorithm": algorithm,
+        "preset": preset,
+        "config": {"steps": 4000, "history": 0} | config,
+        "task": task,
+        "spec": {"n_agents": 2, "feature_names": NAMES, "episode_length": 5},
+        "hazard": {"kind": "Separation", "radius": 0.3, "safe_margin": 0.075},
+        "seed": seed,
+        "data": {"provenance": provenance, "collected": "by hand <b>", "seed": 0},
+    }
+    (path / "config.json").write_text(json.dumps(told))
+    (path / "env.json").write_text(json.dumps({"python": "3.11", "packages": {"jax": "0.5"}}))
+    rows = [{"step": s, "seconds": 1.0, "loss/denoising": 1 / s, "barrier/weight": 0.3} for s in (10, 20, 30)]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
+    if results is not None:
+        (path / "results.json").write_text(json.dumps(results))
+    return Run(path)
+
+
+def record(run: Run, variant: str, plans: int, episodes: int = 2, steps: int = 5, agents: int = 2, rows: int = 3):
+    rng = np.random.default_rng(0)
+    kept = {
+        "states": rng.uniform(-1, 1, (episodes, steps + 1, 6 * agents)),
+        "rewards": rng.normal(size=(episodes, steps)),
+        "costs": rng.integers(0, 2, (episodes, steps)).astype(float),
+        "plans": rng.uniform(-1, 1, (episodes, steps, plans, rows, agents, len(NAMES))),
+        "chosen": rng.integers(0, plans, (episodes, steps)),
+    }
+    np.savez_compressed(run.path / f"rollout-{variant}.npz", **kept)
+    return kept
+
+
+@pytest.fixture
+def runs(tmp_path) -> list[Run]:
+    rng = np.random.default_rng(1)
+    made = []
+    for seed in (0, 1):
+        costs = rng.integers(0, 2, 20)
+        results = {
+            "split": result(rng.normal(250, 30, 20), costs, costs > 0, options={"plans": 1}),
+            "split+plans4": result(rng.normal(260, 30, 20), np.zeros(20), options={"plans": 4}, plan_ms_p50=7.25),
+        }
+        if seed == 0:
+            results["split@validation"] = result([1.0, 2.0], [0, 1], split="validation")
+        made.append(folder(tmp_path, seed=seed, results=results))
+    made.append(folder(tmp_path, "bc", "default", results={"default": result([200, 210], [3, 4])}))
+    for name in ("split", "split+plans4"):
+        record(made[0], name, 4 if "plans" in name else 1)
+    data = result([270.0, 272.0], [0, 1], split="data")
+    del data["per_episode"], data["options"]
+    idle = result([170.0, 172.0], [0, 0])
+    (tmp_path / "runs" / TASK / "reference.json").write_text(json.dumps({"behaviour data": data, "do-nothing": idle}))
+    return made
+
+
+def test_page_is_whole_and_self_contained(runs, tmp_path):
+    page = build_report(runs, tmp_path / "out" / "page.html", title="A & B")
+    text = page.read_text()
+    assert not re.search(r"https?://|//cdn|@import|<script[^>]+src=|<link(?![^>]+href=\"data:)", text)
+    assert "<title>A &amp; B</title>" in text and "by hand &lt;b&gt;" in text
+    for row in ("BC", "ICBF-Diffuser", "split+plans4", "behaviour data", "do-nothing"):
+        assert row in text
+    assert "Validation results" in text and "return − 159.8" in text
+    assert text.count("<tr class") == 6  # three methods, one on validation, two references
+    assert "NaN" not in text and "nan" not in re.findall(r"<td>(.*?)</td>", text)
+    identifiers = re.findall(r'\bid="([^"]+)"', text)
+    assert len(identifiers) == len(set(identifiers))
+    assert all(target in identifiers for target in re.findall(r"url\(#([^)]+)\)", text))
+    assert list(page.parent.iterdir()) == [page]  # nothing temporary stays behind
+
+
+def test_page_goes_into_a_folder(runs, tmp_path):
+    assert build_report(map(lambda r: str(r.path), runs), tmp_path) == tmp_path / "report.html"
+
+
+def test_seeds_are_pooled(runs):
+    (section,) = sections(runs)
+    bc, plain, chosen = section.tables["test"]
+    assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+plans4"]
+    told = [r.results["split"]["per_episode"] for r in runs[:2]]
+    returns, costs = (np.concatenate([t[k] for t in told]) for k in ("return", "cost"))
+    assert plain.seeds == (0, 1) and plain.episodes == 40
+    assert plain.returns == pytest.approx(returns.mean())
+    assert plain.returns_interval == stats.bootstrap_mean(returns, strata=np.repeat([0, 1], 20))
+    assert plain.cost == pytest.approx(costs.mean()) and plain.avoidable == 0.0
+    assert plain.violations == int(costs.sum())
+    assert plain.violation_upper == stats.upper_bound(plain.violations, 40)
+    assert plain.returns_norm == pytest.approx((returns.mean() - 159.8) / 357.0)
+    assert chosen.violation_upper == pytest.approx(1 - 0.05 ** (1 / 40)) and chosen.plan_ms == 7.25
+    assert chosen.safe and not bc.safe
+    assert [r.name for r in section.references] == ["behaviour data", "do-nothing"]
+    assert [r.variant for r in section.tables["validation"]] == ["split"]
+
+
+def test_headline_names_the_best_safe_method(runs, tmp_path):
+    text = build_report(runs, tmp_path).read_text()
+    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes, at most 7\.2 %"
+    assert re.search(f'class="headline">{said}', text)
+
+
+def test_configs_that_differ_get_rows_of_their_own(tmp_path):
+    results = {"split": result([1.0, 2.0], [0, 1])}
+    two = [folder(tmp_path / str(k), results=results, steps=k) for k in (10, 20)]
+    (section,) = sections(two)
+    assert sorted(r.variant for r in section.tables["test"]) == ["split [steps=10]", "split [steps=20]"]
+
+
+def test_tasks_are_kept_apart(tmp_path):
+    other = "simple_spread-expert"
+    runs = [
+        folder(tmp_path, results={"split": result([1.0, 2.0], [0, 1])}),
+        folder(tmp_path, task=other, results={"split": result([3.0, 4.0], [0, 1], task=other)}),
+    ]
+    assert [(s.task, len(s.rows)) for s in sections(runs)] == [(TASK, 1), (other, 1)]
+    assert build_report(runs, tmp_path).read_text().count("<h2") == 2
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        ({"protocol": 2}, "protocol 2"),
+        ({"task": "simple_spread-expert"}, "simple_spread-expert"),
+        ({"split": "train"}, "train"),
+        ({"constants": CONSTANTS | {"cost_limit": 2.0}}, "constants"),
+        ({"per_episode": None}, None),
+    ],
+)
+def test_numbers_that_do_not_belong_together_are_refused(tmp_path, change, said):
+    odd = result([1.0, 2.0], [0, 1]) | change
+    if said is None:
+        del odd["per_episode"]
+    runs = [
+        folder(tmp_path, results={"split": result([1.0, 2.0], [0, 1])}),
+        folder(tmp_path, "madiff", "default", results={"default": odd}),
+    ]
+    with pytest.raises(UserError, match="madiff/seed-0") as caught:
+        build_report(runs, tmp_path / "page.html")
+    assert said is None or said in str(caught.value)
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_reference_of_another_protocol_is_refused(runs, tmp_path):
+    file = tmp_path / "runs" / TASK / "reference.json"
+    file.write_text(json.dumps({"do-nothing": result([1.0], [0], protocol=7)}))
+    with pytest.raises(UserError, match="reference.json.*protocol 7"):
+        build_report(runs, tmp_path)
+
+
+def test_other_data_and_a_seed_given_twice_are_refused(tmp_path):
+    results = {"split": result([1.0, 2.0], [0, 1])}
+    one = folder(tmp_path / "a", results=results)
+    with pytest.raises(UserError, match="other data"):
+        build_report([one, folder(tmp_path / "b", seed=1, results=results, provenance="public")], tmp_path)
+    with pytest.raises(UserError, match="same seed 0"):
+        build_report([one, folder(tmp_path / "c", results=results)], tmp_path)
+    assert sections([one, one])[0].rows[0].seeds == (0,)  # the same folder twice is one run
+
+
+def test_runs_without_results_are_refused(tmp_path):
+    run = folder(tmp_path)
+    with pytest.raises(UserError, match="ringfence eval"):
+        build_report([run], tmp_path)
+    with pytest.raises(UserError, match="No run"):
+        build_report([], tmp_path)
+
+
+def test_players_keep_the_chosen_plan_first(runs):
+    (section,) = sections(runs)
+    many, one = animation.players(section)
+    assert (many["label"], one["label"]) == ("ICBF-Diffuser split+plans4", "ICBF-Diffuser split")
+    kept = np.load(runs[0].path / "rollout-split+plans4.npz")
+    steps, shown, rows, agents = many["episodes"][1]["shape"]
+    packed = animation.unpack(many["episodes"][1]["plans"]).reshape(steps, shown, rows, agents, 2)
+    step = 3
+    expected = kept["plans"][1, step, kept["chosen"][1, step], ..., 2:4]
+    assert shown == 4 and np.allclose(packed[step, 0], expected, atol=5.1e-4)
+    positions = animation.unpack(many["episodes"][0]["positions"]).reshape(steps + 1, agents, 2)
+    assert np.allclose(positions.reshape(steps + 1, -1), kept["states"][0, :, :4], atol=5.1e-4)
+
+
+def test_many_plans_are_cut_to_the_budget(monkeypatch):
+    plans = np.arange(2 * 6 * 3 * 2 * 2, dtype=float).reshape(2, 6, 3, 2, 2) / 1000
+    monkeypatch.setattr(animation, "NUMBERS", 2 * 3 * 2 * 2 * 2)
+    told = animation.few(plans, np.array([5, 0]))
+    assert told["shape"] == [2, 2, 3, 2]
+    assert np.allclose(animation.unpack(told["plans"]).reshape(2, 2, 3, 2, 2)[0, 0], plans[0, 5])
+
+
+def test_a_plan_is_repeated_while_it_is_followed():
+    plans = np.zeros((1, 3, 1, 2, 1, 4))
+    plans[0, 0, ..., 2] = 0.5
+    plans[0, 2, ..., 2] = 0.7
+    xy = animation.tracks({"plans": plans}, NAMES, 1, 0)
+    assert np.allclose(xy[0, :, 0, 0, 0, 0], [0.5, 0.5, 0.7])
+
+
+def test_missing_checkpoint_is_said_on_the_page(tmp_path):
+    run = folder(tmp_path, results={"split": result([1.0, 2.0], [0, 1])}, barrier=True)
+    assert "Not drawn:" in build_report([run], tmp_path).read_text()
+
+
+def test_damaged_recording_is_an_error_that_helps(runs, tmp_path):
+    (runs[0].path / "rollout-split.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(UserError, match="damaged"):
+        build_report(runs, tmp_path)
