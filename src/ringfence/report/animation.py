@@ -57,7 +57,12 @@ def players(section: Section) -> list[dict]:
     single = [f for f in rest if f[0] == 1] or rest
     same = [f for f in single if (f[1].algorithm, f[1].preset) == (most[1].algorithm, most[1].preset)]
     chosen = [most, *(same or single)[-1:]][:VARIANTS]
-    return [p for _, row, run, arrays in chosen if (p := player(section, row, run, arrays))]
+    made = [p for _, row, run, arrays in chosen if (p := player(section, row, run, arrays))]
+    for pair in zip(*(p["episodes"] for p in made)):  # the same resets at the same scale
+        reach = max(e["reach"] for e in pair)
+        for e in pair:
+            e["reach"] = reach
+    return made
 
 
 def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) -> dict | None:

@@ -45,10 +45,10 @@ STYLE = {
 
 # (title, y axis, logarithmic, [(metric, line style, what it is on)])
 PANELS = (
-    ("Denoising loss", "L^D", True, [("loss/denoising", "-", "")]),
-    ("Cloning loss", "L", True, [("loss/cloning", "-", "")]),
-    ("Barrier loss (h learns)", "L_ω", False, [("loss/barrier", "-", "")]),
-    ("Shaping loss (the planner learns)", "L_θ", False, [("loss/shaping", "-", "")]),
+    ("Denoising loss", "loss", True, [("loss/denoising", "-", "")]),
+    ("Cloning loss", "loss", True, [("loss/cloning", "-", "")]),
+    ("Barrier loss (h learns)", "loss", False, [("loss/barrier", "-", "")]),
+    ("Shaping loss (the planner learns)", "loss", False, [("loss/shaping", "-", "")]),
     (
         "h is right on safe states",
         "share with h ≥ 0",
@@ -132,7 +132,7 @@ def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
             ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
         ax.margins(0.08, 0.1)
         low, high = ax.get_xlim()
-        ax.set_xlim(min(low, -0.02 * high), high + 0.12 * (high - low))
+        ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
         ax.set_xlabel(f"avoidable {x_label}")
         ax.set_ylabel("return per episode")
         made.canvas.draw()
@@ -299,7 +299,7 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
     most = max(np.abs(f).max() for f in fields) or 1.0
     rest = np.array([position[j] - position[agent] for j in range(n) if j not in (agent, other)]).reshape(-1, 2)
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        made = figure(4.1 * len(fields) + 0.7, 4.3)
+        made = figure(4.1 * len(fields) + 0.7, 4.0)
         axes = made.subplots(1, len(fields), squeeze=False, sharey=True)[0]
         for ax, h, (case, _) in zip(axes, fields, cases):
             shown = ax.imshow(
@@ -322,8 +322,8 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
         bar = made.colorbar(shown, ax=axes, shrink=0.85)
         bar.set_label("h  (negative: judged unsafe)")
         share = [_agreement(h, distance < radius) for h in fields]
-        about = " and ".join(
-            f"{case}, h < 0 on {inside:.0%} of the area in contact and on {outside:.0%} of the rest"
+        about = "; ".join(
+            f"{case}, h < 0 on {100 * inside:.0f} % of the area in contact and on {100 * outside:.0f} % of the rest"
             for (case, _), (inside, outside) in zip(cases, share)
         )
         label = f"Learned barrier of agent {agent} around it. With the other agent {about}."
