@@ -7,6 +7,7 @@ import zipfile
 
 import numpy as np
 
+from ringfence import tasks
 from ringfence.errors import UserError
 from ringfence.report.table import Row, Section
 from ringfence.runs import Run
@@ -74,11 +75,12 @@ def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) 
     options = row.members[0][1].get("options") or {}
     plans = tracks(arrays, spec["feature_names"], n, run.config["config"].get("history", 0))
     local = options.get("execution") == "decentralized"
+    arena = getattr(tasks.TASKS[section.task].env, "half_width", 1.0) if section.task in tasks.TASKS else 1.0
     episodes = []
     for e in range(len(states)):
         places = np.abs(np.concatenate([states[e, :, : 2 * n].ravel(), states[e, 0, 4 * n :]]))
         told = {
-            "reach": round(max(1.0, float(places.max())) + 0.2, 2),  # half the width of what is shown
+            "reach": round(max(arena, float(places.max())) + 0.2, 2),  # half the width of what is shown
             "positions": pack(states[e, :, : 2 * n]),
             "landmarks": pack(states[e, 0, 4 * n :]),
             "rewards": [round(float(x), 2) for x in arrays["rewards"][e]],
@@ -92,6 +94,7 @@ def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) 
         "seed": run.config["seed"],
         "agents": n,
         "steps": states.shape[1] - 1,
+        "arena": arena,
         "radius": section.hazard["radius"] / 2,
         "contact": section.hazard["radius"],
         "total": int(plans.shape[2]) if plans is not None else 0,

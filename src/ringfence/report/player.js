@@ -44,7 +44,7 @@
       ink.lineJoin = ink.lineCap = "round";
       ink.strokeStyle = rule;
       ink.lineWidth = 1.2 * unit;
-      ink.strokeRect(X(-1), Y(1), 2 * scale, 2 * scale);
+      ink.strokeRect(X(-told.arena), Y(told.arena), 2 * told.arena * scale, 2 * told.arena * scale);
       ink.strokeStyle = dark;
       ink.lineWidth = 2 * unit;
       for (let k = 0; k < e.landmarks.length; k += 2) {
