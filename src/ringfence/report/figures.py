@@ -160,7 +160,8 @@ def _label(ax, points: list[Row]) -> None:
         for sign_x, x in ((1, 8 + 12 * far), (-1, 8 + 12 * far), (0, 0))
         for sign_y, y in ((1, 8 + 14 * far), (-1, 8 + 14 * far))
     ]
-    for row in points:
+    leaders = []
+    for row, dot in zip(points, dots):
         options = []
         for dx, dy, side in around:
             text = ax.annotate(
@@ -178,9 +179,12 @@ def _label(ax, points: list[Row]) -> None:
             penalty = sum(2000 + _overlap(box, other) for other in taken if _overlap(box, other))
             penalty += 400 * sum(box.contains(*d) for d in dots)
             penalty += 120 * sum(_crosses(box, a, b) for a, b in bars)
+            lead = np.linspace(dot, ((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2), 20)
+            penalty += 1000 * sum(other.contains(*p) for other in taken for p in lead[::2])
+            penalty += 1000 * sum(box.contains(*p) for p in leaders)
             outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y0 < frame.y0 or box.y1 > frame.y1
-            options.append((penalty + 10_000 * outside + abs(dx) + abs(dy), dx, dy, side, box))
-        _, dx, dy, side, box = min(options, key=lambda o: o[0])
+            options.append((penalty + 10_000 * outside + abs(dx) + abs(dy), dx, dy, side, box, lead))
+        _, dx, dy, side, box, lead = min(options, key=lambda o: o[0])
         far = abs(dx) + abs(dy) > 30
         ax.annotate(
             row.label,
@@ -194,6 +198,7 @@ def _label(ax, points: list[Row]) -> None:
             arrowprops={"arrowstyle": "-", "color": INK, "lw": 0.6, "alpha": 0.6, "shrinkB": 5} if far else None,
         ).set_in_layout(False)
         taken.append(box)
+        leaders += [*lead] if far else []
 
 
 def _overlap(a, b) -> float:
