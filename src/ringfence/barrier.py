@@ -138,8 +138,9 @@ def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, k
         base = features[jax.random.randint(k2, (count,), 0, len(features))]
         made = hazard.endanger(base, k3)
         parts.append((made, hazard.labels(made)[0]))
-    if not parts:  # nothing is dangerous and nothing can be made so: an empty lesson, not an error
-        return features[:size], jnp.zeros(features[:size].shape[:2], bool)
+    if not parts:  # nothing is dangerous and nothing can be made so: an empty lesson of the same size, not an error
+        bank = features[jax.random.randint(k2, (size,), 0, len(features))]
+        return bank, jnp.zeros(bank.shape[:2], bool)
     return jnp.concatenate([p[0] for p in parts]), jnp.concatenate([p[1] for p in parts])
 
 

@@ -10,6 +10,7 @@ exact, differentiable and linear in the number of entries. Three views exist, be
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -32,6 +33,7 @@ class FeatureMap:
     source: Literal["state", "observations"]
     plus: np.ndarray  # (N, D) int
     minus: np.ndarray  # (N, D) int
+    reconcile: Callable[[Array], Array] | None = None  # joint plans whose agents agree; see `simple_spread`
 
     def __call__(self, observations: Array, state: Array | None) -> Array:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
@@ -55,14 +57,23 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
         names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
         table = np.tile(np.arange(len(names)), (n, 1))
-        return FeatureMap(view, tuple(names), "observations", table, np.full_like(table, -1))
+        agree = _reconcile_relative(tuple(names), n)
+        return FeatureMap(view, tuple(names), "observations", table, np.full_like(table, -1), agree)
     position = np.arange(2 * n).reshape(n, 2)
     velocity, landmark = position + 2 * n, position + 4 * n
     if view == "centralized":
         names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
         names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
         table = np.tile(np.arange(6 * n), (n, 1))
-        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1))
+
+        def agree(x: Array) -> Array:  # agent i knows best where agent i will be
+            own = {c: jnp.stack([x[..., i, names.index(f"agent{i}.{c}")] for i in range(n)], -1) for c in ("x", "y", "vx", "vy")}
+            p, v = (jnp.stack([own[a], own[b]], -1).reshape(*x.shape[:-2], 2 * n) for a, b in (("x", "y"), ("vx", "vy")))
+            shared = jnp.concatenate([p, v], -1)[..., None, :]
+            fixed = jnp.broadcast_to(x[..., :1, :, 4 * n :], (*x.shape[:-1], 2 * n))
+            return jnp.concatenate([jnp.broadcast_to(shared, (*x.shape[:-1], 4 * n)), fixed], -1)
+
+        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), agree)
     if view != "pruned":
         raise unknown("view", view, VIEWS)
     names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
@@ -75,7 +86,36 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         m = [-1] * 4 + list(position[i]) * n + list(position[i]) * (n - 1) + list(velocity[i]) * (n - 1)
         plus.append(p)
         minus.append(m)
-    return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus))
+    agree = _reconcile_relative(tuple(names), n)
+    return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), agree)
+
+
+def _reconcile_relative(names: tuple[str, ...], n: int) -> Callable[[Array], Array]:
+    """A function on plans (..., H, N, D), row 0 the present, that makes the agents agree: what agent i plans to see of
+    landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged.
+
+    Agents execute their own part of a plan, so danger and value have to be judged on that, not on what they imagine
+    of one another; and a gradient on the result moves bodies, not images of them.
+    """
+    at = {name: d for d, name in enumerate(names)}
+    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    own_p, own_v = [at["own.x"], at["own.y"]], [at["own.vx"], at["own.vy"]]
+    moving = "other0.dvx" in at
+    shown = 4 + 2 * n + 2 * (n - 1) + (2 * (n - 1) if moving else 0)
+    assert shown == len(names), "own, landmarks, others, in this order"
+
+    def agree(x: Array) -> Array:
+        p, v = x[..., own_p], x[..., own_v]
+        shape = (*x.shape[:-1], -1)
+        landmarks = x[..., 4 : 4 + 2 * n]
+        moved = p - p[..., :1, :, :]
+        landmarks = landmarks[..., :1, :, :] - jnp.tile(moved, n)
+        parts = [x[..., :4], landmarks, (p[..., others, :] - p[..., :, None, :]).reshape(shape)]
+        if moving:
+            parts.append((v[..., others, :] - v[..., :, None, :]).reshape(shape))
+        return jnp.concatenate(parts, -1)
+
+    return agree
 
 
 def from_data(
@@ -91,6 +131,8 @@ def from_data(
     """
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
+    if view == "centralized" and state is None:
+        raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
     m, n, o = observations.shape
     own = [observations[:, :, d] for d in range(o)]
     shared = [] if state is None else [np.repeat(state[:, d : d + 1], n, 1) for d in range(state.shape[1])]
@@ -111,7 +153,7 @@ def from_data(
         # One index table needs one source: observations, then the state appended to each of them.
         table = np.tile(np.array(kept), (n, 1))
         return _Joint(view, tuple(names[d] for d in kept), "observations", table, np.full_like(table, -1))
-    source = "state" if view == "centralized" and state is not None else "observations"
+    source = "state" if view == "centralized" else "observations"
     table = np.tile(np.array(kept), (n, 1))
     return FeatureMap(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
 

@@ -173,9 +173,12 @@ def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
         return jnp.sqrt(jnp.maximum((x[..., index] ** 2).sum(-1), 1e-12))
 
     def endanger(x: Array, key: Key) -> Array:
-        """Scale the velocity to between the limit and half as much again."""
-        factor = jax.random.uniform(key, x.shape[:-1], minval=1.001, maxval=1.5) * hazard.limit / speed(x)
-        return x.at[..., index].multiply(factor[..., None])
+        """Scale the velocity to between the limit and half as much again; what rests is sent in a random direction."""
+        k1, k2 = jax.random.split(key)
+        velocity = x[..., index]
+        velocity = jnp.where(speed(x)[..., None] > 1e-4, velocity, jax.random.normal(k2, velocity.shape))
+        target = jax.random.uniform(k1, x.shape[:-1], minval=1.001, maxval=1.5) * hazard.limit
+        return x.at[..., index].set(velocity * (target / jnp.linalg.norm(velocity, axis=-1))[..., None])
 
     margin = 0.2 * hazard.limit if hazard.safe_margin is None else hazard.safe_margin
     return BoundHazard(hazard, lambda x: hazard.limit - speed(x), endanger, margin)
@@ -202,8 +205,11 @@ def from_dict(data: dict) -> Hazard:
         raise unknown("hazard", str(kind), kinds)
     if kind == "All":
         return All(tuple(from_dict(h) for h in data.get("hazards", ())))
-    fields = {f.name for f in dataclasses.fields(kinds[kind])}
+    fields = {f.name: f for f in dataclasses.fields(kinds[kind])}
     for name in data:
         if name not in fields:
             raise unknown(f"field of hazard {kind}", name, fields)
+    for name, field in fields.items():
+        if name not in data and field.default is dataclasses.MISSING:
+            raise UserError(f"Hazard {kind} needs a value of '{name}'; add it to the card.")
     return kinds[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})

@@ -162,6 +162,17 @@ class EpisodeStore:
                 f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {len(actions)} steps; "
                 "it must be cumulative and end with the number of steps (drop an unfinished last episode)."
             )
+        if (np.diff(ends, prepend=0) <= 0).any():
+            raise StoreError("episode_ends must increase; give cumulative step counts.")
+        lasts = {"final_observations": (final_observations, (len(ends), *observations.shape[1:]))}
+        if state is not None and final_state is not None:
+            lasts["final_state"] = (final_state, (len(ends), *np.shape(state)[1:]))
+        for name, (value, expected) in lasts.items():
+            if np.shape(value) != expected:
+                raise StoreError(
+                    f"{name} has shape {np.shape(value)}, expected {expected}: the state that each of the {len(ends)} "
+                    "episodes ended in."
+                )
         rewards = np.asarray(rewards, np.float32)
         if rewards.ndim == 1:
             rewards = np.repeat(rewards[:, None], actions.shape[1], 1)

@@ -79,7 +79,7 @@ class TemporalUNet(eqx.Module):
     def __call__(self, x: Array, k: Array, y: Array, keep: Array) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool -> (B, H, N, D)."""
         b, rows, n, d = x.shape
-        told = jax.nn.mish(self._told(k, y, keep))  # every use of it begins with this activation
+        told = _mish(self._told(k, y, keep))  # every use of it begins with this activation
         told = jnp.repeat(told, n, axis=0)
         z = jnp.moveaxis(x, 1, 2).reshape(b * n, rows, d)
         unit = 2 ** (len(self.down) - 1)
@@ -89,7 +89,7 @@ class TemporalUNet(eqx.Module):
             z = _apply_residual(stage["second"], _apply_residual(stage["first"], z, told), told)
             skips.append(z)
             if "halve" in stage:
-                z = _apply(stage["halve"], jnp.concatenate([_shifted(z, -1)[:, ::2], z[:, ::2], z[:, 1::2]], -1))
+                z = _apply(stage["halve"], _neighbours(z, 1, 1, stride=2))
         for block in self.middle:
             z = _apply_residual(block, z, told)
         z = _meet(self.meet[0], z, told, n)
@@ -103,10 +103,10 @@ class TemporalUNet(eqx.Module):
     def _told(self, k: Array, y: Array, keep: Array) -> Array:
         """(B, 2 W): what diffusion step and return say; a dropped return is zeros."""
         first, last = self.step
-        step = _apply(last, jax.nn.mish(_apply(first, sinusoidal(k, first["weight"].shape[0]))))
+        step = _apply(last, _mish(_apply(first, sinusoidal(k, first["weight"].shape[0]))))
         target = y[:, None]
         for layer in self.target[:-1]:
-            target = jax.nn.mish(_apply(layer, target))
+            target = _mish(_apply(layer, target))
         target = _apply(self.target[-1], target)
         return jnp.concatenate([step, jnp.where(keep[:, None], target, 0.0)], -1)
 
@@ -120,17 +120,25 @@ def _waves(width: int) -> int:
 # matrix products when several seeds are trained in one program, where XLA would make grouped convolutions of them.
 
 
-def _shifted(z: Array, by: int) -> Array:
-    """Row t of the result is row t + by of z (M, T, C); zeros beyond the ends."""
-    padded = jnp.pad(z, ((0, 0), (max(-by, 0), max(by, 0)), (0, 0)))
-    return padded[:, max(by, 0) : max(by, 0) + z.shape[1]]
+def _neighbours(z: Array, before: int, after: int, stride: int = 1) -> Array:
+    """(M, T, C) -> (M, T / stride, (before + 1 + after) C): every stride-th row with those around it, zeros outside."""
+    t = z.shape[1]
+    padded = jax.lax.pad(z, jnp.zeros((), z.dtype), ((0, 0, 0), (before, after, 0), (0, 0, 0)))
+    return jnp.concatenate([padded[:, s : s + t : stride] for s in range(before + 1 + after)], -1)
 
 
 def _double(stage: dict, z: Array) -> Array:
     m, t, c = z.shape
-    even = jnp.concatenate([_shifted(z, -1), z], -1) @ stage["even"] + stage["odd"]["bias"]
-    odd = _apply(stage["odd"], jnp.concatenate([z, _shifted(z, 1)], -1))
+    even = _neighbours(z, 1, 0) @ stage["even"] + stage["odd"]["bias"]
+    odd = _apply(stage["odd"], _neighbours(z, 0, 1))
     return jnp.stack([even, odd], 2).reshape(m, 2 * t, c)
+
+
+def _mish(z: Array) -> Array:
+    """z tanh(softplus(z)), written with a single exponential."""
+    e = jnp.exp(jnp.minimum(z, 20.0))
+    e = e * (e + 2.0)
+    return z * (e / (e + 2.0))
 
 
 def _residual(key: Key, a: int, b: int, told: int) -> dict:
@@ -150,13 +158,12 @@ def _convolution(key: Key, a: int, b: int) -> Params:
 
 def _apply_convolution(p: Params, z: Array) -> Array:
     """Convolution, group norm, Mish."""
-    reach = KERNEL // 2
-    z = _apply(p, jnp.concatenate([_shifted(z, s) for s in range(-reach, reach + 1)], -1))
-    m, t, c = z.shape
-    grouped = z.reshape(m, t, math.gcd(GROUPS, c), -1)
+    m, t, _ = z.shape
+    z = _apply(p, _neighbours(z, KERNEL // 2, KERNEL // 2))
+    grouped = z.reshape(m, t, math.gcd(GROUPS, z.shape[-1]), -1)
     grouped = grouped - grouped.mean((1, 3), keepdims=True)
     grouped = grouped * jax.lax.rsqrt((grouped**2).mean((1, 3), keepdims=True) + 1e-5)
-    return jax.nn.mish(grouped.reshape(m, t, c) * p["norm_scale"] + p["norm_bias"])
+    return _mish(grouped.reshape(z.shape) * p["norm_scale"] + p["norm_bias"])
 
 
 def _attention(key: Key, c: int, told: int) -> dict:

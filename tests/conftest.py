@@ -1,0 +1,36 @@
+"""Fixtures that several files share; small, and made once per session."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from ringfence import hazards
+from ringfence.data.behaviour import collect
+from ringfence.data.store import EpisodeStore
+from ringfence.envs import SimpleSpread
+
+
+@pytest.fixture(scope="session")
+def played() -> dict[str, np.ndarray]:
+    """Forty episodes of Simple Spread under uniform actions, as arrays (E, L, ...)."""
+    return collect(SimpleSpread(), "random", 40, jax.random.key(7))
+
+
+@pytest.fixture(scope="session")
+def small_store(played) -> EpisodeStore:
+    """The same episodes as a store."""
+    return EpisodeStore.from_episodes(
+        played["observations"],
+        played["actions"],
+        played["rewards"],
+        played["costs"],
+        state=played["state"],
+        card={
+            "task": "simple_spread-random",
+            "state_names": list(SimpleSpread().state_names),
+            "hazard": hazards.to_dict(hazards.Separation()),
+            "provenance": "made by the tests",
+        },
+    )

@@ -1,0 +1,252 @@
+"""The barrier's conditions, the retention schedule, and who gets which gradient."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import barrier as cbf
+from ringfence import features, hazards, normalise
+from ringfence.algos import icbf
+from ringfence.diffusion import cosine_schedule
+from ringfence.errors import UserError
+from ringfence.nets import MLP
+from ringfence.nets.heads import barrier_on
+from ringfence.windows import WindowData, at
+
+BAR = cosine_schedule(200)
+RELAXATIONS = ("signal", "linear", "none")
+
+# ---------------------------------------------------------------------------------------------------------------------
+# retention
+
+
+@pytest.mark.parametrize("m", [0.0, 0.5, 0.9, 0.99])
+@pytest.mark.parametrize("relaxation", RELAXATIONS)
+def test_relaxation_stays_between_0_and_m_and_vanishes_on_clean_plans(m, relaxation):
+    eta = cbf.Retention(m, relaxation).eta(BAR)
+    assert eta.shape == (200,) and (eta >= 0).all() and (eta <= m).all()
+    assert (np.diff(eta) >= 0).all()
+    assert eta[0] <= 1e-3 * m
+    assert eta[-1] == pytest.approx(0.0 if relaxation == "none" else m, abs=1e-6)
+
+
+@pytest.mark.parametrize("m", [1.0, 1.5, -0.1])
+def test_impossible_retention_is_refused(m):
+    with pytest.raises(UserError, match=rf"retention m={m} must lie in \[0, 1\)"):
+        cbf.Retention(m)
+    with pytest.raises(UserError, match="Unknown relaxation 'cosine'"):
+        cbf.Retention(0.9, "cosine")
+
+
+@pytest.mark.parametrize("two_sided", [True, False])
+def test_conservatism_grows_with_m_and_shrinks_with_noise(two_sided):
+    def least(h, m, eta):
+        return np.asarray(cbf.Retention(m, two_sided=two_sided).decay(jnp.asarray(h), eta))
+
+    h = np.linspace(0.0, 2.0, 9)
+    by_m = np.stack([least(h, m, 0.0) for m in (0.0, 0.3, 0.6, 0.9, 0.99)])
+    assert (np.diff(by_m, axis=0) >= 0).all() and (by_m <= h).all()  # never asks a safe state to become safer
+    by_eta = np.stack([least(h, 0.9, eta) for eta in (0.0, 0.3, 0.6, 0.9)])
+    assert (np.diff(by_eta, axis=0) <= 1e-6).all()
+    np.testing.assert_allclose(by_eta[-1], 0, atol=1e-6)  # all noise: any safe state will do
+    worse = np.stack([least(-h, 0.9, eta) for eta in (0.0, 0.3, 0.6, 0.9)])
+    assert (np.diff(worse, axis=0)[:, 1:] <= 0).all() == two_sided  # the trap: one-sided relaxation is stricter here
+    np.testing.assert_allclose(worse[-1], -h if two_sided else 0 * h, atol=1e-6)
+    assert np.isfinite(least(-h, 0.0, 0.0)).all()
+
+
+@pytest.mark.parametrize("scaled", [True, False])
+@pytest.mark.parametrize("m, delta", [(0.0, 0.1), (0.9, 0.02), (0.9, 0.1), (0.5, 0.1)])
+def test_a_parked_agent_is_satisfied_from_the_fixed_point_on(m, delta, scaled):
+    everywhere = jnp.ones((2, 5, 3), bool)
+    point = delta if scaled else delta / (1 - m)
+    for h, met in ((point * 0.99, False), (point * 1.01, True), (point + 1.0, True)):
+        loss = cbf.hinges(
+            jnp.full((2, 5, 3), h), ~everywhere, everywhere, everywhere, cbf.Retention(m), 0.0, delta, scaled
+        )
+        assert (float(loss.retention) < 1e-7) == met
+        assert (float(loss.safe) < 1e-7) == (h >= delta)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# hinges
+
+
+def test_hinges_are_means_over_their_sets():
+    h = jnp.array([0.5, 0.05, -0.3, 0.2])[None, :, None]
+    safe = jnp.array([True, True, False, True])[None, :, None]
+    unsafe, valid = ~safe, jnp.ones((1, 4, 1), bool)
+    got = cbf.hinges(h, unsafe, safe, valid, cbf.Retention(0.5), 0.0, 0.1, False)
+    assert float(got.safe) == pytest.approx((0.1 - 0.05) / 3)
+    assert float(got.unsafe) == 0
+    # pairs that start in a safe state: (0.5, 0.05), (0.05, -0.3)
+    assert float(got.retention) == pytest.approx(((0.1 - 0.05 + 0.25) + (0.1 + 0.3 + 0.025)) / 2)
+    assert {k: round(float(v), 4) for k, v in got.metrics.items()} == {
+        "accuracy_safe": 1.0,
+        "accuracy_unsafe": 1.0,
+        "accuracy_retention": 0.0,
+        "share_unsafe": 0.25,
+    }
+    shorter = cbf.hinges(h, unsafe, safe, valid.at[:, 2:].set(False), cbf.Retention(0.5), 0.0, 0.1, False)
+    assert float(shorter.retention) == pytest.approx(0.1 - 0.05 + 0.25)  # padded rows are in no set
+    assert float(shorter.metrics["share_unsafe"]) == 0
+
+
+def test_shaping_only_ever_raises_h_and_never_blames_the_present():
+    h = jax.random.normal(jax.random.key(0), (4, 6, 3))
+    valid = jnp.ones((4, 6, 1), bool).at[0, 4:].set(False)
+    shaped = lambda h: cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, jnp.ones((4, 1, 1)))  # noqa: E731
+    gradient = np.asarray(jax.grad(shaped)(h))
+    assert (gradient <= 0).all() and (gradient[:, 1:] < 0).any()
+    assert not gradient[:, 0].any()  # row 0 is the present, which no plan can change
+    assert not gradient[0, 4:].any()  # padded
+    assert float(shaped(jnp.full_like(h, 0.11))) == 0
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# routing
+
+
+@pytest.fixture(scope="module")
+def scene(small_store):
+    """Real windows, their normaliser and hazard, and a barrier that is positive everywhere, so that all hinges of
+    unsafe states bite."""
+    table = features.simple_spread("pruned", 3)
+    data = WindowData(small_store, table, 0.9)
+    hazard = hazards.bind(hazards.Separation(), table.names, 3)
+    batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(0, data.steps, 40), 4, 0)
+    norm = normalise.fit(np.asarray(batch.features), np.asarray(batch.valid), 0, "displacement")
+    net = MLP(jax.random.key(0), (18, 8, 8, 8, 1), groups=3)
+    net.biases[-1] = net.biases[-1] + 3.0
+    bank, own = cbf.unsafe_bank(data.arrays["features"], data.arrays["costs"], hazard, 32, jax.random.key(1))
+    frozen = {"normaliser": norm, "bank": bank, "bank_own": own}
+    return data, batch, hazard, net, frozen
+
+
+def config(routing) -> icbf.Config:
+    return icbf.Config(routing=routing, horizon=4, bank=32, bank_batch=16, barrier_batch=8, delta=0.1)
+
+
+@pytest.fixture(scope="module")
+def losses(scene):
+    """losses[routing](net, slow, features) -> values (L_ω, L_θ) and their gradients to net, average and features."""
+    _, batch, hazard, _, frozen = scene
+
+    def of(routing):
+        def pair(net, slow, x, valid):
+            one = jnp.ones((len(x), 1, 1))
+            made = icbf.Generated(x, valid, 0.1 * one, one)
+            omega, theta, metrics = icbf.barrier_losses(
+                net, slow, frozen, batch._replace(valid=valid), made, jax.random.key(2), config(routing), hazard
+            )
+            return jnp.stack([omega, theta]), metrics
+
+        @jax.jit
+        def everything(net, slow, x, valid):
+            value, metrics = pair(net, slow, x, valid)
+            return value, jax.jacrev(lambda *a: pair(*a, valid)[0], argnums=(0, 1, 2))(net, slow, x), metrics
+
+        return everything
+
+    return {routing: of(routing) for routing in ("paper", "split")}
+
+
+def moves(gradient) -> bool:
+    return any(float(jnp.abs(leaf).max()) > 0 for leaf in jax.tree.leaves(gradient))
+
+
+OMEGA, THETA = 0, 1
+
+
+def row(gradient, of):
+    return jax.tree.map(lambda leaf: leaf[of], gradient)
+
+
+def test_the_dangerous_term_reaches_the_generator_under_paper_and_not_under_split(scene, losses):
+    _, batch, hazard, net, frozen = scene
+    x = jax.jit(hazard.endanger)(batch.features, jax.random.key(3))
+    assert hazard.labels(x)[0].all()  # only the dangerous term is left
+    along = lambda x, g: jax.jvp(lambda x: barrier_on(net, frozen["normaliser"], x).sum(), (x,), (-g,))[1]  # noqa: E731
+
+    value, (to_net, to_slow, to_x), _ = losses["paper"](net, net, x, batch.valid)
+    assert value[OMEGA] == 0 and value[THETA] > 0
+    assert moves(row(to_net, THETA)) and moves(to_x[THETA]) and not moves(to_slow)
+    assert along(x, to_x[THETA]) < 0  # as printed, it pays the generator for going deeper into danger
+
+    value, (to_net, to_slow, to_x), _ = losses["split"](net, net, x, batch.valid)
+    assert value[OMEGA] > 0
+    assert moves(row(to_net, OMEGA)) and not moves(to_x[OMEGA])  # h learns, θ does not hear of it
+    assert not moves(row(to_net, THETA)) and not moves(to_slow)  # θ follows a frozen average
+
+
+def test_split_pulls_generated_states_towards_higher_h(scene, losses):
+    _, batch, _, net, frozen = scene
+    low = jax.tree.map(lambda leaf: leaf, net)
+    low.biases[-1] = net.biases[-1] - 3.0
+    _, (_, _, to_x), _ = losses["split"](net, low, batch.features, batch.valid)
+    gain = jax.jvp(lambda x: barrier_on(low, frozen["normaliser"], x).sum(), (batch.features,), (-to_x[THETA],))[1]
+    assert moves(to_x[THETA]) and gain > 0
+    assert not moves(to_x[THETA][:, 0])  # the present
+
+
+@pytest.mark.parametrize("routing", ["paper", "split"])
+@pytest.mark.parametrize("case", ["all unsafe", "all safe", "all between", "nothing valid"])
+def test_empty_sets_are_finite(scene, losses, routing, case):
+    _, batch, hazard, net, _ = scene
+    x, valid = batch.features, batch.valid
+    if case == "all unsafe":
+        x = jax.jit(hazard.endanger)(x, jax.random.key(4))
+    elif case == "nothing valid":
+        valid = jnp.zeros_like(valid)
+    else:
+        x = x.at[..., 10:14].set(1.0 if case == "all safe" else 0.24)  # the offsets of the others
+        assert hazard.labels(x)[1].all() == (case == "all safe") and not hazard.labels(x)[0].any()
+    value, gradients, metrics = losses[routing](net, net, x, valid)
+    for leaf in jax.tree.leaves((value, gradients, metrics)):
+        assert np.isfinite(leaf).all()
+
+
+def test_paper_needs_a_formula(scene):
+    _, batch, _, net, frozen = scene
+    one = jnp.ones((len(batch.features), 1, 1))
+    made = icbf.Generated(batch.features, batch.valid, one, one)
+    hazard = hazards.bind(hazards.CostColumn(), features.simple_spread("pruned", 3).names, 3)
+    with pytest.raises(UserError, match="routing='paper' labels generated states"):
+        icbf.barrier_losses(net, net, frozen, batch, made, jax.random.key(0), config("paper"), hazard)
+
+
+def test_the_share_of_the_barrier_rises_on_schedule():
+    c = icbf.Config(steps=100, barrier_weight=0.4, barrier_start=0.2, barrier_full=0.6)
+    shares = [float(icbf.barrier_share(c, step)) for step in (0, 20, 30, 40, 60, 100)]
+    assert shares == pytest.approx([0, 0, 0.1, 0.2, 0.4, 0.4], abs=1e-6)
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# the bank of unsafe states
+
+
+def test_the_bank_marks_who_is_unsafe(scene):
+    data, _, hazard, _, frozen = scene
+    bank, own = frozen["bank"], frozen["bank_own"]
+    assert bank.shape == (32, 3, 18) and own.shape == (32, 3)
+    np.testing.assert_array_equal(own, hazard.labels(bank)[0])
+    assert own.any(-1).all()  # every state teaches something
+    rows = np.asarray(data.arrays["features"])
+    real = [(rows == state).all((1, 2)).any() for state in np.asarray(bank)]
+    assert sum(real) == 16  # one half is data
+
+
+def test_the_bank_without_unsafe_data_or_formula(scene):
+    data, _, hazard, _, _ = scene
+    x, costs = data.arrays["features"][:10], jnp.zeros(10)
+    harmless = x.at[..., 10:14].set(1.0)
+    bank, own = cbf.unsafe_bank(harmless, costs, hazard, 32, jax.random.key(0))
+    assert len(bank) == 32 and own.all()  # all made from the formula
+    logged = hazards.bind(hazards.CostColumn(), features.simple_spread("pruned", 3).names, 3)
+    bank, own = cbf.unsafe_bank(x, costs.at[4].set(1.0), logged, 32, jax.random.key(0))
+    assert own.all() and (bank == x[4]).all()
+    bank, own = cbf.unsafe_bank(x, costs, logged, 32, jax.random.key(0))
+    assert bank.shape == (32, 3, 18) and own.shape == (32, 3) and not own.any()

@@ -1,0 +1,200 @@
+"""Hazards against brute force, and the views of the state against the simulator's own observations."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import features, hazards
+from ringfence.envs import SimpleSpread
+from ringfence.errors import UserError
+
+VIEWS = features.VIEWS
+
+
+@pytest.fixture(scope="module")
+def rows(played):
+    """(observations (M, 3, 18), state (M, 18)) of real states, contacts among them."""
+    return played["observations"][:, ::3].reshape(-1, 3, 18), played["state"][:, ::3].reshape(-1, 18)
+
+
+def views_of(rows, view):
+    table = features.simple_spread(view, 3)
+    return table, table(*rows)
+
+
+def distances(state):
+    """(M, N) distance to the nearest other agent, by loops."""
+    n = state.shape[1] // 6
+    out = np.full((len(state), n), np.inf)
+    for m, s in enumerate(state.astype(np.float64)):
+        for i in range(n):
+            for j in range(n):
+                if i != j:
+                    out[m, i] = min(out[m, i], np.hypot(*(s[2 * i : 2 * i + 2] - s[2 * j : 2 * j + 2])))
+    return out
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# hazards
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_clearance_is_distance_less_radius(rows, view):
+    table, x = views_of(rows, view)
+    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
+    expected = distances(rows[1]) - 0.30
+    np.testing.assert_allclose(bound.clearance(jnp.asarray(x)), expected, atol=1e-5)
+    unsafe, safe = bound.labels(jnp.asarray(x))
+    clear = np.abs(expected) > 1e-4
+    assert (np.asarray(unsafe) == (expected < 0))[clear].all() and unsafe.any()
+    margin = np.abs(expected - 0.075) > 1e-4
+    assert (np.asarray(safe) == (expected >= 0.075))[margin].all()
+    assert not (np.asarray(unsafe) & np.asarray(safe)).any()
+    assert not (np.asarray(unsafe) | np.asarray(safe)).all()  # between them, neither
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_endangered_states_are_unsafe_and_near(rows, view):
+    table, x = views_of(rows, view)
+    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
+    made = np.asarray(jax.jit(bound.endanger)(jnp.asarray(x), jax.random.key(0)))
+    assert bound.labels(jnp.asarray(made))[0].all()
+    assert ((made != x).sum(-1) <= 2).all()  # one other agent was moved, nothing else
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_gradient_of_clearance_is_finite_even_where_agents_coincide(rows, view):
+    table, x = views_of(rows, view)
+    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
+    x = np.concatenate([x[:20], np.zeros_like(x[:1])])  # the last row: everybody at the same point
+    gradient = jax.jit(jax.grad(lambda x: bound.clearance(x).sum()))(jnp.asarray(x))
+    assert np.isfinite(gradient).all()
+    assert (np.abs(gradient[:-1]).sum(-1) > 0.5).all()  # a unit step away from the nearest one
+
+
+def test_absent_features_are_named_with_the_nearest():
+    names = features.simple_spread("pruned", 3).names
+    with pytest.raises(UserError, match=r"'other2\.dx'.*did you mean 'other[01]\.d.'"):
+        hazards.bind(hazards.Separation(), names, 4)
+    with pytest.raises(UserError, match=r"SpeedLimit reads the feature 'own\.vz'.*did you mean 'own\.v.'"):
+        hazards.bind(hazards.SpeedLimit(1.0, ("own.vx", "own.vz")), names, 3)
+    with pytest.raises(UserError, match="at least 2 agents"):
+        hazards.bind(hazards.Separation(), features.simple_spread("pruned", 1).names, 1)
+
+
+def test_speed_limit(rows):
+    table, x = views_of(rows, "pruned")
+    x = np.concatenate([x, np.zeros_like(x[:5])])  # some at rest
+    bound = hazards.bind(hazards.SpeedLimit(0.8, ("own.vx", "own.vy")), table.names, 3)
+    speed = np.hypot(x[..., 0], x[..., 1])
+    np.testing.assert_allclose(bound.clearance(jnp.asarray(x)), 0.8 - speed, atol=1e-5)
+    assert bound.safe_margin == pytest.approx(0.16)
+    unsafe, safe = bound.labels(jnp.asarray(x))
+    assert unsafe.any() and safe.any()
+    made = np.asarray(jax.jit(bound.endanger)(jnp.asarray(x), jax.random.key(0)))
+    assert bound.labels(jnp.asarray(made))[0].all()
+    assert (np.hypot(made[..., 0], made[..., 1]) <= 0.8 * 1.51).all()
+    np.testing.assert_array_equal(made[..., 2:], x[..., 2:])
+    moving = speed > 0.01
+    cross = made[..., 0] * x[..., 1] - made[..., 1] * x[..., 0]
+    np.testing.assert_allclose(cross[moving], 0, atol=1e-5)  # the direction is kept
+
+
+def test_all_is_the_smallest_clearance(rows):
+    table, x = views_of(rows, "pruned")
+    parts = hazards.Separation(), hazards.SpeedLimit(0.8, ("own.vx", "own.vy"))
+    bound = hazards.bind(hazards.All(parts), table.names, 3)
+    each = [np.asarray(hazards.bind(p, table.names, 3).clearance(jnp.asarray(x))) for p in parts]
+    np.testing.assert_array_equal(bound.clearance(jnp.asarray(x)), np.minimum(*each))
+    assert bound.labels(jax.jit(bound.endanger)(jnp.asarray(x), jax.random.key(1)))[0].all()
+    with pytest.raises(UserError, match="a formula for each"):
+        hazards.bind(hazards.All((hazards.CostColumn(),)), table.names, 3)
+    with pytest.raises(UserError, match="at least one hazard"):
+        hazards.bind(hazards.All(()), table.names, 3)
+
+
+def test_cost_column_labels_only_what_was_logged(rows):
+    table, x = views_of(rows, "pruned")
+    bound = hazards.bind(hazards.CostColumn(), table.names, 3)
+    assert not bound.has_formula
+    unsafe, safe = bound.labels(jnp.asarray(x[:3]), jnp.array([0.0, 2.0, 0.0]))
+    assert unsafe.tolist() == [[False] * 3, [True] * 3, [False] * 3]
+    np.testing.assert_array_equal(safe, ~unsafe)
+    with pytest.raises(UserError, match="pass their costs"):
+        bound.labels(jnp.asarray(x))
+
+
+def test_hazards_survive_json():
+    import json
+
+    speed = hazards.SpeedLimit(2.5, ("own.vx",), 0.1)
+    for hazard in (hazards.Separation(0.4), speed, hazards.CostColumn(), hazards.All((hazards.Separation(), speed))):
+        assert hazards.from_dict(json.loads(json.dumps(hazards.to_dict(hazard)))) == hazard
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# features
+
+
+def test_views_equal_the_simulators_observations(rows):
+    observations, state = rows
+    table, own = views_of(rows, "decentralized")
+    np.testing.assert_array_equal(own, observations[..., :14])  # all but the silent channel
+    table, pruned = views_of(rows, "pruned")
+    np.testing.assert_allclose(pruned[..., :14], observations[..., :14], atol=1e-6)
+    assert table.names[:14] == features.simple_spread("decentralized", 3).names
+    velocity = observations[..., :2]
+    for i in range(3):
+        for k, j in enumerate(j for j in range(3) if j != i):
+            np.testing.assert_allclose(
+                pruned[:, i, 14 + 2 * k : 16 + 2 * k], velocity[:, j] - velocity[:, i], atol=1e-6
+            )
+            assert table.names[14 + 2 * k] == f"other{k}.dvx"
+    table, shared = views_of(rows, "centralized")
+    np.testing.assert_array_equal(shared, np.repeat(state[:, None], 3, 1))
+    assert table.names == SimpleSpread().state_names
+
+
+@pytest.mark.parametrize("agents", [1, 2, 5])
+def test_views_of_other_teams(agents):
+    env = SimpleSpread(n_agents=agents)
+    observations = np.zeros((4, agents, env.observation_dim), np.float32)
+    state = np.zeros((4, 6 * agents), np.float32)
+    width = {"pruned": 4 + 2 * agents + 4 * (agents - 1), "centralized": 6 * agents, "decentralized": 2 + 4 * agents}
+    for view in VIEWS:
+        table = features.simple_spread(view, agents)
+        x = table(observations, state)
+        assert x.shape == (4, agents, width[view]) and len(set(table.names)) == len(table.names) == width[view]
+
+
+def test_views_of_anybodys_data_drop_constants_and_duplicates():
+    rng = np.random.default_rng(0)
+    observations, state = rng.normal(size=(50, 2, 4)), rng.normal(size=(50, 3))
+    observations[..., 1] = 7.0  # constant
+    observations[..., 3] = observations[..., 0]  # duplicate
+    state[:, 2] = 1.0
+    names, shared = ("a", "b", "c", "d"), ("s", "t", "u")
+    table = features.from_data("pruned", observations, state, names, shared)
+    assert table.names == ("a", "c", "s", "t")
+    x = table(observations, state)
+    np.testing.assert_array_equal(x[..., :2], observations[..., [0, 2]])
+    np.testing.assert_array_equal(x[:, 1, 2:], state[:, :2])
+    again = features.from_dict(features.to_dict(table))
+    np.testing.assert_array_equal(again(jnp.asarray(observations), jnp.asarray(state)), x.astype(np.float32))
+    assert features.from_data("decentralized", observations, state, names, shared).names == ("a", "c")
+    assert features.from_data("centralized", observations, state, names, shared).names == ("s", "t")
+    assert features.from_data("pruned", observations, None, names, ()).names == ("a", "c")
+    with pytest.raises(UserError, match="centralized.*global state"):
+        features.from_data("centralized", observations, None, names, ())
+    with pytest.raises(UserError, match="Every observation entry is constant"):
+        features.from_data("pruned", np.zeros((5, 2, 3)), None, ("a", "b", "c"), ())
+
+
+def test_a_view_of_the_state_needs_it(rows):
+    with pytest.raises(UserError, match="needs the global state"):
+        features.simple_spread("pruned", 3)(rows[0], None)
+    with pytest.raises(UserError, match="did you mean 'pruned'"):
+        features.simple_spread("prune", 3)

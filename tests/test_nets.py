@@ -1,0 +1,135 @@
+"""The denoisers: agents are interchangeable, their number is in no weight, and no weight is idle."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence.errors import UserError
+from ringfence.nets import MLP, agent_attention, build_denoiser
+from ringfence.nets.unet import TemporalUNet
+
+ROWS, FEATURES = 5, 5  # rows do not halve: the U-Net pads them
+
+
+@functools.cache
+def denoiser(kind):
+    """A small denoiser with random numbers in every leaf (the U-Net's attention would start at zero); its leaves come
+    from NumPy, because compiling the initialisation takes longer than all else here."""
+    shapes = jax.eval_shape(lambda key: build_denoiser(key, kind, ROWS, FEATURES, 16, 2), jax.random.key(0))
+    rng = np.random.default_rng(0)
+
+    def fill(leaf):
+        fan_in = leaf.shape[0] if len(leaf.shape) > 1 else 1
+        return jnp.asarray(rng.normal(size=leaf.shape) / fan_in**0.5, jnp.float32)
+
+    return jax.tree.map(fill, shapes)
+
+
+def inputs(agents, rows=ROWS, batch=2):
+    x = jax.random.normal(jax.random.key(1), (batch, rows, agents, FEATURES))
+    return x, jnp.arange(batch) * 50, jnp.linspace(-1.0, 2.0, batch), jnp.arange(batch) % 2 == 0
+
+
+apply = jax.jit(lambda net, *args: net(*args))
+
+
+@pytest.mark.parametrize("kind", ["attention", "unet"])
+def test_agents_are_interchangeable_and_their_number_is_free(kind):
+    net = denoiser(kind)
+    for agents in (3, 5):  # the same weights
+        x, *rest = inputs(agents)
+        out = apply(net, x, *rest)
+        assert out.shape == x.shape and np.isfinite(out).all()
+        order = np.random.default_rng(agents).permutation(agents)
+        np.testing.assert_allclose(apply(net, x[:, :, order], *rest), out[:, :, order], atol=2e-5)
+        other = apply(net, x.at[:, :, 0].add(1.0), *rest)
+        assert (np.abs(other - out)[:, :, 1:].max((1, 3)) > 1e-5).all()  # what one does reaches the others
+
+
+@pytest.mark.parametrize("kind", ["attention", "unet"])
+def test_the_condition_is_heard_and_samples_do_not_mix(kind):
+    net = denoiser(kind)
+    x, k, y, keep = inputs(3)
+    out = apply(net, x, k, y, keep)
+    assert np.abs(apply(net, x, k + 5, y, keep) - out).max((1, 2, 3)).min() > 1e-5
+    heard = np.abs(apply(net, x, k, y + 1.0, keep) - out).max((1, 2, 3))
+    assert heard[0] > 1e-5 and heard[1] == 0  # a dropped return says nothing
+    other = apply(net, x.at[0].add(1.0), k, y, keep)
+    np.testing.assert_array_equal(other[1], out[1])
+
+
+@pytest.mark.parametrize("kind", ["attention", "unet"])
+def test_no_weight_is_idle(kind):
+    net, (x, *rest) = denoiser(kind), inputs(3)
+    gradient = jax.jit(jax.grad(lambda net: (net(x, *rest) ** 2).sum()))(net)
+    idle = [
+        jax.tree_util.keystr(path)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(gradient)[0]
+        if not np.abs(leaf).max() > 1e-9
+    ]
+    assert not idle
+
+
+def test_small_and_large_teams_compute_the_same_attention(monkeypatch):
+    net, (x, *rest) = denoiser("attention"), inputs(5)
+    small = apply(net, x, *rest)
+    monkeypatch.setattr(agent_attention, "SMALL_TEAM", 2)
+    np.testing.assert_allclose(jax.jit(lambda net: net(x, *rest))(net), small, atol=1e-5)
+
+
+def parameters(**sizes) -> int:
+    net = jax.eval_shape(lambda key: TemporalUNet(key, **sizes), jax.random.key(0))
+    return sum(math.prod(leaf.shape) for leaf in jax.tree.leaves(net))
+
+
+def test_unet_has_madiffs_parameters_less_the_dead_ones():
+    def linear(a, b):
+        return a * b + b
+
+    told = 256
+    unused = 2 * linear(128, 32) + linear(128, 128) + 2 * linear(told, 32) + linear(told, 128) + 1
+    cancelling = sum(c // 4 + linear(told, c // 4) for c in (1024, 1024, 512))
+    assert (unused, cancelling) == (74_113, 165_120)
+    assert parameters(rows=24, features=18, width=128, depth=3) + unused + cancelling == 64_342_550  # 64.3 M
+    assert parameters(rows=8, features=18, width=128, depth=3) == 64_103_317  # rows are in no weight
+
+
+@pytest.mark.parametrize("rows", [1, 5, 8])
+@pytest.mark.parametrize("depth, width", [(1, 7), (3, 12)])
+def test_unet_takes_any_rows_width_and_depth(rows, depth, width):
+    key = jax.random.key(0)
+    out = jax.eval_shape(lambda *args: TemporalUNet(key, rows, FEATURES, width, depth)(*args), *inputs(3, rows))
+    assert out.shape == (2, rows, 3, FEATURES)
+
+
+def test_unet_padding_keeps_rows_in_place():
+    net, (x, *rest) = denoiser("unet"), inputs(3)
+    longer = jnp.concatenate([x, x[:, -1:]], 1)  # what the network pads with
+    np.testing.assert_allclose(apply(net, x, *rest), apply(net, longer, *rest)[:, :5], atol=1e-6)
+
+
+def test_wrong_sizes_are_refused():
+    with pytest.raises(UserError, match="depth=4 of the temporal U-Net"):
+        TemporalUNet(jax.random.key(0), 8, 3, 16, 4)
+    with pytest.raises(UserError, match="width=2"):
+        TemporalUNet(jax.random.key(0), 8, 3, 2, 1)
+    with pytest.raises(UserError, match="Unknown denoiser 'u-net'; did you mean 'unet'"):
+        build_denoiser(jax.random.key(0), "u-net", 8, 3, 16, 1)
+
+
+def test_grouped_mlps_are_separate_networks():
+    net = MLP(jax.random.key(0), (4, 8, 2), groups=3)
+    x = jax.random.normal(jax.random.key(1), (5, 6, 3, 4))
+    out = apply(net, x)
+    assert out.shape == (5, 6, 3, 2)
+    for i in range(3):
+        hidden = np.maximum(x[:, :, i] @ net.weights[0][i] + net.biases[0][i], 0)
+        np.testing.assert_allclose(out[:, :, i], hidden @ net.weights[1][i] + net.biases[1][i], atol=1e-5)
+    shared = jax.tree.map(lambda leaf: leaf[:1], net)
+    np.testing.assert_allclose(apply(shared, x)[:, :, 0], out[:, :, 0], atol=1e-5)

@@ -1,0 +1,59 @@
+"""The coordinates of plans: exact inverses, unit variance."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import features, normalise
+from ringfence.windows import WindowData, at
+
+
+@pytest.fixture(scope="module", params=[0, 2], ids=["present", "history"])
+def windows(request, small_store):
+    """(windows (M, H, N, D), valid (M, H), row of the present)."""
+    data = WindowData(small_store, features.simple_spread("pruned", 3), 0.9)
+    batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(data.steps), 6, request.param)
+    return np.asarray(batch.features), np.asarray(batch.valid), request.param
+
+
+@pytest.mark.parametrize("coordinates", ["displacement", "state"])
+def test_inverse_and_unit_variance(windows, coordinates):
+    x, valid, now = windows
+    norm = normalise.fit(x, valid, now, coordinates)
+    z = np.asarray(norm.apply(jnp.asarray(x)))
+    np.testing.assert_allclose(norm.invert(jnp.asarray(z)), x, atol=1e-5)
+    present = z[:, now].reshape(-1, z.shape[-1])
+    np.testing.assert_allclose(present.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(present.std(0), 1, atol=1e-3)
+    if coordinates == "displacement":
+        for s in range(now + 1, x.shape[1]):
+            moved = z[valid[:, s], s].reshape(-1, z.shape[-1])
+            np.testing.assert_allclose(moved.mean(0), 0, atol=1e-3)
+            np.testing.assert_allclose(moved.std(0), 1, atol=1e-3)
+    else:
+        np.testing.assert_array_equal(z, norm.state(jnp.asarray(x)))
+    np.testing.assert_allclose(
+        np.asarray(norm.step(x[:, now], x[:, now + 1]))[valid[:, now + 1]].std((0, 1)), 1, atol=1e-3
+    )
+
+
+def test_any_plan_survives_the_round_trip(windows):
+    x, valid, now = windows
+    for coordinates in ("displacement", "state"):
+        norm = normalise.fit(x, valid, now, coordinates)
+        z = np.random.default_rng(0).normal(size=(2, 5, *x.shape[1:])).astype(np.float32)  # more leading axes
+        np.testing.assert_allclose(norm.apply(norm.invert(jnp.asarray(z))), z, atol=2e-4)
+
+
+def test_constant_entries_are_left_alone():
+    x = np.zeros((10, 4, 2, 3), np.float32)
+    x[..., 0] = 5.0
+    norm = normalise.fit(x, np.ones((10, 4), bool), 0, "displacement")
+    z = norm.apply(jnp.asarray(x))
+    assert np.isfinite(z).all() and not np.asarray(z).any()
+    np.testing.assert_array_equal(norm.invert(z), x)
+    nothing_follows = np.arange(4)[None] < np.ones((10, 1))  # only the present is valid
+    assert np.isfinite(normalise.fit(x, nothing_follows, 0, "displacement").apply(jnp.asarray(x))).all()

@@ -1,0 +1,316 @@
+"""Episode stores: what they refuse, what they keep, and the windows drawn from them."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+
+import h5py
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ringfence.data.store import ARRAYS, EpisodeStore
+from ringfence.errors import StoreError, UserError
+from ringfence.windows import WindowData, at, return_scores, returns_to_go
+
+
+def logs(lengths=(3, 1, 4), agents=2, seed=0, **card) -> EpisodeStore:
+    """A store of noise with a global state; `other` entries of the card are passed on."""
+    rng = np.random.default_rng(seed)
+    ends = np.cumsum(lengths)
+    t, e = int(ends[-1]), len(lengths)
+    return EpisodeStore.from_steps(
+        rng.normal(size=(t, agents, 5)),
+        rng.uniform(-1, 1, size=(t, agents, 2)),
+        rng.normal(size=(t, agents)),
+        episode_ends=ends,
+        final_observations=rng.normal(size=(e, agents, 5)),
+        costs=rng.integers(0, 2, t),
+        state=rng.normal(size=(t, 6)),
+        final_state=rng.normal(size=(e, 6)),
+        terminated=rng.integers(0, 2, e).astype(bool),
+        card=card,
+    )
+
+
+def assert_same(a: EpisodeStore, b: EpisodeStore):
+    for name in (*ARRAYS, "state"):
+        x, y = getattr(a, name), getattr(b, name)
+        assert x.dtype == y.dtype, name
+        np.testing.assert_array_equal(x, y, err_msg=name)
+    assert a.card == b.card
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# disk
+
+
+def test_round_trip(tmp_path, small_store):
+    for store in (small_store, logs(note="kept", agents=3)):
+        loaded = EpisodeStore.load(store.save(tmp_path / "deep" / "store.h5"))
+        assert_same(store, loaded)
+    assert os.listdir(tmp_path / "deep") == ["store.h5"]
+
+
+def test_a_store_without_state_round_trips(tmp_path):
+    store = dataclasses.replace(logs(), state=None)
+    assert EpisodeStore.load(store.save(tmp_path / "s.h5")).state is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.99])
+def test_truncated_file_is_refused(tmp_path, small_store, share):
+    path = small_store.save(tmp_path / "s.h5")
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(StoreError, match=r"s\.h5.*truncated or not HDF5"):
+        EpisodeStore.load(path)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_missing_array_is_named(tmp_path, name):
+    path = logs().save(tmp_path / "s.h5")
+    with h5py.File(path, "a") as f:
+        del f[name]
+    with pytest.raises(StoreError, match=f"lacks the array '{name}'"):
+        EpisodeStore.load(path)
+
+
+def test_foreign_files_are_refused(tmp_path):
+    foreign = tmp_path / "foreign.h5"
+    with h5py.File(foreign, "w") as f:
+        f["observations"] = np.zeros(3)
+    with pytest.raises(StoreError, match="not an episode store"):
+        EpisodeStore.load(foreign)
+    text = tmp_path / "notes.txt"
+    text.write_text("nothing here")
+    with pytest.raises(StoreError, match="not HDF5"):
+        EpisodeStore.load(text)
+    with pytest.raises(StoreError, match="No episode store at"):
+        EpisodeStore.load(tmp_path / "absent.h5")
+
+
+def test_an_invalid_file_is_refused_by_name(tmp_path):
+    path = logs().save(tmp_path / "s.h5")
+    with h5py.File(path, "a") as f:
+        f["costs"][2] = np.nan
+    with pytest.raises(StoreError, match=r"s\.h5.*costs\[2\] is nan"):
+        EpisodeStore.load(path)
+
+
+@pytest.mark.parametrize("broken", ["create_dataset", "replace"])
+def test_nothing_is_left_when_saving_fails(tmp_path, monkeypatch, broken):
+    path = logs().save(tmp_path / "s.h5")
+    before = path.read_bytes()
+
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(*((h5py.Group, "create_dataset") if broken == "create_dataset" else (os, "replace")), full)
+    with pytest.raises(OSError, match="No space left"):
+        logs(seed=1).save(path)
+    monkeypatch.undo()
+    assert os.listdir(tmp_path) == ["s.h5"] and path.read_bytes() == before
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# validation
+
+
+def changed(name, index, value):
+    """A mutation: entry `index` of array `name` becomes `value`."""
+
+    def mutate(store):
+        array = getattr(store, name).copy()
+        array[index] = value
+        return {name: array}
+
+    return mutate
+
+
+def ends_inside(store):
+    flags = store.terminated.copy()
+    flags[0] = True
+    return {"terminated": flags}
+
+
+RULES = {
+    "nan": (changed("observations", (4, 1, 2), np.nan), r"observations\[4, 1, 2\] is nan"),
+    "inf": (changed("state", (3, 2), np.inf), r"state\[3, 2\] is inf"),
+    "nan reward": (changed("rewards", (0, 1), np.nan), r"rewards\[0, 1\] is nan"),
+    "action": (changed("actions", (5, 0, 1), 1.5), r"actions\[5, 0, 1\] is 1.5, outside \[-1, 1\]"),
+    "negative cost": (changed("costs", 1, -1.0), "costs holds negative entries"),
+    "flat actions": (lambda s: {"actions": s.actions[:, 0]}, r"actions has shape \(8, 2\), expected \(T, N, A\)"),
+    "no last state": (lambda s: {"observations": s.observations[:-3]}, r"observations has shape \(8, 2, 5\)"),
+    "agents": (lambda s: {"observations": s.observations[:, :1]}, "observations has shape"),
+    "rewards": (lambda s: {"rewards": s.rewards[:, 0]}, r"rewards has shape \(8,\), expected \(8, 2\)"),
+    "costs": (lambda s: {"costs": s.rewards}, r"costs has shape \(8, 2\), expected \(8,\)"),
+    "flags": (lambda s: {"truncated": s.truncated[:-1]}, r"truncated has shape \(7,\)"),
+    "state": (lambda s: {"state": s.state[:-1]}, r"state has shape \(10, 6\), expected \(11, S\)"),
+    "no episode": (lambda s: {"episode_ends": s.episode_ends[:0]}, "episode_ends is empty"),
+    "ends fall": (lambda s: {"episode_ends": np.array([4, 3, 8])}, "episode_ends must increase"),
+    "unfinished": (lambda s: {"episode_ends": s.episode_ends[:-1]}, "episode_ends ends at 4, actions has 8 steps"),
+    "both flags": (lambda s: {"terminated": s.truncated | s.terminated}, "terminated and truncated are both set"),
+    "no flag": (
+        lambda s: {"terminated": s.terminated & False, "truncated": s.truncated & False},
+        "Episode 0 is unfinished",
+    ),
+    "flag inside": (ends_inside, "inside an episode is flagged"),
+    "names": (
+        lambda s: {"card": {**s.card, "observation_names": ["a"]}},
+        "names 1 observation entries, the data has 5",
+    ),
+    "state names": (lambda s: {"card": {**s.card, "state_names": ["a"]}}, "names 1 state entries, not 6"),
+}
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_broken_rule_is_named(rule):
+    mutate, message = RULES[rule]
+    store = logs()
+    if rule == "both flags":
+        assert store.truncated.any()
+    with pytest.raises(StoreError, match=message):
+        dataclasses.replace(store, **mutate(store))
+
+
+def test_bounds_of_actions_come_from_the_card():
+    store = logs()
+    wide = dataclasses.replace(store, card={**store.card, "action_low": -3.0, "action_high": 3.0})
+    dataclasses.replace(wide, actions=wide.actions * 3)
+    with pytest.raises(StoreError, match=r"outside \[-3, 3\]"):
+        dataclasses.replace(wide, actions=wide.actions * 30)
+
+
+def test_bad_cards_are_refused():
+    with pytest.raises(UserError, match="Unknown hazard 'Separatoin'; did you mean 'Separation'"):
+        logs(hazard={"kind": "Separatoin"})
+    with pytest.raises(UserError, match="did you mean 'radius'"):
+        logs(hazard={"kind": "Separation", "radus": 0.3})
+    with pytest.raises(UserError, match="SpeedLimit.*limit"):
+        logs(hazard={"kind": "SpeedLimit"})
+
+
+def test_select_keeps_whole_episodes():
+    store = logs((3, 1, 4, 2))
+    part = store.select(np.array([False, True, False, True]))
+    assert part.lengths.tolist() == [1, 2]
+    np.testing.assert_array_equal(part.actions, store.actions[[3, 8, 9]])
+    np.testing.assert_array_equal(part.observations, store.observations[[4, 5, 11, 12, 13]])
+    np.testing.assert_array_equal(part.state, store.state[[4, 5, 11, 12, 13]])
+    np.testing.assert_allclose(part.returns, store.returns[[1, 3]], rtol=1e-6)
+    np.testing.assert_allclose(part.episode_costs, store.episode_costs[[1, 3]])
+    with pytest.raises(StoreError, match="No episode is left"):
+        store.select(np.zeros(4, bool))
+
+
+def test_from_steps_equals_from_episodes(small_store, played):
+    flat = lambda x: x.reshape(-1, *x.shape[2:])  # noqa: E731
+    again = EpisodeStore.from_steps(
+        flat(played["observations"][:, :-1]),
+        flat(played["actions"]),
+        flat(played["rewards"]),
+        episode_ends=np.arange(1, 41) * 25,
+        final_observations=played["observations"][:, -1],
+        costs=flat(played["costs"]),
+        state=flat(played["state"][:, :-1]),
+        final_state=played["state"][:, -1],
+        card=small_store.card,
+    )
+    assert_same(small_store, again)
+
+
+def test_makers_refuse_incomplete_logs(played):
+    with pytest.raises(StoreError, match="keep the state that the last action leads to"):
+        EpisodeStore.from_episodes(
+            played["observations"][:, :-1], played["actions"], played["rewards"], played["costs"]
+        )
+    steps = dict(observations=np.zeros((4, 1, 2)), actions=np.zeros((4, 1, 1)), rewards=np.zeros(4))
+    with pytest.raises(StoreError, match="drop an unfinished last episode"):
+        EpisodeStore.from_steps(**steps, episode_ends=[3], final_observations=np.zeros((1, 1, 2)))
+    with pytest.raises(StoreError, match="state was given without final_state"):
+        EpisodeStore.from_steps(
+            **steps, episode_ends=[4], final_observations=np.zeros((1, 1, 2)), state=np.zeros((4, 1))
+        )
+    with pytest.raises(StoreError, match="episode_ends must increase"):
+        EpisodeStore.from_steps(**steps, episode_ends=[9, 4], final_observations=np.zeros((2, 1, 2)))
+    with pytest.raises(StoreError, match="final_observations has shape"):
+        EpisodeStore.from_steps(**steps, episode_ends=[2, 4], final_observations=np.zeros((1, 1, 2)))
+
+
+def test_one_reward_for_the_team_is_everybodys():
+    store = EpisodeStore.from_episodes(np.zeros((1, 3, 4, 2)), np.zeros((1, 2, 4, 1)), [[1.0, 2.0]], [[0.0, 1.0]])
+    assert store.rewards.tolist() == [[1.0] * 4, [2.0] * 4]
+    assert store.returns.tolist() == [3.0] and store.episode_costs.tolist() == [1.0]
+
+
+# ---------------------------------------------------------------------------------------------------------------------
+# windows
+
+
+@st.composite
+def partitions(draw, total=12, parts=4):
+    """Lengths of `parts` episodes that sum to `total`; fixed sizes, so that one compilation serves all examples."""
+    cuts = draw(st.lists(st.integers(1, total - 1), min_size=parts - 1, max_size=parts - 1, unique=True))
+    return np.diff([0, *sorted(cuts), total])
+
+
+drawn = jax.jit(at, static_argnums=(2, 3))
+
+
+@pytest.mark.parametrize("horizon, history", [(5, 0), (3, 2)])
+@settings(max_examples=15, deadline=None)
+@given(lengths=partitions())
+def test_windows_repeat_rows_at_the_ends_of_episodes(horizon, history, lengths):
+    store = logs(tuple(lengths))
+    data = WindowData(store, lambda observations, state: observations, 0.9)
+    steps = np.arange(store.steps)
+    batch = jax.tree.map(np.asarray, drawn(data.arrays, steps, horizon, history))
+    row, step = 0, 0
+    for length in lengths:
+        for t in range(length):
+            for j in range(horizon + history):
+                time = t + j - history
+                here = row + min(max(time, 0), length)
+                np.testing.assert_array_equal(batch.features[step, j], store.observations[here])
+                assert batch.valid[step, j] == (time <= length)
+                arrived = min(max(time, 0), length)
+                assert batch.costs[step, j] == (store.costs[step - t + arrived - 1] if arrived else 0)
+                if j < horizon + history - 1:
+                    acted = 0 <= time < length
+                    wanted = store.actions[step - t + time] if acted else np.zeros((2, 2))
+                    np.testing.assert_array_equal(batch.actions[step, j], wanted)
+            step += 1
+        row += length + 1
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=6), discount=st.floats(0.0, 1.0), seed=st.integers(0, 999)
+)
+def test_returns_to_go_is_the_discounted_sum(lengths, discount, seed):
+    lengths = np.array(lengths)
+    reward = np.random.default_rng(seed).normal(size=lengths.sum())
+    expected, start = [], 0
+    for length in lengths:
+        for t in range(length):
+            expected.append(sum(discount**i * r for i, r in enumerate(reward[start + t : start + length])))
+        start += length
+    np.testing.assert_allclose(returns_to_go(reward, lengths, discount), expected, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lengths=st.lists(st.integers(1, 12), min_size=1, max_size=80), seed=st.integers(0, 999))
+def test_return_scores_keep_the_order_within_a_time_step(lengths, seed):
+    time = np.concatenate([np.arange(n) for n in lengths])
+    togo = np.random.default_rng(seed).normal(size=len(time)).round(1)  # rounded: ties occur
+    scores = return_scores(togo, time)
+    assert np.isfinite(scores).all() and abs(scores.mean()) < 0.3
+    for t in range(max(lengths)):
+        here = time == t
+        order = np.argsort(togo[here])
+        assert (np.diff(scores[here][order]) >= 0).all()
+        for value in np.unique(togo[here]):
+            assert len(np.unique(scores[here & (togo == value)])) == 1
