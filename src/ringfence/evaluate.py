@@ -23,7 +23,6 @@ from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
 from ringfence.types import Policy, Spec
-from ringfence.windows import blank
 
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
@@ -150,7 +149,7 @@ def load(run: Run | str, step: int | None = None, **options):
     """(job, policy) of a finished run; `options` are fields of PlanOptions, read at evaluation time."""
     run = run if isinstance(run, Run) else Run(Path(run))
     job = load_job(run)
-    template = job.algorithm.init(jax.random.key(0), job.spec, job.config, blank(job.spec), job.hazard)
+    template = jax.eval_shape(lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.hazard))
     _, state = run.load_checkpoint(template, step)
     return job, make_policy(job, state, options)
 

@@ -21,9 +21,12 @@ from ringfence import diffusion
 from ringfence.errors import UserError
 from ringfence.features import FeatureMap
 from ringfence.hazards import BoundHazard
-from ringfence.nets.heads import barrier_on, infer_action, state_values
+from ringfence.nets.heads import barrier_on, infer_action
 from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+from ringfence.values import plan_value
+
+MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
 @dataclass(frozen=True)
@@ -36,9 +39,13 @@ class PlanOptions:
     guidance: float = 1.2  # ω of classifier-free guidance; 1 switches it off
     target: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
     temperature: float = 1.0  # scale of the first noise
+    ascent: float = 0.0  # gradient guidance: steps of x̂0 along the plan's value, in units of its deviation
+    persist: float = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
+    repair: float = 0.0  # gradient guidance: steps of x̂0 along the safety score where it is below the margin
     select: Literal["clearance", "barrier", "both"] = "clearance"  # what a plan's safety is judged by
     margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
     prefix: int = 3  # rows of the plan that are judged
+    reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: int = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
@@ -55,9 +62,9 @@ class PlanOptions:
 class Planner(eqx.Module):
     """Receding-horizon diffusion planner with selection among plans."""
 
-    networks: dict[str, Any]  # denoiser, inverse, critic, maybe barrier
+    networks: dict[str, Any]  # denoiser, inverse, maybe barrier
     normaliser: Normaliser
-    value_scale: Array  # (2, 2)
+    critic: dict[str, Any]  # what states are worth
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     history: int = eqx.field(static=True)
@@ -150,17 +157,51 @@ class Planner(eqx.Module):
         bar = np.asarray(self.alpha_bar)
         target = jnp.full(b, o.target)
         predict = diffusion.guided(self.networks["denoiser"], bar, target, o.guidance, self.prediction, self.clip)
-        x = diffusion.sample(
-            predict,
-            lambda x: jnp.where(mask, known, x),
-            (b, rows, n, d),
-            bar,
-            key,
-            o.steps,
-            o.sampler,
-            o.temperature,
-        )
-        return self.normaliser.invert(x)
+
+        def inpaint(x: Array) -> Array:
+            return jnp.where(mask, known, x)
+
+        def steered(x: Array, k: Array) -> Array:
+            clean = inpaint(predict(x, k))
+            if o.ascent > 0 or o.repair > 0:
+                slope = jax.grad(lambda c: self.merit(inpaint(c)).sum())(clean)
+                size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
+                slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
+                level = (1.0 - jnp.asarray(bar, jnp.float32)[k]) ** o.persist
+                clean = jnp.clip(inpaint(clean + level[:, None, None, None] * slope), -self.clip, self.clip)
+            return self.normaliser.apply(self.agreed(self.normaliser.invert(clean))) if o.reconcile else clean
+
+        shape = (b, rows, n, d)
+        x = diffusion.sample(steered, inpaint, shape, bar, key, o.steps, o.sampler, o.temperature)
+        return self.agreed(self.normaliser.invert(x)) if o.reconcile else self.normaliser.invert(x)
+
+    def agreed(self, x: Array) -> Array:
+        """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
+        if self.feature_map.reconcile is None or self.options.execution == "decentralized":
+            return x
+        later = self.feature_map.reconcile(x[:, self.history :])
+        return jnp.concatenate([x[:, : self.history], later], 1)
+
+    def merit(self, clean: Array) -> Array:
+        """(B,) what gradient guidance climbs: value in deviations of the data's, and safety up to the margin."""
+        o, total = self.options, jnp.zeros(clean.shape[0])
+        x = self.agreed(self.normaliser.invert(clean))
+        ahead = x[:, self.history + 1 :]
+        if o.ascent > 0:
+            total = total + o.ascent * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]
+        if o.repair > 0:
+            short = jnp.minimum(self.safety(ahead) - o.margin, 0.0)
+            total = total + o.repair * short.sum((1, 2))
+        return total
+
+    def safety(self, rows: Array) -> Array:
+        """(..., N) the configured safety score of states (..., N, D): clearance, barrier or the least of both."""
+        scores = []
+        if self.options.select in ("clearance", "both"):
+            scores.append(self.hazard.clearance(rows))
+        if self.options.select in ("barrier", "both"):
+            scores.append(barrier_on(self.networks["barrier"], self.normaliser, rows))
+        return jnp.stack(scores).min(0)
 
     def judge(self, x: Array) -> tuple[Array, Array]:
         """Plans (B, P, rows, N, D) -> safety (B, P, N), the least over the judged rows, and value (B, P).
@@ -169,15 +210,8 @@ class Planner(eqx.Module):
         """
         o, now = self.options, self.history
         ahead = x[:, :, now + 1 : now + 1 + o.prefix]
-        scores = []
-        if o.select in ("clearance", "both"):
-            scores.append(self.hazard.clearance(ahead))
-        if o.select in ("barrier", "both"):
-            scores.append(barrier_on(self.networks["barrier"], self.normaliser, ahead))
-        safety = jnp.stack(scores).min(0).min(2)
-        reward, togo = state_values(self.networks["critic"], self.normaliser, self.value_scale, x[:, :, now + 1 :])
-        weight = self.discount ** jnp.arange(reward.shape[-1])
-        return safety, (reward * weight).sum(-1) + weight[-1] * self.discount * togo[..., -1]
+        safety = self.safety(ahead).min(2)
+        return safety, plan_value(self.critic, x[:, :, now + 1 :], self.discount)
 
     def _no_news(self, batch: int) -> dict[str, Array]:
         n, d, rows = self.spec.n_agents, self.spec.feature_dim, self.history + self.horizon

@@ -93,7 +93,13 @@ def train(
     runs = [_prepare(Run(folder_of(out, job, seed)), job, seed, data) for seed in seeds]
     limit = getattr(job.config, "cost_limit", None)
     used = data if limit is None else data.select(data.episode_costs <= limit)
-    windows = WindowData(used, job.feature_map, job.config.discount)
+    windows = WindowData(
+        used,
+        job.feature_map,
+        getattr(job.config, "discount", 1.0),
+        getattr(job.config, "condition", None),
+        job.config.horizon,
+    )
     steps = job.config.steps
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)

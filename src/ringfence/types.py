@@ -72,11 +72,8 @@ class Batch(NamedTuple):
     features: Array  # (B, H, N, D) s̃_i at t .. t+H-1; the tail past the episode's end repeats the last state
     actions: Array  # (B, H-1, N, A) the action between rows h and h+1 (0 where padded)
     valid: Array  # (B, H) bool: the row is a real state of the episode
-    rewards: Array  # (B, H-1) team reward of the transition h -> h+1 (0 where padded)
-    returns: Array  # (B,) normal score of the return-to-go among the data at the same time step
-    togo: Array  # (B, H) discounted return-to-go of every row (0 where padded)
+    score: Array  # (B,) normal score of the window's value among the data: the condition y
     costs: Array  # (B, H) cost charged on arriving in the row
-    time: Array  # (B,) time step of the present row
 
 
 class PolicyStep(NamedTuple):

@@ -11,11 +11,10 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtri
-from scipy.stats import rankdata
 
+from ringfence import values
 from ringfence.data.store import EpisodeStore
-from ringfence.types import Array, Batch, Key, Spec
+from ringfence.types import Array, Batch, Key
 
 MIN_COHORT = 30  # return scores are ranks among at least this many steps
 
@@ -24,48 +23,52 @@ class WindowData:
     """Episodes on the device, with all that is needed to draw windows.
 
     M = T + E rows of states, T steps. `arrays` is a pytree of device arrays that jitted functions take as an
-    argument, so that the data is never baked into a compiled program.
+    argument, so that the data is never baked into a compiled program. `critic` is what states are worth (values.py);
+    it is fitted here, once per data set, and only if an algorithm is conditioned on value or ranks plans by it.
     """
 
-    def __init__(self, store: EpisodeStore, features: Callable, discount: float):
+    def __init__(
+        self,
+        store: EpisodeStore,
+        features: Callable,
+        discount: float,
+        condition: values.Condition | None = None,
+        horizon: int = 2,
+        updates: int = 8000,
+    ):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
         step = np.arange(store.steps)
         time = step - starts[episode]
         team = store.rewards.mean(1)
-        togo = returns_to_go(team, store.lengths, discount)
-        rows_togo = np.insert(togo, store.episode_ends, 0.0)
-        # (2, 2): mean and standard deviation of the reward, then of the return-to-go
-        self.value_scale = np.array([[v.mean(), max(v.std(), 1e-6)] for v in (team, togo)], np.float32)
-        rows_cost = np.insert(store.costs, starts, 0.0)  # the cost charged on arriving in a row
-        x = np.asarray(features(store.observations, store.state), np.float32)
+        row, last = step + episode, store.episode_ends[episode] + episode
+        x = jnp.asarray(np.asarray(features(store.observations, store.state), np.float32))
         self.steps, self.n_agents, self.feature_dim = store.steps, store.n_agents, x.shape[-1]
+        self.critic = None
+        scores = np.zeros(store.steps)
+        if condition is not None:
+            togo = returns_to_go(team, store.lengths, discount)
+            arrived, ahead = np.zeros(len(x), np.float32), np.zeros(len(x), np.float32)
+            arrived[row + 1], ahead[row] = team, togo
+            # First rows were not arrived in: they take the reward of their own first step, a fair stand-in.
+            arrived[starts + np.arange(store.episodes)] = team[starts]
+            self.critic = values.fit_critic(
+                x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates
+            )
+            if condition == "advantage":
+                value = values.values_of(self.critic, x)
+                scores = values.normal_scores(values.advantages(value, team, row, last, horizon, discount))
+            else:
+                scores = return_scores(togo, time)
         self.arrays = {
-            "features": jnp.asarray(x),  # (M, N, D)
+            "features": x,  # (M, N, D)
             "actions": jnp.asarray(store.actions),  # (T, N, A)
-            "rewards": jnp.asarray(team),  # (T,)
-            "scores": jnp.asarray(return_scores(togo, time), jnp.float32),  # (T,)
-            "togo": jnp.asarray(rows_togo, jnp.float32),  # (M,)
-            "costs": jnp.asarray(rows_cost, jnp.float32),  # (M,)
-            "time": jnp.asarray(time, jnp.int32),  # (T,)
-            "row": jnp.asarray(step + episode, jnp.int32),  # (T,) row of the state before the step
+            "scores": jnp.asarray(scores, jnp.float32),  # (T,)
+            "costs": jnp.asarray(np.insert(store.costs, starts, 0.0), jnp.float32),  # (M,) charged on arriving
+            "row": jnp.asarray(row, jnp.int32),  # (T,) row of the state before the step
             "first_row": jnp.asarray(starts[episode] + episode, jnp.int32),  # (T,)
-            "last_row": jnp.asarray(store.episode_ends[episode] + episode, jnp.int32),  # (T,)
+            "last_row": jnp.asarray(last, jnp.int32),  # (T,)
         }
-
-
-def blank(spec: Spec, steps: int = 40) -> WindowData:
-    """Data of the right shapes that says nothing: one episode of noise, from which a model's skeleton is built."""
-    rng = np.random.default_rng(0)
-    n, d = spec.n_agents, spec.feature_dim
-    store = EpisodeStore.from_episodes(
-        rng.normal(size=(1, steps + 1, n, d)),
-        np.zeros((1, steps, n, spec.action_dim)),
-        np.zeros((1, steps)),
-        np.zeros((1, steps)),
-        card={"action_low": min(spec.action_low, 0.0), "action_high": max(spec.action_high, 0.0)},
-    )
-    return WindowData(store, lambda observations, state: observations, 0.9)
 
 
 def draw(arrays: dict[str, Array], key: Key, batch: int, horizon: int, history: int = 0) -> Batch:
@@ -88,11 +91,8 @@ def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) ->
         features=arrays["features"][row],
         actions=jnp.where(acted[..., None, None], arrays["actions"][after], 0.0),
         valid=valid,
-        rewards=jnp.where(acted, arrays["rewards"][after], 0.0),
-        returns=arrays["scores"][step],
-        togo=jnp.where(valid, arrays["togo"][row], 0.0),
+        score=arrays["scores"][step],
         costs=arrays["costs"][row],
-        time=arrays["time"][step],
     )
 
 
@@ -116,10 +116,9 @@ def return_scores(togo: np.ndarray, time: np.ndarray) -> np.ndarray:
     Ranking within the time step keeps early windows from seeing impossible targets, and the normal score keeps the
     scale the same for every data set: +2 is the best 2.3 %. Times that few episodes reach are ranked together.
     """
-    out = np.zeros(len(togo))
     order = np.argsort(time, kind="stable")
     counts = np.bincount(time)
-    edges, start = [], 0
+    edges, start, out = [], 0, np.zeros(len(togo))
     for count in np.cumsum(counts):
         if count - start >= MIN_COHORT or count == len(togo):
             edges.append((start, count))
@@ -128,5 +127,5 @@ def return_scores(togo: np.ndarray, time: np.ndarray) -> np.ndarray:
         edges[-2:] = [(edges[-2][0], edges[-1][1])]
     for a, b in edges:
         cohort = order[a:b]
-        out[cohort] = ndtri((rankdata(togo[cohort]) - 0.5) / (b - a))
+        out[cohort] = values.normal_scores(togo[cohort])
     return out

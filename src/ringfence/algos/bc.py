@@ -25,7 +25,6 @@ class Config:
     cost_limit: float | None = None  # keep episodes with cost ≤ this; None keeps all
     horizon: int = 2  # rows of a window: now and next
     history: int = 0  # rows of the past (unused)
-    discount: float = 0.99  # unused by the loss; windows carry returns
     width: int = 256  # units of each hidden layer
     depth: int = 2  # hidden layers
     steps: int = 10_000  # updates
@@ -36,20 +35,29 @@ class Config:
     ema: float = 0.995  # of the parameters
 
 
-def init(key: Key, spec: Spec, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
+def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: BoundHazard) -> PyTree:
+    """Parameters, their averages, optimiser state, the normaliser; without data, zeros stand for its statistics."""
     ka, kw = jax.random.split(key)
-    d, sizes = spec.feature_dim, [config.width] * config.depth
-    params = {"actor": MLP(ka, (d, *sizes, spec.action_dim), groups=spec.n_agents, final_scale=0.1)}
-    some = jax.random.randint(kw, (min(8192, 4 * data.steps),), 0, data.steps)
-    windows = at(data.arrays, some, 2)
-    norm = normalise.fit(np.asarray(windows.features), np.asarray(windows.valid), 0, "displacement")
-    return {
-        "params": params,
-        "ema": jax.tree.map(jnp.copy, params),
-        "opt": _optimiser(config).init(params),
-        "step": jnp.zeros((), jnp.int32),
-        "frozen": {"normaliser": norm},
-    }
+    d = spec.feature_dim
+
+    def networks() -> dict:
+        sizes = (d, *[config.width] * config.depth, spec.action_dim)
+        params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
+        return {
+            "params": params,
+            "ema": jax.tree.map(jnp.copy, params),
+            "opt": _optimiser(config).init(params),
+            "step": jnp.zeros((), jnp.int32),
+        }
+
+    if data is None:
+        one, step = jnp.zeros(d), jnp.zeros((1, d))
+        norm = normalise.Normaliser(one, one, step, step, 0, "displacement")
+    else:
+        some = jax.random.randint(kw, (min(8192, 4 * data.steps),), 0, data.steps)
+        windows = at(data.arrays, some, 2)
+        norm = normalise.fit(np.asarray(windows.features), np.asarray(windows.valid), 0, "displacement")
+    return jax.jit(networks)() | {"frozen": {"normaliser": norm}}
 
 
 def make_update(config: Config, spec: Spec, hazard: BoundHazard):

@@ -4,7 +4,6 @@ Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 8)
     L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 10)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 12)
-    L^V  reward and return-to-go of a state, by which plans are ranked; not in the paper
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
 the barrier is learned and diagnosed, but the planner is MADIFF's to the bit.
@@ -20,11 +19,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import barrier as cbf
-from ringfence import diffusion, features, normalise
+from ringfence import diffusion, features, normalise, values
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP, build_denoiser
-from ringfence.nets.heads import barrier_on, infer_action, state_values
+from ringfence.nets.heads import barrier_on, infer_action
 from ringfence.optim import Optimiser, average
 from ringfence.policies import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
@@ -40,12 +39,13 @@ class Config:
     horizon: int = 8  # H, rows of a plan, the present one included
     history: int = 0  # rows of the past that are in-painted, too
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    discount: float = 0.9  # of the return-to-go that plans are conditioned on and ranked by
+    condition: values.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
+    discount: float = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
     # --- denoiser ---
     net: Literal["attention", "unet"] = "attention"  # agent attention over flat windows, or MADIFF's temporal U-Net
-    width: int = 256  # channels
+    width: int = 128  # channels
     depth: int = 3  # blocks (attention) or resolutions (unet)
     diffusion_steps: int = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
@@ -70,20 +70,19 @@ class Config:
     gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
     gradient_batch: int = 32  # windows per update for ddim:n and chain:n
     barrier_width: int = 128  # units of each of h's 3 hidden layers
-    barrier_batch: int = 64  # windows per update that h learns from (data and generated, each)
+    barrier_batch: int = 64  # windows per update that barriers work on, data and generated, each
     bank: int = 4096  # unsafe states kept for h
     bank_batch: int = 128  # of them per update
 
     # --- other networks ---
     inverse_width: int = 128  # units of each of 2 hidden layers
     inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
-    critic_width: int = 128  # units of each of 2 hidden layers
 
     # --- optimisation ---
-    steps: int = 4000  # updates
-    batch: int = 192  # windows per update
+    steps: int = 2000  # updates
+    batch: int = 128  # windows per update
     lr: float = 1e-3  # Adam, after warm-up, before cosine decay to a tenth
-    warmup: int = 200  # updates
+    warmup: int = 100  # updates
     grad_clip: float = 1.0  # global norm, per network
     ema: float = 0.995  # of all parameters; the policy uses the averages
 
@@ -126,31 +125,54 @@ def retention(config: Config) -> cbf.Retention:
     return cbf.Retention(config.retention, config.relaxation, config.two_sided)
 
 
-def init(key: Key, spec: Spec, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
-    """Parameters, their averages, optimiser state and the frozen statistics of the data."""
+def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: BoundHazard) -> PyTree:
+    """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
+    for the statistics, which is all that a checkpoint's template needs."""
     check(config)
-    kd, kb, ki, kv, kw, ku = jax.random.split(key, 6)
-    n, d, h = spec.n_agents, spec.feature_dim, config.horizon + config.history
-    params = {
-        "denoiser": build_denoiser(kd, config.net, h, d, config.width, config.depth),
-        "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n),
-        "critic": MLP(kv, (d, *[config.critic_width] * 2, 2)),
-    }
-    frozen = {"normaliser": fit_normaliser(config, data, kw), "value_scale": jnp.asarray(data.value_scale)}
+    kd, kb, ki, ks = jax.random.split(key, 4)
+    n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
+
+    def networks() -> dict:
+        params = {
+            "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth),
+            "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n),
+        }
+        if config.barrier:
+            groups = n if config.scope == "individual" else 1
+            params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
+        return {
+            "params": params,
+            "ema": jax.tree.map(jnp.copy, params),
+            "opt": optimiser(config).init(params),
+            "step": jnp.zeros((), jnp.int32),
+        }
+
+    frozen = blank_statistics(spec, config) if data is None else statistics(ks, config, data, hazard)
+    return jax.jit(networks)() | {"frozen": frozen}
+
+
+def statistics(key: Key, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
+    """What is learned of the data once: the normaliser, the critic, the bank of unsafe states."""
+    kw, ku = jax.random.split(key)
+    frozen = {"normaliser": fit_normaliser(config, data, kw), "critic": data.critic}
     if config.barrier:
-        groups = n if config.scope == "individual" else 1
-        params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
         some = jax.random.randint(kw, (min(100_000, 4 * data.steps),), 0, data.arrays["features"].shape[0])
         rows = data.arrays["features"][some], data.arrays["costs"][some]
-        bank, own = cbf.unsafe_bank(*rows, hazard, config.bank, ku)
-        frozen |= {"bank": bank, "bank_own": own}
-    return {
-        "params": params,
-        "ema": jax.tree.map(jnp.copy, params),
-        "opt": optimiser(config).init(params),
-        "step": jnp.zeros((), jnp.int32),
-        "frozen": frozen,
-    }
+        frozen["bank"], frozen["bank_own"] = cbf.unsafe_bank(*rows, hazard, config.bank, ku)
+    return frozen
+
+
+def blank_statistics(spec: Spec, config: Config) -> PyTree:
+    """Zeros in the shapes of `statistics`."""
+    d, n, h = spec.feature_dim, spec.n_agents, config.horizon
+    one = jnp.zeros(d)
+    norm = normalise.Normaliser(
+        one, one, jnp.zeros((h - 1, d)), jnp.zeros((h - 1, d)), config.history, config.coordinates
+    )
+    frozen = {"normaliser": norm, "critic": values.blank_critic(d)}
+    if config.barrier:
+        frozen |= {"bank": jnp.zeros((config.bank, n, d)), "bank_own": jnp.zeros((config.bank, n), bool)}
+    return frozen
 
 
 def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 8192) -> normalise.Normaliser:
@@ -213,7 +235,7 @@ def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Confi
     mask = inpainted(visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1])
     noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
     keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
-    output = params["denoiser"](noised.x, noised.k, batch.returns, keep)
+    output = params["denoiser"](noised.x, noised.k, batch.score, keep)
     weight = (~mask & batch.valid[..., None, None]).astype(jnp.float32)
     clip = (config.snr_floor, config.snr_ceiling)
     loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
@@ -228,16 +250,6 @@ def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, k
     return (
         ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(-1).mean()
     )
-
-
-def values(params: PyTree, batch: Batch, frozen: PyTree, config: Config) -> Array:
-    """L^V: squared errors of reward and return-to-go, both standardised, on the first step of windows."""
-    now, scale = config.history, frozen["value_scale"]
-    x = batch.features[:, now : now + 2]
-    reward, togo = state_values(params["critic"], frozen["normaliser"], scale, x)
-    on_reward = (reward[:, 1] - batch.rewards[:, now]) / scale[0, 1]
-    on_togo = (togo - batch.togo[:, now : now + 2]) / scale[1, 1]
-    return (on_reward**2).mean() + (on_togo**2).mean()
 
 
 class Generated(NamedTuple):
@@ -265,8 +277,10 @@ def generated(
     ret, bar = retention(config), alpha_bar
     etas = jnp.asarray(ret.eta(bar), jnp.float32)
     if kind == "x0":
-        weight = noised.signal[..., 0] ** 2 if config.weigh_by_signal else jnp.ones_like(noised.signal[..., 0])
-        return Generated(norm.invert(clean), batch.valid, etas[noised.k][:, None, None], weight)
+        m = config.barrier_batch
+        weight = noised.signal[:m, ..., 0] ** 2
+        weight = weight if config.weigh_by_signal else jnp.ones_like(weight)
+        return Generated(norm.invert(clean[:m]), batch.valid[:m], etas[noised.k[:m]][:, None, None], weight)
     b = min(config.gradient_batch, clean.shape[0])
     mask, known, valid = mask[:b], norm.apply(batch.features)[:b], batch.valid[:b]
     one, zero = jnp.ones((b, 1, 1)), jnp.zeros((b, 1, 1))
@@ -274,7 +288,7 @@ def generated(
     def inpaint(x: Array) -> Array:
         return jnp.where(mask, known, x)
 
-    predict = diffusion.guided(params["denoiser"], alpha_bar, batch.returns[:b], 1.0, config.prediction, config.clip)
+    predict = diffusion.guided(params["denoiser"], alpha_bar, batch.score[:b], 1.0, config.prediction, config.clip)
     if kind == "ddim":
         x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)
         return Generated(norm.invert(x), valid, zero, one)
@@ -380,9 +394,8 @@ def make_loss(config: Config, hazard: BoundHazard):
         norm = frozen["normaliser"]
         denoise, (clean, noised, mask) = denoising(params, batch, norm.apply(batch.features), kd, config, alpha_bar)
         inverse = inverse_dynamics(params, batch, norm, kp, config)
-        value = values(params, batch, frozen, config)
-        metrics = {"loss/denoising": denoise, "loss/inverse": inverse, "loss/value": value}
-        total = parts[0] * denoise + inverse + value
+        metrics = {"loss/denoising": denoise, "loss/inverse": inverse}
+        total = parts[0] * denoise + inverse
         if config.barrier:
             made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
@@ -457,7 +470,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     return Planner(
         networks=state["ema"],
         normaliser=state["frozen"]["normaliser"],
-        value_scale=state["frozen"]["value_scale"],
+        critic=state["frozen"]["critic"],
         alpha_bar=tuple(schedule(config).tolist()),
         horizon=config.horizon,
         history=config.history,

@@ -14,7 +14,6 @@ from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.tasks import Task
 
-
 COLLECTION = 271_828  # root of the collection keys, far from those of evaluation
 
 

@@ -1,4 +1,4 @@
-"""What the small networks mean: inverse dynamics, values and barriers, on features in physical units."""
+"""What the small networks mean: inverse dynamics and barriers, on features in physical units."""
 
 from __future__ import annotations
 
@@ -23,12 +23,3 @@ def infer_action(
     if key is not None and noise > 0:
         step = step + noise * jax.random.normal(key, step.shape)
     return inverse(jnp.concatenate([norm.state(before), step], -1))
-
-
-def state_values(critic: MLP, norm: Normaliser, scale: Array, x: Array) -> tuple[Array, Array]:
-    """(team reward on arriving in a state, return-to-go from it), each (...,), in the data's units; x (..., N, D).
-
-    Every agent's s̃_i gives an estimate and the team's is their mean; `scale` (2, 2) holds mean and deviation of both.
-    """
-    out = critic(norm.state(x)).mean(-2) * scale[:, 1] + scale[:, 0]
-    return out[..., 0], out[..., 1]

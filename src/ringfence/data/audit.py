@@ -1,0 +1,78 @@
+"""What is in a store, and what should worry its user."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ringfence import hazards, tasks
+from ringfence.data.store import EpisodeStore
+from ringfence.errors import UserError
+
+
+class Audit(NamedTuple):
+    facts: dict[str, str]
+    warnings: list[str]
+
+
+def audit(store: EpisodeStore) -> Audit:
+    """Sizes, returns, cost, share of episodes that start unsafe, and warnings in plain words."""
+    s, card = store, store.card
+    returns, costs, lengths = s.returns, s.episode_costs, s.lengths
+    rate = float((s.costs > 0).mean())
+    facts = {
+        "task": str(card["task"]),
+        "provenance": str(card["provenance"]),
+        "collected": str(card.get("collected", "not said")),
+        "episodes": f"{s.episodes:,}",
+        "steps": f"{s.steps:,}",
+        "episode length": f"{lengths.min()} to {lengths.max()}" if np.ptp(lengths) else str(lengths[0]),
+        "agents": str(s.n_agents),
+        "observation, action": f"{s.observations.shape[2]}, {s.actions.shape[2]} per agent",
+        "global state": "none" if s.state is None else f"{s.state.shape[1]} entries",
+        "hazard": str(s.hazard),
+        "return": f"{returns.mean():.2f} ± {returns.std():.2f}, from {returns.min():.2f} to {returns.max():.2f}",
+        "cost per episode": f"{costs.mean():.3f} ± {costs.std():.3f}, at most {costs.max():g}",
+        "steps with cost": f"{100 * rate:.2f} %",
+        "episodes with cost": f"{100 * (costs > 0).mean():.2f} %",
+        "actions": f"from {s.actions.min():.3f} to {s.actions.max():.3f}, bounds {card['action_low']:g} to "
+        f"{card['action_high']:g}",
+        "ended by": f"{int(s.terminated.sum()):,} terminations, {int(s.truncated.sum()):,} truncations",
+    }
+    warnings = []
+    starts = _unsafe_starts(store)
+    if starts is not None:
+        facts["episodes starting unsafe"] = f"{100 * starts.mean():.2f} %"
+        if starts.any():
+            warnings.append(
+                f"{100 * starts.mean():.1f} % of episodes start unsafe: their first cost says nothing about a policy; "
+                "read the avoidable cost."
+            )
+    if rate == 0:
+        warnings.append("No step has a cost: a barrier can learn danger only from the hazard's formula.")
+    elif rate < 0.01:
+        warnings.append(f"Only {100 * rate:.2f} % of steps have a cost: labels of danger are scarce.")
+    elif rate > 0.99:
+        warnings.append(f"{100 * rate:.1f} % of steps have a cost: almost nothing in this data is safe.")
+    flat = s.observations.reshape(-1, s.observations.shape[2])
+    constant = np.flatnonzero(np.ptp(flat[:: max(1, len(flat) // 100_000)], axis=0) < 1e-9)
+    if len(constant):
+        warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
+    if s.terminated.any() and not s.truncated.any() and np.ptp(lengths) == 0:
+        warnings.append("All episodes terminate at the same length: these are probably time limits (truncated).")
+    return Audit(facts, warnings)
+
+
+def _unsafe_starts(store: EpisodeStore) -> np.ndarray | None:
+    task = tasks.from_store(store)
+    try:
+        view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
+        bound = hazards.bind(task.hazard, view.names, store.n_agents)
+    except UserError:
+        return None
+    if not bound.has_formula:
+        return None
+    first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+    state = None if store.state is None else store.state[first]
+    return np.asarray(bound.labels(view(store.observations[first], state))[0]).any(-1)
