@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+
+# The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give.
+# Set before JAX starts; whoever sets XLA_FLAGS himself, even to nothing, tests with those.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+
 import jax
 import numpy as np
 import pytest

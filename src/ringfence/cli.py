@@ -24,14 +24,23 @@ def tasks() -> None:
     for t in tasks.TASKS.values():
         mean, deviation = t.published_return
         table.add_row(
-            t.name, f"{t.about}, {t.transitions:,} steps", f"{mean:.1f} ± {deviation:.1f}", str(t.hazard),
-            f"{t.cost_limit:g}", f"{t.cost_offset:g}", f"{t.return_min:g}", f"{t.return_max:g}",
+            t.name,
+            f"{t.about}, {t.transitions:,} steps",
+            f"{mean:.1f} ± {deviation:.1f}",
+            str(t.hazard),
+            f"{t.cost_limit:g}",
+            f"{t.cost_offset:g}",
+            f"{t.return_min:g}",
+            f"{t.return_max:g}",
         )
     out.print(table)
 
 
 def make(
-    task: Positional[str], size: int | None = None, seed: int = 0, out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None
+    task: Positional[str],
+    size: int | None = None,
+    seed: int = 0,
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
 ) -> None:
     """Regenerate a task's data set (cached).
 
@@ -114,8 +123,14 @@ def train(
     changes = _assignments(set)
     _early(algorithm, preset, changes)
     runs = training.train(
-        algorithm, _store(data), preset=preset, seeds=tuple(range(first_seed, first_seed + seeds)), out=out,
-        changes=changes, together=together, tensorboard=tensorboard,
+        algorithm,
+        _store(data),
+        preset=preset,
+        seeds=tuple(range(first_seed, first_seed + seeds)),
+        out=out,
+        changes=changes,
+        together=together,
+        tensorboard=tensorboard,
     )
     for run in runs:
         print(run.path)
@@ -126,6 +141,7 @@ def evaluate(
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
     record: int = 4,
+    planner: Literal["plain", "guarded"] = "plain",
     plans: int | None = None,
     steps: int | None = None,
     sampler: str | None = None,
@@ -145,6 +161,7 @@ def evaluate(
         episodes: at least 200 for a table.
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
+        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one.
         plans: drawn per step; the best safe one is followed.
         steps: of the sampler.
         sampler: ddim, ddpm or dpm++.
@@ -160,22 +177,42 @@ def evaluate(
     from ringfence.evaluate import evaluate as run_evaluation
 
     given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
-    table = Table("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
+    table = Table(
+        "run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm"
+    )
     for run in _runs(runs):
-        r = run_evaluation(run, episodes=episodes, split=split, record=record, quiet=False, **given)
+        r = run_evaluation(run, episodes=episodes, split=split, planner=planner, record=record, quiet=False, **given)
         table.add_row(
-            str(run.path), r["variant"], f"{r['return_mean']:.1f}", f"{r['cost_mean']:.3f}", f"{r['avoidable_cost']:.3f}",
-            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})", f"{r['return_norm']:.3f}", f"{r['cost_norm']:.3f}",
+            str(run.path),
+            r["variant"],
+            f"{r['return_mean']:.1f}",
+            f"{r['cost_mean']:.3f}",
+            f"{r['avoidable_cost']:.3f}",
+            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
+            f"{r['return_norm']:.3f}",
+            f"{r['cost_norm']:.3f}",
         )
     out.print(table)
 
 
 PLAN_OPTIONS = (
-    "plans", "steps", "sampler", "guidance", "target", "temperature", "select", "margin", "prefix", "replan", "execution",
+    "plans",
+    "steps",
+    "sampler",
+    "guidance",
+    "target",
+    "temperature",
+    "select",
+    "margin",
+    "prefix",
+    "replan",
+    "execution",
 )
 
 
-def report(runs: Positional[list[Path]], out_file: Annotated[Path, tyro.conf.arg(name="out")] = Path("report.html")) -> None:
+def report(
+    runs: Positional[list[Path]], out_file: Annotated[Path, tyro.conf.arg(name="out")] = Path("report.html")
+) -> None:
     """One self-contained HTML page from evaluated runs.
 
     Args:
@@ -208,7 +245,9 @@ def doctor() -> None:
             out.print(f"{package:12} [yellow]missing[/], for {use}: pip install 'ringfence\\[{extra}]'")
 
 
-def demo(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("demo"), tier: str = "expert", quick: bool = False) -> None:
+def demo(
+    out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("demo"), tier: str = "expert", quick: bool = False
+) -> None:
     """The whole job on Simple Spread: data, training without and with barrier, evaluation, report.
 
     Args:
@@ -223,7 +262,12 @@ def demo(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("demo"), tie
 
 DATA = {"make": make, "import-omar": import_omar, "info": info, "train-behaviour": train_behaviour}
 COMMANDS = {
-    "tasks": tasks, "train": train, "eval": evaluate, "report": report, "demo": demo, "doctor": doctor,
+    "tasks": tasks,
+    "train": train,
+    "eval": evaluate,
+    "report": report,
+    "demo": demo,
+    "doctor": doctor,
 }
 
 
@@ -236,8 +280,10 @@ def main(arguments: list[str] | None = None) -> None:
             )
         else:
             tyro.extras.subcommand_cli_from_dict(
-                COMMANDS | {"data": lambda: main(["data", "--help"])}, prog="ringfence",
-                description="Safe offline multi-agent reinforcement learning.", args=arguments,
+                COMMANDS | {"data": lambda: main(["data", "--help"])},
+                prog="ringfence",
+                description="Safe offline multi-agent reinforcement learning.",
+                args=arguments,
             )
     except UserError as error:
         Console(stderr=True, highlight=False).print(f"[red]error:[/] {error}", soft_wrap=True, markup=True)

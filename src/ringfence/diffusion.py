@@ -66,7 +66,7 @@ def to_clean(output: Array, x: Array, signal: Array, noise: Array, prediction: P
 def denoising_loss(
     output: Array, x0: Array, noised: Noised, weight: Array, prediction: Prediction, snr_clip: tuple[float, float]
 ) -> Array:
-    """L^D: masked mean of the squared error; `weight` (same shape as x0 or broadcastable) is 0 where nothing is learned.
+    """L^D: masked mean of the squared error; `weight` (broadcastable) is 0 where nothing is learned.
 
     x0-prediction: ‖x̂0 − x0‖² weighted by clip(SNR, ·, ·), so that the high-noise levels, where the mode is chosen,
     keep weight. ε- and v-prediction: unweighted (Ho et al. 2020; Salimans & Ho 2022).

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import algos, features, hazards, stats, tasks, training
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.hazards import BoundHazard
-from ringfence.policies import Planner, PlanOptions
+from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
@@ -183,14 +183,10 @@ def make_policy(job: training.Job, state, options: dict) -> Policy:
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
 
 
-def variant_name(job: training.Job, policy: Policy, split: str = "test") -> str:
-    """Evaluation-time choices that differ from the defaults, e.g. `split+plans8`; for direct policies the preset."""
-    name = job.preset
-    if isinstance(policy, Planner):
-        for f in dataclasses.fields(PlanOptions):
-            value = getattr(policy.options, f.name)
-            if value != f.default:
-                name += f"+{f.name}{value}"
+def variant_name(job: training.Job, planner: str, options: dict, split: str) -> str:
+    """Preset, named planner and the options given beside it, e.g. `split+guarded+steps10`."""
+    name = job.preset if planner == "plain" else f"{job.preset}+{planner}"
+    name += "".join(f"+{k}{v}" for k, v in options.items())
     return name if split == "test" else f"{name}@{split}"
 
 
@@ -199,21 +195,28 @@ def evaluate(
     *,
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
+    planner: str = "plain",
     record: int = 0,
     quiet: bool = True,
     step: int | None = None,
     **options,
 ) -> dict:
-    """Evaluate a run folder and add the result to its results.json, under the variant's name."""
-    job, policy = load(run, step, **options)
-    variant = variant_name(job, policy, split)
+    """Evaluate a run folder and add the result to its results.json, under the variant's name.
+
+    `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones.
+    """
+    if planner not in PLANNERS:
+        raise unknown("planner", planner, PLANNERS)
+    job, policy = load(run, step, **{**PLANNERS[planner], **options})
+    plans = isinstance(policy, Planner)
+    variant = variant_name(job, planner if plans else "plain", options if plans else {}, split)
     seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
     result, played = evaluate_policy(policy, job.task, episodes, split, seed, record, label, quiet)
     result |= {
         "algorithm": job.algorithm.name,
         "variant": variant,
-        "options": dataclasses.asdict(policy.options) if isinstance(policy, Planner) else {},
+        "options": dataclasses.asdict(policy.options) if plans else {},
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),
     }

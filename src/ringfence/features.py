@@ -67,9 +67,8 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         table = np.tile(np.arange(6 * n), (n, 1))
 
         def agree(x: Array) -> Array:  # agent i knows best where agent i will be
-            own = {c: jnp.stack([x[..., i, names.index(f"agent{i}.{c}")] for i in range(n)], -1) for c in ("x", "y", "vx", "vy")}
-            p, v = (jnp.stack([own[a], own[b]], -1).reshape(*x.shape[:-2], 2 * n) for a, b in (("x", "y"), ("vx", "vy")))
-            shared = jnp.concatenate([p, v], -1)[..., None, :]
+            # In state order, x and y of agent i stand at 2i and 2i + 1, its velocity 2n later.
+            shared = jnp.stack([x[..., d % (2 * n) // 2, d] for d in range(4 * n)], -1)[..., None, :]
             fixed = jnp.broadcast_to(x[..., :1, :, 4 * n :], (*x.shape[:-1], 2 * n))
             return jnp.concatenate([jnp.broadcast_to(shared, (*x.shape[:-1], 4 * n)), fixed], -1)
 

@@ -21,7 +21,7 @@ from ringfence import diffusion
 from ringfence.errors import UserError
 from ringfence.features import FeatureMap
 from ringfence.hazards import BoundHazard
-from ringfence.nets.heads import barrier_on, infer_action
+from ringfence.nets.heads import barrier_on, foresee, infer_action
 from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.values import plan_value
@@ -45,6 +45,7 @@ class PlanOptions:
     select: Literal["clearance", "barrier", "both"] = "clearance"  # what a plan's safety is judged by
     margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
     prefix: int = 3  # rows of the plan that are judged
+    foresight: bool = True  # judge plans by where forward dynamics says they lead, not by what they say
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: int = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
@@ -57,6 +58,14 @@ class PlanOptions:
             raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
         if self.execution not in ("centralized", "decentralized"):
             raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
+
+
+# Named sets of evaluation-time choices. `guarded` uses everything that is known at run time: value and clearance
+# steer the sample, the best safe one of eight plans is followed. Chosen on validation resets; docs/evaluation.md.
+PLANNERS: dict[str, dict] = {
+    "plain": {},
+    "guarded": {"plans": 8, "guidance": 1.0, "ascent": 30.0, "repair": 100.0, "margin": 0.05},
+}
 
 
 class Planner(eqx.Module):
@@ -186,13 +195,32 @@ class Planner(eqx.Module):
         """(B,) what gradient guidance climbs: value in deviations of the data's, and safety up to the margin."""
         o, total = self.options, jnp.zeros(clean.shape[0])
         x = self.agreed(self.normaliser.invert(clean))
-        ahead = x[:, self.history + 1 :]
         if o.ascent > 0:
+            ahead = x[:, self.history + 1 :]
             total = total + o.ascent * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]
         if o.repair > 0:
-            short = jnp.minimum(self.safety(ahead) - o.margin, 0.0)
+            short = jnp.minimum(self.safety(self.foreseen(x)) - o.margin, 0.0)
             total = total + o.repair * short.sum((1, 2))
         return total
+
+    def foreseen(self, x: Array) -> Array:
+        """The judged rows (B, prefix, N, D) of plans (B, rows, N, D).
+
+        With `foresight`, not as planned but as forward dynamics says they will come out when inverse dynamics tracks
+        the plan within the action bounds: a plan may ask for what no action can do.
+        """
+        o, now = self.options, self.history
+        last = min(now + 1 + o.prefix, x.shape[1])
+        if not o.foresight or "forward" not in self.networks:
+            return x[:, now + 1 : last]
+        state, rows = x[:, now], []
+        for row in range(now + 1, last):
+            action = infer_action(self.networks["inverse"], self.normaliser, state, x[:, row])
+            action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
+            state = foresee(self.networks["forward"], self.normaliser, state, action)
+            state = self.agreed(jnp.concatenate([x[:, : now + 1], state[:, None]], 1))[:, -1]
+            rows.append(state)
+        return jnp.stack(rows, 1)
 
     def safety(self, rows: Array) -> Array:
         """(..., N) the configured safety score of states (..., N, D): clearance, barrier or the least of both."""
@@ -208,10 +236,14 @@ class Planner(eqx.Module):
 
         Value: Σ_h γ^h r̂(row) along the plan, then γ^H V̂(last row), in the data's units.
         """
-        o, now = self.options, self.history
-        ahead = x[:, :, now + 1 : now + 1 + o.prefix]
-        safety = self.safety(ahead).min(2)
-        return safety, plan_value(self.critic, x[:, :, now + 1 :], self.discount)
+        b, p, rows, n, d = x.shape
+        seen = self.foreseen(x.reshape(b * p, rows, n, d))
+        safety = self.safety(seen).min(1).reshape(b, p, n)
+        ahead = x[:, :, self.history + 1 :]
+        if self.options.foresight:
+            kept = self.options.prefix
+            ahead = jnp.concatenate([seen.reshape(b, p, *seen.shape[1:]), ahead[:, :, kept:]], 2)
+        return safety, plan_value(self.critic, ahead, self.discount)
 
     def _no_news(self, batch: int) -> dict[str, Array]:
         n, d, rows = self.spec.n_agents, self.spec.feature_dim, self.history + self.horizon

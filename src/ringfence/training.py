@@ -7,7 +7,9 @@ not, and chunk lengths change nothing.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+import operator
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -91,11 +93,11 @@ def train(
     """
     job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
     runs = [_prepare(Run(folder_of(out, job, seed)), job, seed, data) for seed in seeds]
-    limit = getattr(job.config, "cost_limit", None)
-    used = data if limit is None else data.select(data.episode_costs <= limit)
-    windows = WindowData(
-        used,
-        job.feature_map,
+    windows = _windows(
+        data,
+        job.task,
+        job.config.view,
+        getattr(job.config, "cost_limit", None),
         getattr(job.config, "discount", 1.0),
         getattr(job.config, "condition", None),
         job.config.horizon,
@@ -110,6 +112,21 @@ def train(
         for run, seed in zip(runs, seeds):
             program = _loop(job, windows, [run], [seed], options, program)
     return runs
+
+
+@functools.lru_cache(maxsize=1)
+def _windows(
+    data: EpisodeStore,
+    task: Task,
+    view: str,
+    cost_limit: float | None,
+    discount: float,
+    condition: str | None,
+    horizon: int,
+) -> WindowData:
+    """Device data of a job; the last one is kept, since tables train several algorithms on one store."""
+    used = data if cost_limit is None else data.select(data.episode_costs <= cost_limit)
+    return WindowData(used, task.feature_map(view, data), discount, condition, horizon)
 
 
 @dataclass(frozen=True)
@@ -237,8 +254,9 @@ def _deleted(state: PyTree) -> bool:
 
 
 def _save(runs: list[Run], step: int, state: PyTree) -> None:
+    host = jax.device_get(state)
     for i, run in enumerate(runs):
-        run.save_checkpoint(step, jax.tree.map(lambda x: np.asarray(x[i]), state))
+        run.save_checkpoint(step, jax.tree.map(operator.itemgetter(i), host))
 
 
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:

@@ -4,6 +4,7 @@ Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 8)
     L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 10)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 12)
+    L^F  forward dynamics per agent, by which plans are checked before they are followed; not in the paper
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
 the barrier is learned and diagnosed, but the planner is MADIFF's to the bit.
@@ -23,7 +24,7 @@ from ringfence import diffusion, features, normalise, values
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP, build_denoiser
-from ringfence.nets.heads import barrier_on, infer_action
+from ringfence.nets.heads import barrier_on, foresee, infer_action
 from ringfence.optim import Optimiser, average
 from ringfence.policies import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
@@ -75,7 +76,7 @@ class Config:
     bank_batch: int = 128  # of them per update
 
     # --- other networks ---
-    inverse_width: int = 128  # units of each of 2 hidden layers
+    inverse_width: int = 128  # units of each of 2 hidden layers, of inverse and forward dynamics
     inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
     # --- optimisation ---
@@ -90,6 +91,8 @@ class Config:
 PRESETS: dict[str, dict] = {
     "split": {},
     "paper": {
+        "condition": "return",
+        "discount": 0.99,
         "routing": "paper",
         "barrier_weight": 0.1,
         "barrier_start": 0.0,
@@ -129,13 +132,14 @@ def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: 
     """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
     for the statistics, which is all that a checkpoint's template needs."""
     check(config)
-    kd, kb, ki, ks = jax.random.split(key, 4)
+    kd, kb, ki, kf, ks = jax.random.split(key, 5)
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
 
     def networks() -> dict:
         params = {
             "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n),
+            "forward": MLP(kf, (d + spec.action_dim, *[config.inverse_width] * 2, d), groups=n),
         }
         if config.barrier:
             groups = n if config.scope == "individual" else 1
@@ -250,6 +254,14 @@ def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, k
     return (
         ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(-1).mean()
     )
+
+
+def forward_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, config: Config) -> Array:
+    """L^F = E ‖Δs̃_i − g_i(s̃_i, a_i)‖² on data pairs, in standard deviations of the step: what an action will do."""
+    now = config.history
+    before, after, action = batch.features[:, now], batch.features[:, now + 1], batch.actions[:, now]
+    predicted = norm.step(before, foresee(params["forward"], norm, before, action))
+    return ((predicted - norm.step(before, after)) ** 2).mean()
 
 
 class Generated(NamedTuple):
@@ -394,8 +406,9 @@ def make_loss(config: Config, hazard: BoundHazard):
         norm = frozen["normaliser"]
         denoise, (clean, noised, mask) = denoising(params, batch, norm.apply(batch.features), kd, config, alpha_bar)
         inverse = inverse_dynamics(params, batch, norm, kp, config)
-        metrics = {"loss/denoising": denoise, "loss/inverse": inverse}
-        total = parts[0] * denoise + inverse
+        forward = forward_dynamics(params, batch, norm, config)
+        metrics = {"loss/denoising": denoise, "loss/inverse": inverse, "loss/forward": forward}
+        total = parts[0] * denoise + inverse + forward
         if config.barrier:
             made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
@@ -493,7 +506,7 @@ MADIFF = Algorithm(
     make_diagnose,
     make_policy,
     {
-        "default": {"barrier": False, "barrier_weight": 0.0},
+        "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "discount": 0.99},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
 )

@@ -23,3 +23,9 @@ def infer_action(
     if key is not None and noise > 0:
         step = step + noise * jax.random.normal(key, step.shape)
     return inverse(jnp.concatenate([norm.state(before), step], -1))
+
+
+def foresee(forward: MLP, norm: Normaliser, before: Array, action: Array) -> Array:
+    """g_φi: features (..., N, D) and actions (..., N, A) -> features after one step."""
+    step = forward(jnp.concatenate([norm.state(before), action], -1))
+    return before + step * norm.step_scale[0] + norm.step_mean[0]
