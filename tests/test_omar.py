@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -67,7 +68,7 @@ def test_five_agents_and_an_unfinished_episode(tmp_path):
     states = SpreadState(*(jnp.asarray(x, jnp.float32) for x in parts))
     gaps = np.linalg.norm(np.asarray(states.position[:, 1:, :, None] - states.position[:, 1:, None]), axis=-1)
     played = {
-        "observations": np.asarray(env.observe(states)),
+        "observations": np.asarray(jax.jit(env.observe)(states)),
         "actions": rng.uniform(-1, 1, (4, 25, 5, 2)),
         "rewards": rng.normal(size=(4, 25, 5)),
         "costs": (gaps + np.eye(5) < 0.3).any((2, 3)),

@@ -126,7 +126,8 @@ def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, k
     none, is synthesised from the hazard's formula. Without it h goes flat as soon as the generator is safe.
     """
     k1, k2, k3 = jax.random.split(key, 3)
-    unsafe, _ = hazard.labels(features, costs)
+    labels = jax.jit(hazard.labels)
+    unsafe, _ = labels(features, costs)
     found = jnp.flatnonzero(unsafe.any(-1))
     parts = []
     if len(found):
@@ -136,8 +137,8 @@ def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, k
     if hazard.has_formula:
         count = size - sum(len(p[0]) for p in parts)
         base = features[jax.random.randint(k2, (count,), 0, len(features))]
-        made = hazard.endanger(base, k3)
-        parts.append((made, hazard.labels(made)[0]))
+        made = jax.jit(hazard.endanger)(base, k3)
+        parts.append((made, labels(made)[0]))
     if not parts:  # nothing is dangerous and nothing can be made so: an empty lesson of the same size, not an error
         bank = features[jax.random.randint(k2, (size,), 0, len(features))]
         return bank, jnp.zeros(bank.shape[:2], bool)

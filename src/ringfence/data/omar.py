@@ -17,7 +17,7 @@ import os
 import re
 from pathlib import Path
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ringfence import features, hazards, tasks
@@ -181,9 +181,10 @@ def _check_state(directory: Path, env: SimpleSpread, observations: np.ndarray, k
     """Refuse joint observations that do not describe one state: files of different runs, or another environment."""
     n = env.n_agents
     seen = 4 + 2 * n + 2 * (n - 1)  # without the communication channel
+    retell = jax.jit(lambda x: env.observe(env.from_observations(x)))
     for start in range(0, len(observations), CHUNK):
         given = observations[start : start + CHUNK]
-        told = np.asarray(env.observe(env.from_observations(jnp.asarray(given))))
+        told = np.asarray(retell(given))
         error = np.abs(told - given)[..., :seen].max(-1)  # (M, N)
         if (error > STATE_SLACK).any():
             row, agent = (int(v) for v in np.argwhere(error > STATE_SLACK)[0])
@@ -243,7 +244,7 @@ def _check_order(
 
 
 def _global_state(env: SimpleSpread, observations: np.ndarray) -> np.ndarray:
-    return np.asarray(env.global_state(env.from_observations(jnp.asarray(observations))))
+    return np.asarray(env.global_state(env.from_observations(observations)))
 
 
 def _costs(
@@ -256,11 +257,9 @@ def _costs(
         raise StoreError("OMAR's files hold no costs, so CostColumn has nothing to read; pass a hazard with a formula.")
     reached = np.concatenate([state[1:], final_state[-1:]])
     reached[ends - 1] = final_state
-    unsafe = [
-        np.asarray(bound.labels(jnp.asarray(view(None, reached[i : i + CHUNK])))[0]).any(-1)
-        for i in range(0, len(reached), CHUNK)
-    ]
-    return np.concatenate(unsafe).astype(np.float32)
+    labels = jax.jit(bound.labels)
+    unsafe = [labels(view(None, reached[i : i + CHUNK]))[0] for i in range(0, len(reached), CHUNK)]
+    return np.concatenate(unsafe).any(-1).astype(np.float32)
 
 
 def _observation_names(n: int) -> tuple[str, ...]:
