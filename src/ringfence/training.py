@@ -145,8 +145,8 @@ def make_program(job: Job):
     chunk length; it returns the new state and the chunk's mean metrics.
     """
     config = job.config
-    update = job.algorithm.make_update(config, job.spec, job.hazard)
-    look = job.algorithm.make_diagnose(config, job.spec, job.hazard)
+    update = job.algorithm.make_update(config, job.spec, job.feature_map, job.hazard)
+    look = job.algorithm.make_diagnose(config, job.spec, job.feature_map, job.hazard)
 
     def one(state: PyTree, root, arrays):
         key = jax.random.fold_in(root, state["step"])

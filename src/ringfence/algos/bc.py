@@ -60,7 +60,7 @@ def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: 
     return jax.jit(networks)() | {"frozen": {"normaliser": norm}}
 
 
-def make_update(config: Config, spec: Spec, hazard: BoundHazard):
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     opt = _optimiser(config)
 
     def loss(params: PyTree, frozen: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
@@ -77,7 +77,7 @@ def make_update(config: Config, spec: Spec, hazard: BoundHazard):
     return update
 
 
-def make_diagnose(config: Config, spec: Spec, hazard: BoundHazard):
+def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     return lambda state, batch, key: {}
 
 

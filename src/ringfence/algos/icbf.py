@@ -68,6 +68,7 @@ class Config:
     two_sided: bool = True  # relax the unsafe side towards "do not get worse"
     scaled_margin: bool = True  # margin (1−α)δ in the retention hinge instead of δ
     weigh_by_signal: bool = True  # weight ᾱ_k on the generator's hinges
+    agree: bool = True  # barriers see plans whose agents agree, so that gradients move bodies, not images of them
     gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
     gradient_batch: int = 32  # windows per update for ddim:n and chain:n
     barrier_width: int = 128  # units of each of h's 3 hidden layers
@@ -101,6 +102,7 @@ PRESETS: dict[str, dict] = {
         "two_sided": False,
         "scaled_margin": False,
         "weigh_by_signal": False,
+        "agree": False,
     },
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
     "madiff-unet": {
@@ -397,7 +399,7 @@ def barrier_share(config: Config, step: Array) -> Array:
     return config.barrier_weight * jnp.clip((progress - config.barrier_start + 1e-12) / width, 0.0, 1.0)
 
 
-def make_loss(config: Config, hazard: BoundHazard):
+def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
     """loss(params, ema, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
     alpha_bar = schedule(config)
 
@@ -411,6 +413,10 @@ def make_loss(config: Config, hazard: BoundHazard):
         total = parts[0] * denoise + inverse + forward
         if config.barrier:
             made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
+            if config.agree and feature_map.reconcile is not None:
+                now = made.features[:, config.history :]
+                now = feature_map.reconcile(now)
+                made = made._replace(features=jnp.concatenate([made.features[:, : config.history], now], 1))
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
                 made = jax.lax.stop_gradient(made)
             omega, theta, more = barrier_losses(
@@ -427,9 +433,9 @@ def make_loss(config: Config, hazard: BoundHazard):
     return loss
 
 
-def make_update(config: Config, spec: Spec, hazard: BoundHazard):
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; pure, one Adam step on every network."""
-    loss, opt = make_loss(config, hazard), optimiser(config)
+    loss, opt = make_loss(config, feature_map, hazard), optimiser(config)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         (_, metrics), grads = jax.value_and_grad(loss, has_aux=True)(
@@ -443,9 +449,9 @@ def make_update(config: Config, spec: Spec, hazard: BoundHazard):
     return update
 
 
-def make_diagnose(config: Config, spec: Spec, hazard: BoundHazard):
+def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """diagnose(state, batch, key) -> metrics that are too dear for every update: who pulls θ how hard."""
-    loss = make_loss(config, hazard)
+    loss = make_loss(config, feature_map, hazard)
 
     def diagnose(state: PyTree, batch: Batch, key: Key) -> Metrics:
         if not config.barrier or config.barrier_weight == 0:
