@@ -48,7 +48,7 @@ def measure_team(n: int, updates: int) -> tuple[dict[str, float], tuple]:
     store = random_store(task, 400)
     job = training.make_job("icbf", task, None, {}, store)
     data = WindowData(store, job.feature_map, job.config.discount, job.config.condition, job.config.horizon, updates=10)
-    state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.hazard)
+    state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard)
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     stacked = jax.tree.map(lambda x: x[None], state)

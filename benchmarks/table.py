@@ -26,7 +26,7 @@ ENTRIES = (
     ("bc", "default", ("plain",)),
     ("bc-safe", "default", ("plain",)),
     ("icbf", "split", ("plain", "plans8", GUARDED)),
-    ("madiff", "default", ("plain", "plans8", GUARDED)),
+    ("madiff", "default", ("plain", GUARDED)),
     ("icbf", "paper", ("plain",)),
 )
 COLUMNS = (

@@ -1,6 +1,6 @@
 """Individual control barrier functions h_i(s̃_i): the conditions, the retention schedule, who gets which gradient.
 
-    h ≥ 0 on safe states,  h < 0 on unsafe ones,  h(s̃_{t+1}) ≥ α h(s̃_t)  along transitions           (paper, eq. 9)
+    h ≥ 0 on safe states,  h < 0 on unsafe ones,  h(s̃_{t+1}) ≥ α h(s̃_t)  along transitions           (paper, eq. 7)
 
 `retention` is the code's name of α, which the noise schedule would otherwise share. Retention 0 is one-step set
 membership, 1 forbids any approach to the boundary; every value in [0, 1) keeps {h ≥ 0} invariant.
@@ -24,7 +24,7 @@ Relaxation = Literal["signal", "linear", "none"]
 
 @dataclass(frozen=True)
 class Retention:
-    """α_k = m − η_k with 0 ≤ η_k ≤ m < 1 and η → 0 as k → 0 (paper, eq. 11).
+    """α_k = m − η_k with 0 ≤ η_k ≤ m < 1 and η → 0 as k → 0 (paper, eq. 9).
 
     A parked agent (h constant in time) meets the unscaled condition h ≥ α h + δ only if h ≥ δ / (1 − m): 0.2 for
     m = 0.9, δ = 0.02. The scaled margin (1 − α) δ asks for h ≥ δ instead, whatever m is.
@@ -80,7 +80,7 @@ def hinges(
     scaled_margin: bool,
     weight: Array | float = 1.0,
 ) -> Hinges:
-    """The hinges of eq. 10, each a mean over its own set (sums would tie the balance to the batch and its classes).
+    """The hinges of eq. 8, each a mean over its own set (sums would tie the balance to the batch and its classes).
 
     h, unsafe, safe, valid: (B, H, N). Sets follow the labels:
         S_0 ∪ S_s:  max(0, δ − h(s̃))              on safe states
@@ -100,7 +100,7 @@ def hinges(
             "accuracy_safe": _mean(h >= 0, safe),
             "accuracy_unsafe": _mean(h < 0, unsafe),
             "accuracy_retention": _mean(slack >= 0, pair),
-            "share_unsafe": _mean(unsafe, valid),
+            "share_unsafe": _mean(unsafe.astype(jnp.float32), valid),
         },
     )
 
@@ -146,6 +146,6 @@ def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, k
 
 
 def _mean(x: Array, mask: Array, weight: Array | float = 1.0) -> Array:
-    """Mean of x over a mask, 0 where the mask is empty; `weight` multiplies the terms, not the count."""
-    mask = mask.astype(jnp.float32)
+    """Mean of x over a mask (broadcast to x), 0 where it is empty; `weight` multiplies the terms, not the count."""
+    mask = jnp.broadcast_to(mask, x.shape).astype(jnp.float32)
     return (x * mask * weight).sum() / jnp.maximum(mask.sum(), 1.0)

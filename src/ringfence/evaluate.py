@@ -149,7 +149,9 @@ def load(run: Run | str, step: int | None = None, **options):
     """(job, policy) of a finished run; `options` are fields of PlanOptions, read at evaluation time."""
     run = run if isinstance(run, Run) else Run(Path(run))
     job = load_job(run)
-    template = jax.eval_shape(lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.hazard))
+    template = jax.eval_shape(
+        lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
+    )
     _, state = run.load_checkpoint(template, step)
     return job, make_policy(job, state, options)
 

@@ -22,6 +22,7 @@ from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
 VIEWS = ("pruned", "centralized", "decentralized")
+OWN = (0, 1, 2, 3)  # own.vx, own.vy, own.x, own.y
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +34,8 @@ class FeatureMap:
     source: Literal["state", "observations"]
     plus: np.ndarray  # (N, D) int
     minus: np.ndarray  # (N, D) int
-    reconcile: Callable[[Array], Array] | None = None  # joint plans whose agents agree; see `simple_spread`
+    own: tuple[int, ...] | None = None  # entries that only the agent itself can change; the rest follows from them
+    reconcile: Callable[[Array], Array] | None = None  # (..., H, N, D): rows after the first follow from own entries
 
     def __call__(self, observations: Array, state: Array | None) -> Array:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
@@ -58,21 +60,14 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
         table = np.tile(np.arange(len(names)), (n, 1))
         agree = _reconcile_relative(tuple(names), n)
-        return FeatureMap(view, tuple(names), "observations", table, np.full_like(table, -1), agree)
+        return FeatureMap(view, tuple(names), "observations", table, np.full_like(table, -1), OWN, agree)
     position = np.arange(2 * n).reshape(n, 2)
     velocity, landmark = position + 2 * n, position + 4 * n
     if view == "centralized":
         names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
         names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
         table = np.tile(np.arange(6 * n), (n, 1))
-
-        def agree(x: Array) -> Array:  # agent i knows best where agent i will be
-            # In state order, x and y of agent i stand at 2i and 2i + 1, its velocity 2n later.
-            shared = jnp.stack([x[..., d % (2 * n) // 2, d] for d in range(4 * n)], -1)[..., None, :]
-            fixed = jnp.broadcast_to(x[..., :1, :, 4 * n :], (*x.shape[:-1], 2 * n))
-            return jnp.concatenate([jnp.broadcast_to(shared, (*x.shape[:-1], 4 * n)), fixed], -1)
-
-        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), agree)
+        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1))
     if view != "pruned":
         raise unknown("view", view, VIEWS)
     names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
@@ -86,7 +81,7 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         plus.append(p)
         minus.append(m)
     agree = _reconcile_relative(tuple(names), n)
-    return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), agree)
+    return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), OWN, agree)
 
 
 def _reconcile_relative(names: tuple[str, ...], n: int) -> Callable[[Array], Array]:
@@ -104,15 +99,13 @@ def _reconcile_relative(names: tuple[str, ...], n: int) -> Callable[[Array], Arr
     assert shown == len(names), "own, landmarks, others, in this order"
 
     def agree(x: Array) -> Array:
-        p, v = x[..., own_p], x[..., own_v]
-        shape = (*x.shape[:-1], -1)
-        landmarks = x[..., 4 : 4 + 2 * n]
-        moved = p - p[..., :1, :, :]
-        landmarks = landmarks[..., :1, :, :] - jnp.tile(moved, n)
-        parts = [x[..., :4], landmarks, (p[..., others, :] - p[..., :, None, :]).reshape(shape)]
-        if moving:
-            parts.append((v[..., others, :] - v[..., :, None, :]).reshape(shape))
-        return jnp.concatenate(parts, -1)
+        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        moved, sped = later[..., own_p] - start[..., own_p], later[..., own_v] - start[..., own_v]
+        parts = [later[..., :4], start[..., 4 : 4 + 2 * n] - jnp.tile(moved, n)]
+        for change, first in ((moved, 4 + 2 * n), (sped, 4 + 2 * n + 2 * (n - 1)))[: 1 + moving]:
+            apart = change[..., others, :] - change[..., :, None, :]
+            parts.append(start[..., first : first + 2 * (n - 1)] + apart.reshape(*change.shape[:-1], -1))
+        return jnp.concatenate([start, jnp.concatenate(parts, -1)], -3)
 
     return agree
 

@@ -64,7 +64,7 @@ class PlanOptions:
 # steer the sample, the best safe one of eight plans is followed. Chosen on validation resets; docs/evaluation.md.
 PLANNERS: dict[str, dict] = {
     "plain": {},
-    "guarded": {"plans": 8, "guidance": 1.0, "ascent": 30.0, "repair": 100.0, "margin": 0.05},
+    "guarded": {"plans": 8, "guidance": 1.0, "ascent": 30.0, "repair": 100.0, "margin": 0.1},
 }
 
 
@@ -186,7 +186,7 @@ class Planner(eqx.Module):
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
-        if self.feature_map.reconcile is None or self.options.execution == "decentralized":
+        if self.feature_map.reconcile is None:
             return x
         later = self.feature_map.reconcile(x[:, self.history :])
         return jnp.concatenate([x[:, : self.history], later], 1)

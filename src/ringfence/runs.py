@@ -18,7 +18,7 @@ import subprocess
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import numpy as np
@@ -155,13 +155,15 @@ def write_json(path: Path, data: Any) -> None:
 
 def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
     """A config dataclass from named changes; strings are read as the field's type, unknown names are refused."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}
-    values = {}
+    fields, hints, values = {f.name: f for f in dataclasses.fields(kind)}, get_type_hints(kind), {}
     for name, value in changes.items():
         if name not in fields:
             raise unknown(f"config field of {of}", name, fields)
         default = fields[name].default
         values[name] = _parse(name, value, default) if isinstance(value, str) else value
+        options = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
+        if options and values[name] not in options:
+            raise unknown(f"value of {of}'s {name}", str(values[name]), map(str, options))
     return kind(**values)
 
 

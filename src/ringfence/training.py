@@ -101,6 +101,7 @@ def train(
         getattr(job.config, "discount", 1.0),
         getattr(job.config, "condition", None),
         job.config.horizon,
+        getattr(job.config, "critic_updates", 0),
     )
     steps = job.config.steps
     chunk = chunk or max(1, steps // 40)
@@ -123,10 +124,11 @@ def _windows(
     discount: float,
     condition: str | None,
     horizon: int,
+    updates: int,
 ) -> WindowData:
     """Device data of a job; the last one is kept, since tables train several algorithms on one store."""
     used = data if cost_limit is None else data.select(data.episode_costs <= cost_limit)
-    return WindowData(used, task.feature_map(view, data), discount, condition, horizon)
+    return WindowData(used, task.feature_map(view, data), discount, condition, horizon, updates)
 
 
 @dataclass(frozen=True)
@@ -187,7 +189,8 @@ def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Optio
     advance, diagnose = program
     roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
     fresh = [
-        job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.hazard) for r in roots
+        job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.feature_map, job.hazard)
+        for r in roots
     ]
     starts, states = [], []
     for run, state in zip(runs, fresh):

@@ -97,8 +97,8 @@ class Algorithm:
 
     name: str
     Config: type  # frozen dataclass; the command line is generated from it
-    init: Callable[..., PyTree]  # (key, spec, config, data, hazard) -> state, a pytree of arrays
-    make_update: Callable[..., Callable]  # (config, spec, feature_map, hazard) -> update(state, batch, key) -> state, metrics
+    init: Callable[..., PyTree]  # (key, spec, config, data, feature_map, hazard) -> state, a pytree
+    make_update: Callable[..., Callable]  # (config, spec, feature_map, hazard) -> update(state, batch, key)
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default

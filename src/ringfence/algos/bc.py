@@ -25,17 +25,24 @@ class Config:
     cost_limit: float | None = None  # keep episodes with cost ≤ this; None keeps all
     horizon: int = 2  # rows of a window: now and next
     history: int = 0  # rows of the past (unused)
-    width: int = 256  # units of each hidden layer
+    width: int = 128  # units of each hidden layer
     depth: int = 2  # hidden layers
-    steps: int = 10_000  # updates
-    batch: int = 512  # windows per update
+    steps: int = 4_000  # updates
+    batch: int = 256  # windows per update
     lr: float = 1e-3  # Adam
     warmup: int = 100  # updates
     grad_clip: float = 1.0  # global norm
     ema: float = 0.995  # of the parameters
 
 
-def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: BoundHazard) -> PyTree:
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+) -> PyTree:
     """Parameters, their averages, optimiser state, the normaliser; without data, zeros stand for its statistics."""
     ka, kw = jax.random.split(key)
     d = spec.feature_dim

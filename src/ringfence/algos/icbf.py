@@ -1,9 +1,9 @@
 """ICBF-Diffuser: a multi-agent diffusion planner shaped by one control barrier function per agent.
 
 Losses, each with the paper's symbol:
-    L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 8)
-    L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 10)
-    L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 12)
+    L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 6)
+    L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 8)
+    L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
     L^F  forward dynamics per agent, by which plans are checked before they are followed; not in the paper
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 
 from ringfence import barrier as cbf
 from ringfence import diffusion, features, normalise, values
@@ -39,6 +40,7 @@ class Config:
     view: features.View = "pruned"  # what s̃_i is: pruned, centralized, decentralized
     horizon: int = 8  # H, rows of a plan, the present one included
     history: int = 0  # rows of the past that are in-painted, too
+    carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
     condition: values.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
     discount: float = 0.9  # of the value that plans are conditioned on and ranked by
@@ -57,7 +59,7 @@ class Config:
 
     # --- barrier ---
     barrier: bool = True  # build h at all
-    barrier_weight: float = 0.3  # λ of the generator's share of L^C
+    barrier_weight: float = 3.0  # λ of the generator's share of L^C
     barrier_start: float = 0.3  # share of training at which λ starts to rise from 0
     barrier_full: float = 0.5  # share of training at which λ is reached
     routing: Literal["split", "paper"] = "split"  # who gets which gradient
@@ -68,7 +70,6 @@ class Config:
     two_sided: bool = True  # relax the unsafe side towards "do not get worse"
     scaled_margin: bool = True  # margin (1−α)δ in the retention hinge instead of δ
     weigh_by_signal: bool = True  # weight ᾱ_k on the generator's hinges
-    agree: bool = True  # barriers see plans whose agents agree, so that gradients move bodies, not images of them
     gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
     gradient_batch: int = 32  # windows per update for ddim:n and chain:n
     barrier_width: int = 128  # units of each of h's 3 hidden layers
@@ -77,23 +78,26 @@ class Config:
     bank_batch: int = 128  # of them per update
 
     # --- other networks ---
+    critic_updates: int = 8000  # of the critic, fitted once per data set before training
     inverse_width: int = 128  # units of each of 2 hidden layers, of inverse and forward dynamics
     inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
     # --- optimisation ---
-    steps: int = 2000  # updates
+    steps: int = 1500  # updates
     batch: int = 128  # windows per update
-    lr: float = 1e-3  # Adam, after warm-up, before cosine decay to a tenth
+    lr: float = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
     warmup: int = 100  # updates
     grad_clip: float = 1.0  # global norm, per network
     ema: float = 0.995  # of all parameters; the policy uses the averages
+
+
+DYNAMICS_STEPS = 3  # steps of every window that inverse and forward dynamics learn from
 
 
 PRESETS: dict[str, dict] = {
     "split": {},
     "paper": {
         "condition": "return",
-        "discount": 0.99,
         "routing": "paper",
         "barrier_weight": 0.1,
         "barrier_start": 0.0,
@@ -102,7 +106,6 @@ PRESETS: dict[str, dict] = {
         "two_sided": False,
         "scaled_margin": False,
         "weigh_by_signal": False,
-        "agree": False,
     },
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
     "madiff-unet": {
@@ -112,7 +115,8 @@ PRESETS: dict[str, dict] = {
         "horizon": 24,
         "coordinates": "state",
         "prediction": "epsilon",
-        "clip": 1.0,
+        "clip": 3.0,
+        "condition": "return",
         "discount": 0.99,
         "batch": 64,
         "lr": 2e-4,
@@ -130,18 +134,26 @@ def retention(config: Config) -> cbf.Retention:
     return cbf.Retention(config.retention, config.relaxation, config.two_sided)
 
 
-def init(key: Key, spec: Spec, config: Config, data: WindowData | None, hazard: BoundHazard) -> PyTree:
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+) -> PyTree:
     """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
     for the statistics, which is all that a checkpoint's template needs."""
     check(config)
     kd, kb, ki, kf, ks = jax.random.split(key, 5)
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
+    carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
 
     def networks() -> dict:
         params = {
-            "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth),
-            "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n),
-            "forward": MLP(kf, (d + spec.action_dim, *[config.inverse_width] * 2, d), groups=n),
+            "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth, carried),
+            "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True),
+            "forward": MLP(kf, (d + spec.action_dim, *[config.inverse_width] * 2, d), groups=n, linear=True),
         }
         if config.barrier:
             groups = n if config.scope == "individual" else 1
@@ -235,35 +247,58 @@ def inpainted(visible: Array, history: int, rows: int) -> Array:
     return (known[None, :, None] & visible[:, None, :])[..., None]
 
 
-def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: Array):
+def carries_own(config: Config, feature_map: features.FeatureMap) -> bool:
+    """Whether plans hold own entries only; needs a view that knows how the rest follows."""
+    return config.carry == "own" and feature_map.reconcile is not None and config.net == "attention"
+
+
+def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndarray:
+    """(H, D) bool: entries of a window that the denoiser reads and writes; the present is always read whole."""
+    rows, d = config.history + config.horizon, len(feature_map.names)
+    carried = np.ones((rows, d), bool)
+    if carries_own(config, feature_map):
+        carried[config.history + 1 :] = np.isin(np.arange(d), feature_map.own)
+    return carried
+
+
+def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: Array, carried: Array):
     """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted."""
     k1, k2, k3 = jax.random.split(key, 3)
     mask = inpainted(visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1])
     noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
     keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
     output = params["denoiser"](noised.x, noised.k, batch.score, keep)
-    weight = (~mask & batch.valid[..., None, None]).astype(jnp.float32)
+    weight = (~mask & batch.valid[..., None, None] & carried[:, None]).astype(jnp.float32)
     clip = (config.snr_floor, config.snr_ceiling)
     loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
     clean = diffusion.to_clean(output, noised.x, noised.signal, noised.noise, config.prediction, config.clip)
     return loss, (jnp.where(mask, plan, clean), noised, mask)
 
 
+def steps_of(batch: Batch, now: int) -> tuple[Array, Array, Array, Array]:
+    """Before, after (B, P, N, D), action (B, P, N, A) and valid (B, P, 1) of the first P steps of the windows."""
+    last = min(now + DYNAMICS_STEPS, batch.features.shape[1] - 1)
+    before, after = batch.features[:, now:last], batch.features[:, now + 1 : last + 1]
+    return before, after, batch.actions[:, now:last], batch.valid[:, now + 1 : last + 1, None].astype(jnp.float32)
+
+
 def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, key: Key, config: Config) -> Array:
     """L^P = E ‖a_i − f_φi(s̃_i,t, s̃_i,t+1)‖² on data pairs, summed over the action and averaged over agents."""
-    before, after = batch.features[:, config.history], batch.features[:, config.history + 1]
-    action = batch.actions[:, config.history]
-    return (
-        ((infer_action(params["inverse"], norm, before, after, key, config.inverse_noise) - action) ** 2).sum(-1).mean()
-    )
+    before, after, action, valid = steps_of(batch, config.history)
+    inferred = infer_action(params["inverse"], norm, before, after, key, config.inverse_noise)
+    error = ((inferred - action) ** 2).sum(-1)
+    return (error * valid).sum() / (valid.sum() * error.shape[-1])
 
 
 def forward_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, config: Config) -> Array:
-    """L^F = E ‖Δs̃_i − g_i(s̃_i, a_i)‖² on data pairs, in standard deviations of the step: what an action will do."""
-    now = config.history
-    before, after, action = batch.features[:, now], batch.features[:, now + 1], batch.actions[:, now]
+    """L^F = E huber(Δs̃_i − g_i(s̃_i, a_i)) on data pairs, in standard deviations of the step: what an action will do.
+
+    The Huber loss keeps the kicks of contacts, which dwarf everything else, from owning the model.
+    """
+    before, after, action, valid = steps_of(batch, config.history)
     predicted = norm.step(before, foresee(params["forward"], norm, before, action))
-    return ((predicted - norm.step(before, after)) ** 2).mean()
+    error = optax.losses.huber_loss(predicted, norm.step(before, after), delta=1.0).mean(-1)
+    return (error * valid).sum() / (valid.sum() * error.shape[-1])
 
 
 class Generated(NamedTuple):
@@ -401,21 +436,23 @@ def barrier_share(config: Config, step: Array) -> Array:
 
 def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
     """loss(params, ema, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
-    alpha_bar = schedule(config)
+    alpha_bar, carried = schedule(config), carried_entries(config, feature_map)
 
     def loss(params, ema, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
         kd, kp, kc, kg = jax.random.split(key, 4)
         norm = frozen["normaliser"]
-        denoise, (clean, noised, mask) = denoising(params, batch, norm.apply(batch.features), kd, config, alpha_bar)
+        denoise, (clean, noised, mask) = denoising(
+            params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried
+        )
         inverse = inverse_dynamics(params, batch, norm, kp, config)
         forward = forward_dynamics(params, batch, norm, config)
         metrics = {"loss/denoising": denoise, "loss/inverse": inverse, "loss/forward": forward}
         total = parts[0] * denoise + inverse + forward
         if config.barrier:
             made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
-            if config.agree and feature_map.reconcile is not None:
-                now = made.features[:, config.history :]
-                now = feature_map.reconcile(now)
+            if carries_own(config, feature_map):
+                # Where others will be is what *they* plan: a gradient must move bodies, not one's image of them.
+                now = feature_map.reconcile(made.features[:, config.history :])
                 made = made._replace(features=jnp.concatenate([made.features[:, : config.history], now], 1))
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
                 made = jax.lax.stop_gradient(made)
@@ -512,7 +549,7 @@ MADIFF = Algorithm(
     make_diagnose,
     make_policy,
     {
-        "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "discount": 0.99},
+        "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
 )

@@ -10,10 +10,12 @@ from ringfence.types import Key
 __all__ = ["MLP", "AgentAttention", "build_denoiser"]
 
 
-def build_denoiser(key: Key, kind: str, rows: int, features: int, width: int, depth: int):
+def build_denoiser(
+    key: Key, kind: str, rows: int, features: int, width: int, depth: int, carried: tuple[int, ...] | None = None
+):
     """A denoiser F(x (B, H, N, D), k (B,), y (B,), keep (B,)) -> (B, H, N, D) by name."""
     if kind == "attention":
-        return AgentAttention(key, rows, features, width, depth)
+        return AgentAttention(key, rows, features, width, depth, carried)
     if kind == "unet":
         from ringfence.nets.unet import TemporalUNet
 

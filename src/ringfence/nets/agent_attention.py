@@ -9,6 +9,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ringfence.nets.embedding import Condition
 from ringfence.types import Array, Key
@@ -23,13 +24,23 @@ class AgentAttention(eqx.Module):
     """
 
     condition: Condition
-    inlet: Array  # (H·D, W)
-    outlet: Array  # (W, H·D)
+    inlet: Array  # (carried entries, W)
+    outlet: Array  # (W, carried entries)
     blocks: list[dict[str, Array]]
+    carried: tuple[int, ...] = eqx.field(static=True)  # entries of a flattened window (H·D) that are read and written
 
-    def __init__(self, key: Key, rows: int, features: int, width: int = 128, depth: int = 3):
+    def __init__(
+        self,
+        key: Key,
+        rows: int,
+        features: int,
+        width: int = 128,
+        depth: int = 3,
+        carried: tuple[int, ...] | None = None,
+    ):
         keys = jax.random.split(key, depth + 3)
-        flat = rows * features
+        self.carried = tuple(range(rows * features)) if carried is None else carried
+        flat = len(self.carried)
         self.condition = Condition(keys[0], width)
         self.inlet = _normal(keys[1], flat, width)
         self.outlet = _normal(keys[2], width, flat, 0.1)
@@ -39,12 +50,13 @@ class AgentAttention(eqx.Module):
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool -> (B, H, N, D)."""
         b, h, n, d = x.shape
         c = self.condition(k, y, keep)
-        token = jnp.moveaxis(x, 1, 2).reshape(b * n, h * d) @ self.inlet
+        carried = np.array(self.carried)
+        token = jnp.moveaxis(x, 1, 2).reshape(b * n, h * d)[:, carried] @ self.inlet
         for p in self.blocks:
             token = token + _attend(_norm(token), p, n)
             told = jnp.repeat(c @ p["tell"] + p["bias"], n, axis=0)
             token = token + jax.nn.silu(_norm(token) @ p["up"] + told) @ p["down"]
-        out = _norm(token) @ self.outlet
+        out = jnp.zeros((b * n, h * d)).at[:, carried].set(_norm(token) @ self.outlet)
         return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
 
 

@@ -14,9 +14,13 @@ class MLP(eqx.Module):
 
     weights: list[Array]  # (G, F_in, F_out)
     biases: list[Array]  # (G, F_out)
+    linear: Array | None  # (G, F_in, F_out) added to the output: what is linear need not be learned by ReLUs
 
-    def __init__(self, key: Key, sizes: tuple[int, ...], groups: int = 1, final_scale: float = 1.0):
+    def __init__(
+        self, key: Key, sizes: tuple[int, ...], groups: int = 1, final_scale: float = 1.0, linear: bool = False
+    ):
         """`sizes` = (in, hidden, ..., out); He initialisation, the last layer scaled by `final_scale`."""
+        self.linear = jnp.zeros((groups, sizes[0], sizes[-1])) if linear else None
         self.weights, self.biases = [], []
         keys = jax.random.split(key, len(sizes) - 1)
         for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:]):
@@ -28,13 +32,15 @@ class MLP(eqx.Module):
     def __call__(self, x: Array) -> Array:
         shape, groups = x.shape, self.weights[0].shape[0]
         if groups == 1:
-            x = x.reshape(-1, shape[-1])
+            x = first = x.reshape(-1, shape[-1])
             for n, (w, b) in enumerate(zip(self.weights, self.biases)):
                 x = x @ w[0] + b[0]
                 x = jax.nn.relu(x) if n < len(self.weights) - 1 else x
+            x = x if self.linear is None else x + first @ self.linear[0]
             return x.reshape(*shape[:-1], x.shape[-1])
-        x = jnp.moveaxis(x.reshape(-1, groups, shape[-1]), 1, 0)  # (N, M, F): one matrix product per agent
+        x = first = jnp.moveaxis(x.reshape(-1, groups, shape[-1]), 1, 0)  # (N, M, F): one matrix product per agent
         for n, (w, b) in enumerate(zip(self.weights, self.biases)):
             x = jax.lax.batch_matmul(x, w) + b[:, None]
             x = jax.nn.relu(x) if n < len(self.weights) - 1 else x
+        x = x if self.linear is None else x + jax.lax.batch_matmul(first, self.linear)
         return jnp.moveaxis(x, 0, 1).reshape(*shape[:-1], x.shape[-1])

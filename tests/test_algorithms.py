@@ -1,0 +1,234 @@
+"""One contract for every algorithm, and what is special about the flagship."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import algos, evaluate, tasks, training
+from ringfence.errors import CheckpointError, UserError
+from ringfence.runs import Run
+
+TINY = {
+    "icbf": dict(steps=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8, bank=64, bank_batch=16,
+                 inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20, barrier_start=0.0, barrier_full=0.2),
+    "madiff": dict(steps=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20),
+    "bc": dict(steps=12, batch=32, width=16, depth=1),
+    "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
+}  # fmt: skip
+QUICK = {"episodes": 4, "steps": 2}
+
+
+@pytest.fixture(scope="session")
+def trained(small_store, tmp_path_factory):
+    """One tiny finished run of every algorithm."""
+    out = tmp_path_factory.mktemp("runs")
+    return {
+        name: training.train(name, small_store, out=out, changes=TINY[name], quiet=True, chunk=5)[0]
+        for name in algos.ALGORITHMS
+    }
+
+
+@pytest.mark.parametrize("name", algos.ALGORITHMS)
+def test_contract(name, trained):
+    """Finite metrics, the whole of training done, and a policy that acts within bounds and the same after loading."""
+    run = trained[name]
+    rows = run.metrics
+    assert [r["step"] for r in rows] == [5, 10, 12]
+    assert all(np.isfinite(v) for r in rows for v in r.values())
+    assert run.checkpoints()[-1][0] == 12
+    env = tasks.get("simple_spread-random").env
+    state = env.reset(jax.random.key(0), 5)
+    actions = []
+    for _ in range(2):
+        _, policy = evaluate.load(run, steps=2)
+        _, out = policy.act(policy.start(5), env.observe(state), env.global_state(state), jax.random.key(1))
+        actions.append(np.asarray(out.action))
+    assert actions[0].shape == (5, 3, 2) and np.abs(actions[0]).max() <= 1.0
+    np.testing.assert_array_equal(*actions)
+
+
+def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path):
+    """To the last bit, with a chunk length that does not divide the checkpoint's step."""
+
+    def stop(step, _):
+        if step >= 8:
+            raise KeyboardInterrupt
+
+    told = dict(out=tmp_path, changes=TINY["icbf"], quiet=True)
+    with pytest.raises(KeyboardInterrupt):
+        training.train("icbf", small_store, chunk=4, checkpoint_every=4, on_chunk=stop, **told)
+    run = training.train("icbf", small_store, chunk=3, **told)[0]
+    from safetensors.numpy import load_file
+
+    a = load_file(run.checkpoints()[-1][1])
+    b = load_file(trained["icbf"].checkpoints()[-1][1])
+    assert a.keys() == b.keys()
+    for k in a:
+        np.testing.assert_array_equal(a[k], b[k], err_msg=k)
+    steps = [r["step"] for r in run.metrics]
+    assert steps == sorted(set(steps)) and steps[-1] == 12
+
+
+def test_no_weight_is_madiff_to_the_bit(small_store, tmp_path):
+    """λ = 0 learns a barrier beside the planner, and the planner's networks are MADIFF's."""
+    same = {"condition": "return"}
+    zero = training.train(
+        "icbf", small_store, out=tmp_path, changes={**TINY["icbf"], **same, "barrier_weight": 0.0}, quiet=True
+    )[0]
+    plain = training.train("madiff", small_store, out=tmp_path, changes=TINY["madiff"], quiet=True)[0]
+    from safetensors.numpy import load_file
+
+    a, b = (load_file(r.checkpoints()[-1][1]) for r in (zero, plain))
+    for k in b:
+        if k.split("/")[0] in ("params", "ema", "frozen"):
+            np.testing.assert_array_equal(a[k], b[k], err_msg=k)
+    assert any(k.startswith("params/barrier") for k in a) and not any(k.startswith("params/barrier") for k in b)
+
+
+def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
+    changes = TINY["bc"]
+    apart = training.train("bc", small_store, seeds=(0, 1), out=tmp_path / "a", changes=changes, quiet=True)
+    together = training.train(
+        "bc", small_store, seeds=(0, 1), out=tmp_path / "b", changes=changes, quiet=True, together=True
+    )
+    for x, y in zip(apart, together):
+        assert x.metrics[-1]["loss/cloning"] == pytest.approx(y.metrics[-1]["loss/cloning"], rel=1e-4)
+
+
+@pytest.mark.parametrize("gradient", ["ddim:2", "chain:2"])
+def test_gradient_depths(small_store, tmp_path, gradient):
+    run = training.train(
+        "icbf", small_store, out=tmp_path, changes={**TINY["icbf"], "gradient": gradient, "steps": 3}, quiet=True
+    )[0]
+    assert run.metrics[-1]["gradient/shaping"] > 0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        dict(),
+        dict(plans=3, select="both"),
+        dict(plans=2, execution="decentralized", select="barrier"),
+        dict(replan=2, sampler="dpm++"),
+        dict(plans=2, ascent=5.0, repair=5.0, guidance=1.0, sampler="ddpm"),
+    ],
+)
+def test_planner_options(trained, options):
+    run = trained["icbf"]
+    result = evaluate.evaluate(run, **QUICK, record=2, **options)
+    assert result["episodes"] == 4 and np.isfinite(result["return_mean"])
+    assert len(run.results) >= 1
+
+
+def test_views(small_store, tmp_path):
+    for view in ("centralized", "decentralized"):
+        changes = {**TINY["icbf"], "view": view, "steps": 2, "observe": "mixed"}
+        run = training.train("icbf", small_store, out=tmp_path / view, changes=changes, quiet=True)[0]
+        assert np.isfinite(evaluate.evaluate(run, **QUICK, plans=2)["return_mean"])
+
+
+def test_paired_resets(trained):
+    """All methods start from the same states, and the first n episodes do not depend on how many are played."""
+    task = tasks.get("simple_spread-random")
+    _, bc = evaluate.load(trained["bc"])
+    _, other = evaluate.load(trained["bc-safe"])
+    a = evaluate.rollout(bc, task.env, 60)["states"]
+    b = evaluate.rollout(other, task.env, 3)["states"]
+    np.testing.assert_array_equal(a[:3, 0], b[:, 0])
+    np.testing.assert_array_equal(a[:3], evaluate.rollout(bc, task.env, 3)["states"])
+    validation = evaluate.rollout(bc, task.env, 3, "validation")["states"]
+    assert not np.array_equal(a[:3, 0], validation[:, 0])
+
+
+def test_bad_input_is_refused(small_store, trained, tmp_path):
+    run = trained["icbf"]
+    with pytest.raises(UserError, match="did you mean 'icbf'"):
+        training.train("icfb", small_store, out=tmp_path)
+    with pytest.raises(UserError, match="did you mean 'barrier_weight'"):
+        training.train("icbf", small_store, out=tmp_path, changes={"barier_weight": 1})
+    with pytest.raises(UserError, match="preset"):
+        training.train("icbf", small_store, out=tmp_path, preset="spilt")
+    with pytest.raises(UserError, match=r"retention m=1.0"):
+        training.train("icbf", small_store, out=tmp_path, changes={**TINY["icbf"], "retention": 1.0})
+    with pytest.raises(UserError, match="another run"):
+        training.train("icbf", small_store, out=run.path.parents[2], changes={**TINY["icbf"], "lr": 0.1})
+    with pytest.raises(UserError, match="planner"):
+        evaluate.evaluate(run, planner="gaurded")
+    with pytest.raises(UserError, match="1 to 20 steps"):
+        evaluate.evaluate(run, steps=21)
+    with pytest.raises(UserError, match="needs a barrier"):
+        evaluate.evaluate(trained["madiff"], plans=2, select="barrier")
+    assert not any(tmp_path.rglob("ckpt"))
+
+
+def test_broken_checkpoints_are_refused(trained, tmp_path):
+    import shutil
+
+    run = Run(tmp_path / "copy")
+    shutil.copytree(trained["bc"].path, run.path)
+    file = run.checkpoints()[-1][1]
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(CheckpointError, match="truncated"):
+        evaluate.load(run)
+    from safetensors.numpy import load_file, save_file
+
+    file.write_bytes(whole)
+    arrays = load_file(file)
+    name = next(k for k in arrays if k.startswith("ema"))
+    save_file({k: v for k, v in arrays.items() if k != name}, file)
+    with pytest.raises(CheckpointError, match="lacks the array"):
+        evaluate.load(run)
+    save_file({**arrays, name: np.zeros((1, 2, 3), np.float32)}, file)
+    with pytest.raises(CheckpointError, match="another task or config"):
+        evaluate.load(run)
+    with pytest.raises(UserError, match="no run folder"):
+        evaluate.load(Run(tmp_path / "nothing"))
+
+
+def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
+    import shutil
+
+    from ringfence import runs
+
+    run = Run(tmp_path / "copy")
+    shutil.copytree(trained["bc"].path, run.path)
+    before = [s for s, _ in run.checkpoints()]
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(runs, "save_file", full)
+    with pytest.raises(UserError, match="free some space"):
+        run.save_checkpoint(99, {"x": jnp.zeros(2)})
+    assert [s for s, _ in run.checkpoints()] == before
+    assert not list((run.path / "ckpt").glob("*.part"))
+
+
+def test_own_data_without_a_simulator(played, tmp_path):
+    """Anybody's logs: a store with named features, a hazard, a policy that acts; nothing of Simple Spread is known."""
+    from ringfence.data import EpisodeStore
+    from ringfence.features import simple_spread
+    from ringfence.hazards import Separation
+
+    names = simple_spread("decentralized", 3).names
+    store = EpisodeStore.from_episodes(
+        played["observations"][..., : len(names)], played["actions"], played["rewards"], played["costs"],
+        card={"task": "my-robots", "observation_names": list(names), "hazard": Separation(0.3)},
+    )  # fmt: skip
+    run = training.train("icbf", store, out=tmp_path, changes=TINY["icbf"], quiet=True)[0]
+    _, policy = evaluate.load(run, plans=2, steps=2)
+    seen = jnp.asarray(store.observations[:4])
+    _, out = policy.act(policy.start(4), seen, None, jax.random.key(0))
+    assert out.action.shape == (4, 3, 2)
+    with pytest.raises(UserError, match="only as data"):
+        evaluate.evaluate(run)
+
+
+def test_trained_config_round_trip(trained):
+    job = evaluate.load_job(trained["icbf"])
+    told = trained["icbf"].config["config"]
+    assert {k: v for k, v in dataclasses.asdict(job.config).items()} == told
