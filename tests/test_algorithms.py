@@ -13,8 +13,10 @@ from ringfence.runs import Run
 
 TINY = {
     "icbf": dict(steps=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8, bank=64, bank_batch=16,
-                 inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20, barrier_start=0.0, barrier_full=0.2),
-    "madiff": dict(steps=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20),
+                 inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20,
+                 barrier_start=0.0, barrier_full=0.2),
+    "madiff": dict(steps=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20,
+                   critic_updates=20),
     "bc": dict(steps=12, batch=32, width=16, depth=1),
     "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
 }  # fmt: skip
@@ -111,7 +113,6 @@ def test_gradient_depths(small_store, tmp_path, gradient):
     [
         dict(),
         dict(plans=3, select="both"),
-        dict(plans=2, execution="decentralized", select="barrier"),
         dict(replan=2, sampler="dpm++"),
         dict(plans=2, ascent=5.0, repair=5.0, guidance=1.0, sampler="ddpm"),
     ],
@@ -128,6 +129,8 @@ def test_views(small_store, tmp_path):
         changes = {**TINY["icbf"], "view": view, "steps": 2, "observe": "mixed"}
         run = training.train("icbf", small_store, out=tmp_path / view, changes=changes, quiet=True)[0]
         assert np.isfinite(evaluate.evaluate(run, **QUICK, plans=2)["return_mean"])
+        alone = evaluate.evaluate(run, **QUICK, plans=2, execution="decentralized", select="barrier")
+        assert np.isfinite(alone["return_mean"])
 
 
 def test_paired_resets(trained):
@@ -159,6 +162,12 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         evaluate.evaluate(run, planner="gaurded")
     with pytest.raises(UserError, match="1 to 20 steps"):
         evaluate.evaluate(run, steps=21)
+    with pytest.raises(UserError, match="trained with observe"):
+        evaluate.evaluate(run, execution="decentralized")
+    with pytest.raises(UserError, match="carry='all'"):
+        evaluate.evaluate(run, reconcile=False)
+    with pytest.raises(UserError, match="did you mean 'paper'"):
+        training.train("icbf", small_store, out=tmp_path, changes={"routing": "papr"})
     with pytest.raises(UserError, match="needs a barrier"):
         evaluate.evaluate(trained["madiff"], plans=2, select="barrier")
     assert not any(tmp_path.rglob("ckpt"))

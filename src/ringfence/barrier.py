@@ -105,7 +105,9 @@ def hinges(
     )
 
 
-def shaping(h: Array, valid: Array, retention: Retention, eta: Array, delta: float, weight: Array) -> Array:
+def shaping(
+    h: Array, valid: Array, retention: Retention, eta: Array, delta: float, scaled_margin: bool, weight: Array
+) -> Array:
     """L_θ of the `split` preset: raise h̄ along the plan, against a frozen barrier.
 
         mean_t max(0, δ − h̄(x̂0_t)) + mean_t max(0, (1−α) δ − h̄(x̂0_{t+1}) + α sg h̄(x̂0_t)),   t ≥ 1 in the first
@@ -115,7 +117,8 @@ def shaping(h: Array, valid: Array, retention: Retention, eta: Array, delta: flo
     """
     positive = _mean(jax.nn.relu(delta - h[:, 1:]), valid[:, 1:], weight)
     floor = retention.decay(jax.lax.stop_gradient(h[:, :-1]), eta)
-    drop = jax.nn.relu((1.0 - retention.m + eta) * delta - h[:, 1:] + floor)
+    margin = (1.0 - retention.m + eta) * delta if scaled_margin else delta
+    drop = jax.nn.relu(margin - h[:, 1:] + floor)
     return positive + _mean(drop, valid[:, 1:], weight)
 
 

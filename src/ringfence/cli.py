@@ -153,6 +153,7 @@ def evaluate(
     prefix: int | None = None,
     replan: int | None = None,
     execution: str | None = None,
+    set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
 ) -> None:
     """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
 
@@ -173,10 +174,12 @@ def evaluate(
         prefix: rows of a plan that are judged.
         replan: steps for which a plan is followed.
         execution: centralized or decentralized.
+        set: any other planner option, e.g. --set ascent=10 repair=100; docs/evaluation.md lists them.
     """
     from ringfence.evaluate import evaluate as run_evaluation
 
     given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
+    given |= _assignments(set)
     table = Table(
         "run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm"
     )

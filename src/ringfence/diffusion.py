@@ -13,11 +13,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.types import Array, Key
 
 Prediction = Literal["x0", "epsilon", "v"]
 Sampler = Literal["ddpm", "ddim", "dpm++"]
+SAMPLERS = ("ddpm", "ddim", "dpm++")
 Predict = Callable[[Array, Array], Array]  # (x_k (B, ...), k (B,)) -> clean estimate x̂0 (B, ...)
 
 
@@ -103,7 +104,7 @@ def timesteps(total: int, steps: int) -> np.ndarray:
     """Decreasing diffusion steps (n,), evenly spaced and starting at K−1 ("trailing", Lin et al. 2024): with few
     steps, none is spent on the last levels, where the clean estimate is already exact."""
     if not 1 <= steps <= total:
-        raise UserError(f"A sampler can take 1 to {total} steps of this model, got {steps}; change --steps.")
+        raise UserError(f"A sampler can take 1 to {total} steps of this model, got {steps}; choose fewer.")
     return np.round(np.arange(steps, 0, -1) * total / steps).astype(int) - 1
 
 
@@ -144,10 +145,9 @@ def refine(
     """Denoise x from levels[0] down the given decreasing diffusion steps and on to the clean plan."""
     bar = np.concatenate([alpha_bar[levels], [1.0]])
     signal, noise = np.sqrt(bar), np.sqrt(1.0 - bar)
-    if sampler == "ddpm":
-        eta = 1.0
-    elif sampler not in ("ddim", "dpm++"):
-        raise UserError(f"Unknown sampler '{sampler}'; choose ddpm, ddim or dpm++.")
+    if sampler not in SAMPLERS:
+        raise unknown("sampler", sampler, SAMPLERS)
+    eta = 1.0 if sampler == "ddpm" else eta
     schedule = {
         "k": jnp.asarray(levels, jnp.int32),
         "signal": jnp.asarray(signal[:-1], jnp.float32),

@@ -39,7 +39,7 @@ def rollout(
     label: str = "",
     quiet: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Play `episodes` episodes: `returns`, `costs` (E, L) per step, `states` (E, L+1, S); the first `record` episodes
+    """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S); the first `record` episodes
     also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise, never the resets."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
@@ -212,12 +212,15 @@ def evaluate(
     job, policy = load(run, step, **{**PLANNERS[planner], **options})
     plans = isinstance(policy, Planner)
     variant = variant_name(job, planner if plans else "plain", options if plans else {}, split)
+    variant += "" if step is None else f"@step{step}"
     seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
     result, played = evaluate_policy(policy, job.task, episodes, split, seed, record, label, quiet)
     result |= {
         "algorithm": job.algorithm.name,
         "variant": variant,
+        "provenance": run.config["data"]["provenance"],
+        "planner": planner if plans else "plain",
         "options": dataclasses.asdict(policy.options) if plans else {},
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),

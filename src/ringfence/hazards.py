@@ -27,7 +27,7 @@ class Separation:
     """Agents' centres must stay at least `radius` apart: ℓ_i = min_j ‖p_j − p_i‖ − radius (m)."""
 
     radius: float = 0.30  # m; two agents of radius 0.15 touch at 0.30
-    safe_margin: float = 0.075  # m; safe from 1.25 radii on, the ratio MACBF uses (Qin et al. 2021)
+    safe_margin: float = 0.075  # m; 1.25 radii at 0.30, the ratio MACBF uses (Qin et al. 2021)
 
 
 @dataclass(frozen=True)

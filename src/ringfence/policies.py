@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import diffusion
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.features import FeatureMap
 from ringfence.hazards import BoundHazard
 from ringfence.nets.heads import barrier_on, foresee, infer_action
@@ -56,6 +56,11 @@ class PlanOptions:
                 raise UserError(f"{name}={getattr(self, name)} must be at least {least}.")
         if self.select not in ("clearance", "barrier", "both"):
             raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
+        for name in ("temperature", "ascent", "repair", "persist"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if self.sampler not in diffusion.SAMPLERS:
+            raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):
             raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
 
@@ -80,6 +85,8 @@ class Planner(eqx.Module):
     prediction: str = eqx.field(static=True)
     clip: float = eqx.field(static=True)
     discount: float = eqx.field(static=True)
+    observe: str = eqx.field(static=True)  # whose present was known in training
+    carries_own: bool = eqx.field(static=True)  # plans hold own entries only; the rest is recomputed
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     hazard: BoundHazard = eqx.field(static=True)
@@ -91,10 +98,18 @@ class Planner(eqx.Module):
             raise UserError(
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
             )
-        if o.plans > 1 and o.select != "clearance" and "barrier" not in self.networks:
+        judged = o.plans > 1 or o.repair > 0
+        if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
-        if o.plans > 1 and o.select != "barrier" and not self.hazard.has_formula:
+        if judged and o.select != "barrier" and not self.hazard.has_formula:
             raise UserError(f"select='{o.select}' needs a hazard with a formula; use select='barrier'.")
+        if self.carries_own and not o.reconcile:
+            raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
+        if o.execution == "decentralized" and self.observe == "all":
+            raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
+        if o.execution == "centralized" and self.observe == "single":
+            raise UserError("This model was trained with observe='single'; evaluate with execution='decentralized'.")
+        diffusion.timesteps(len(self.alpha_bar), o.steps)
 
     def start(self, batch: int) -> PyTree:
         n, d = self.spec.n_agents, self.spec.feature_dim
@@ -141,16 +156,20 @@ class Planner(eqx.Module):
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), o.plans, 0), visible.shape)
         x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
         x = x.reshape(b, copies, rows, n, d)
-        if local:
-            x = x.reshape(b, n, o.plans, rows, n, d)
-            x = jnp.stack([x[:, i, :, :, i] for i in range(n)], -2)  # each agent keeps its own part of its own plans
+        if local:  # each agent judges the team plans that it imagined itself, by its own safety, and keeps its own part
+            own = x.reshape(b, n, o.plans, rows, n, d)
+            parts = jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)  # (B, P, rows, N, D)
+            if o.plans == 1:
+                return parts[:, 0], self._no_news(b) | {"plans": parts}
+            safety, value = self.judge(x)
+            safety = jnp.stack([safety.reshape(b, n, o.plans, n)[:, i, :, i] for i in range(n)], -1)  # (B, P, N)
+            chosen = pick(safety, jnp.moveaxis(value.reshape(b, n, o.plans), 1, 2), o.margin)  # (B, N)
+            plan = jnp.take_along_axis(parts, chosen[:, None, None, :, None], 1)[:, 0]
+            clearance = jnp.take_along_axis(safety, chosen[:, None], 1)[:, 0].min(-1)
+            return plan, {"plans": parts, "chosen": chosen, "clearance": clearance}
         if o.plans == 1:
             return x[:, 0], self._no_news(b) | {"plans": x}
         safety, value = self.judge(x)
-        if local:
-            chosen = pick(safety, value[..., None], o.margin)  # (B, N): agents choose apart
-            plan = jnp.take_along_axis(x, chosen[:, None, None, :, None], 1)[:, 0]
-            return plan, {"plans": x, "chosen": chosen[:, 0], "clearance": safety.max(1).min(-1)}
         team = safety.min(-1)
         chosen = pick(team, value, o.margin)
         plan = jnp.take_along_axis(x, chosen[:, None, None, None, None], 1)[:, 0]
@@ -249,7 +268,7 @@ class Planner(eqx.Module):
         n, d, rows = self.spec.n_agents, self.spec.feature_dim, self.history + self.horizon
         return {
             "plans": jnp.zeros((batch, self.options.plans, rows, n, d)),
-            "chosen": jnp.zeros(batch, jnp.int32),
+            "chosen": jnp.zeros((batch, n) if self.options.execution == "decentralized" else batch, jnp.int32),
             "clearance": jnp.full(batch, jnp.nan),
         }
 

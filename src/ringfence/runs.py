@@ -15,7 +15,6 @@ import os
 import platform
 import re
 import subprocess
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -27,6 +26,7 @@ from safetensors.numpy import load_file, save_file
 
 from ringfence import __version__
 from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.files import whole
 from ringfence.types import PyTree
 
 KEEP = 2  # checkpoints
@@ -75,22 +75,13 @@ class Run:
 
     def save_checkpoint(self, step: int, state: PyTree) -> Path:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
-        folder = self.path / "ckpt"
-        folder.mkdir(parents=True, exist_ok=True)
+        final = self.path / "ckpt" / f"step-{step:08d}.safetensors"
         arrays = {name: np.array(leaf, order="C") for name, leaf in named_leaves(state)}
-        final = folder / f"step-{step:08d}.safetensors"
-        temporary = folder / f".step-{step:08d}.part"
-        try:
-            save_file(arrays, temporary, {"step": str(step)})
-            os.replace(temporary, final)
-        except BaseException as error:
-            temporary.unlink(missing_ok=True)
-            if isinstance(error, (OSError, SafetensorError)):
-                raise UserError(
-                    f"The checkpoint '{final}' could not be written ({error}); free some space and run the same "
-                    "command again: training resumes from the last checkpoint."
-                ) from error
-            raise
+        with whole(final) as temporary:
+            try:
+                save_file(arrays, temporary, {"step": str(step)})
+            except SafetensorError as error:  # its own wrapping of the operating system's error
+                raise OSError(str(error)) from error
         for _, old in self.checkpoints()[:-KEEP]:
             old.unlink(missing_ok=True)
         return final
@@ -142,15 +133,8 @@ def read_json(path: Path, problem: str) -> dict:
 
 def write_json(path: Path, data: Any) -> None:
     """Whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "w") as f:
-            json.dump(data, f, indent=1)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    with whole(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=1))
 
 
 def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:

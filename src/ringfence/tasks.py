@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
@@ -98,8 +98,8 @@ def get(name: str) -> Task:
 def from_store(store: EpisodeStore) -> Task:
     """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
     name = store.card["task"]
-    if name in TASKS:
-        return TASKS[name]
+    if name in TASKS:  # danger is what the data says it is
+        return replace(TASKS[name], hazard=store.hazard)
     returns = store.returns
     low, high = float(returns.min()), float(returns.max())
     return Task(

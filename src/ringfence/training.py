@@ -67,6 +67,7 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
     hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
+    a.check(config, hazard)
     return Job(a, preset, config, task, spec, feature_map, hazard)
 
 

@@ -97,6 +97,7 @@ class Algorithm:
 
     name: str
     Config: type  # frozen dataclass; the command line is generated from it
+    check: Callable[..., None]  # (config, hazard): refuses settings that cannot work
     init: Callable[..., PyTree]  # (key, spec, config, data, feature_map, hazard) -> state, a pytree
     make_update: Callable[..., Callable]  # (config, spec, feature_map, hazard) -> update(state, batch, key)
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk

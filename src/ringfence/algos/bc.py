@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence import features, normalise
+from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
 from ringfence.optim import Optimiser, average
@@ -24,7 +25,7 @@ class Config:
     view: features.View = "decentralized"  # what an agent sees: its own observation, as in OMAR's study
     cost_limit: float | None = None  # keep episodes with cost ≤ this; None keeps all
     horizon: int = 2  # rows of a window: now and next
-    history: int = 0  # rows of the past (unused)
+    history: int = 0  # rows of the past; cloning looks at the present alone
     width: int = 128  # units of each hidden layer
     depth: int = 2  # hidden layers
     steps: int = 4_000  # updates
@@ -67,6 +68,12 @@ def init(
     return jax.jit(networks)() | {"frozen": {"normaliser": norm}}
 
 
+def check(config: Config, hazard: BoundHazard) -> None:
+    """Refuse settings that cannot work, before anything is computed."""
+    if config.history or config.horizon != 2:
+        raise UserError("bc looks at the present state alone; leave history=0 and horizon=2.")
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     opt = _optimiser(config)
 
@@ -96,5 +103,5 @@ def _optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
 
 
-BC = Algorithm("bc", Config, init, make_update, make_diagnose, make_policy, {"default": {}})
-BC_SAFE = Algorithm("bc-safe", Config, init, make_update, make_diagnose, make_policy, {"default": {"cost_limit": 0.0}})
+BC = Algorithm("bc", Config, check, init, make_update, make_diagnose, make_policy, {"default": {}})
+BC_SAFE = replace(BC, name="bc-safe", presets={"default": {"cost_limit": 0.0}})

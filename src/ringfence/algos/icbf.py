@@ -144,7 +144,6 @@ def init(
 ) -> PyTree:
     """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
     for the statistics, which is all that a checkpoint's template needs."""
-    check(config)
     kd, kb, ki, kf, ks = jax.random.split(key, 5)
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
@@ -203,10 +202,15 @@ def optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
 
 
-def check(config: Config) -> None:
+def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     retention(config)
-    gradient_depth(config.gradient)
+    schedule(config)
+    _, depth = gradient_depth(config.gradient)
+    if depth >= config.diffusion_steps:
+        raise UserError(f"gradient='{config.gradient}' goes deeper than the {config.diffusion_steps} diffusion steps.")
+    if config.barrier and config.routing == "paper" and not hazard.has_formula:
+        raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
     if config.horizon < 2:
         raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
     if config.routing == "split" and not config.scaled_margin and config.delta / (1 - config.retention) > 2.0:
@@ -389,15 +393,15 @@ def barrier_losses(
         unsafe_made, safe_made = hazard.labels(jax.lax.stop_gradient(x))
     rows = valid[..., None]
     if config.routing == "paper":
-        if unsafe_made is None:
-            raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
         made_h = barrier_on(net, norm, x)
         on_made = cbf.hinges(made_h, unsafe_made, safe_made, rows, ret, eta, config.delta, config.scaled_margin, weight)
         loss_theta = on_made.safe + on_made.unsafe + on_made.retention
         loss_omega = jnp.zeros(())
     else:
         slow = jax.lax.stop_gradient(average)
-        loss_theta = cbf.shaping(barrier_on(slow, norm, x), rows, ret, eta, config.delta, weight)
+        loss_theta = cbf.shaping(
+            barrier_on(slow, norm, x), rows, ret, eta, config.delta, config.scaled_margin, weight
+        )
     m = config.barrier_batch
     data_x, data_rows = batch.features[:m, now:], batch.valid[:m, now:, None]
     unsafe, safe = hazard.labels(data_x, batch.costs[:m, now:])
@@ -429,9 +433,10 @@ def barrier_losses(
 
 def barrier_share(config: Config, step: Array) -> Array:
     """λ at an update: 0 until `barrier_start`, `barrier_weight` from `barrier_full` on, linear between."""
-    progress = step / max(config.steps, 1)
-    width = max(config.barrier_full - config.barrier_start, 1e-9)
-    return config.barrier_weight * jnp.clip((progress - config.barrier_start + 1e-12) / width, 0.0, 1.0)
+    progress, width = step / max(config.steps, 1), config.barrier_full - config.barrier_start
+    if width <= 0:
+        return config.barrier_weight * (progress >= config.barrier_start)
+    return config.barrier_weight * jnp.clip((progress - config.barrier_start) / width, 0.0, 1.0)
 
 
 def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
@@ -533,6 +538,8 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
         prediction=config.prediction,
         clip=config.clip,
         discount=config.discount,
+        observe=config.observe,
+        carries_own=carries_own(config, feature_map),
         spec=spec,
         feature_map=feature_map,
         hazard=hazard,
@@ -540,10 +547,11 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     )
 
 
-ICBF = Algorithm("icbf", Config, init, make_update, make_diagnose, make_policy, PRESETS)
+ICBF = Algorithm("icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS)
 MADIFF = Algorithm(
     "madiff",
     Config,
+    check,
     init,
     make_update,
     make_diagnose,

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -24,6 +23,7 @@ import numpy as np
 
 from ringfence import hazards
 from ringfence.errors import StoreError
+from ringfence.files import whole
 
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
@@ -198,20 +198,12 @@ class EpisodeStore:
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
         path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-        os.close(handle)
-        try:
-            with h5py.File(temporary, "w") as f:
-                f.attrs["ringfence_store"] = FORMAT
-                f.attrs["card"] = json.dumps(self.card)
-                for name in (*ARRAYS, "state"):
-                    if getattr(self, name) is not None:
-                        f.create_dataset(name, data=getattr(self, name))
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with whole(path) as temporary, h5py.File(temporary, "w") as f:
+            f.attrs["ringfence_store"] = FORMAT
+            f.attrs["card"] = json.dumps(self.card)
+            for name in (*ARRAYS, "state"):
+                if getattr(self, name) is not None:
+                    f.create_dataset(name, data=getattr(self, name))
         return path
 
     @classmethod

@@ -1,4 +1,4 @@
-"""What the small networks mean: inverse dynamics and barriers, on features in physical units."""
+"""What the small networks mean: inverse and forward dynamics, barriers, on features in physical units."""
 
 from __future__ import annotations
 

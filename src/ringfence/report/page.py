@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shlex
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,7 +13,8 @@ from markupsafe import Markup
 
 from ringfence import __version__, algos, tasks
 from ringfence.errors import UserError
-from ringfence.policies import PlanOptions
+from ringfence.files import whole
+from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.table import NAMES, Row, Section, sections
 from ringfence.runs import Run, read_json
@@ -59,16 +58,8 @@ def _asset(name: str) -> str:
 
 
 def _write(path: Path, text: str) -> Path:
-    """Whole or not at all."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-        with os.fdopen(handle, "w", encoding="utf-8") as f:
-            f.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise UserError(f"'{path}' could not be written ({error}); give another --out.") from error
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
     return path
 
 
@@ -264,9 +255,12 @@ def commands(section: Section, out: Path) -> list[str]:
     evaluations: dict[tuple, list[str]] = {}
     for row in section.rows:
         for run, result in row.members:
-            defaults = {f.name: f.default for f in dataclasses.fields(PlanOptions)}
+            planner = result.get("planner", "plain")
+            usual = {f.name: f.default for f in dataclasses.fields(PlanOptions)} | PLANNERS.get(planner, {})
             options = result.get("options") or {}
-            given = " ".join(f"--{k} {v}" for k, v in options.items() if k not in defaults or v != defaults[k])
+            given = " ".join(shlex.quote(f"{k}={v}") for k, v in options.items() if v != usual.get(k))
+            given = f"--set {given}" if given else ""
+            given = given if planner == "plain" else f"--planner {planner} {given}".strip()
             split = " --split validation" if row.split == "validation" else ""
             how = f"--episodes {result['episodes']}{split} {given}".strip()
             evaluations.setdefault((how,), []).append(shlex.quote(str(run.path)))

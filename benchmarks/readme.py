@@ -1,0 +1,86 @@
+"""Writes the measured tables into README.md and docs/method.md, between their markers, from results/ alone.
+
+    python benchmarks/readme.py
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import defaultdict
+from pathlib import Path
+
+import numpy as np
+
+from ringfence.stats import upper_bound
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "results"
+TIERS = ("expert", "medium", "medium-replay", "random")
+ROWS = (
+    ("behaviour data", "reference", "behaviour data"),
+    ("do-nothing", "reference", "do nothing"),
+    ("random actions", "reference", "random actions"),
+    ("bc", "default", "BC"),
+    ("bc-safe", "default", "BC on episodes without a collision"),
+    ("madiff", "default", "MADIFF (no barrier)"),
+    ("icbf", "paper", "ICBF-Diffuser `paper`"),
+    ("icbf", "split", "ICBF-Diffuser `split`"),
+    ("icbf", "split+plans8", "`split`, best of 8 plans"),
+    ("madiff", "default+guarded", "MADIFF, guarded planner"),
+    ("icbf", "split+guarded", "`split`, guarded planner"),
+)
+
+
+def main() -> None:
+    with open(RESULTS / "simple_spread" / "table.csv") as f:
+        table = list(csv.DictReader(f))
+    groups = defaultdict(list)
+    for row in table:
+        groups[row["task"], row["algorithm"], row["variant"]].append(row)
+    put("README.md", "table", spread(groups))
+    speed = []
+    for file in sorted((RESULTS / "performance").glob("*.json")):
+        speed += [(r["name"], r["value"], r["unit"], r["command"]) for r in json.loads(file.read_text())]
+    lines = ["| what | measured | command |", "|---|---|---|"]
+    lines += [f"| {name} | {value:.4g} {unit} | `{command}` |" for name, value, unit, command in speed]
+    put("docs/performance.md", "performance", "\n".join(lines))
+
+
+def spread(groups: dict) -> str:
+    """One line per method, per tier: normalised return (raw) and avoidable collision steps per episode."""
+    head = "| | " + " | ".join(f"{t}: return (norm.) | avoidable cost | unsafe episodes" for t in TIERS) + " |"
+    lines = [head, "|---|" + "---|---|---|" * len(TIERS)]
+    for algorithm, variant, name in ROWS:
+        cells = []
+        for tier in TIERS:
+            rows = groups.get((f"simple_spread-{tier}", algorithm, variant))
+            cells += ["–"] * 3 if not rows else cell(rows)
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def cell(rows: list[dict]) -> list[str]:
+    def column(key: str) -> np.ndarray:
+        return np.array([float(r[key]) for r in rows])
+
+    returns, norm, avoidable = column("return_mean"), column("return_norm"), column("avoidable_cost")
+    episodes = int(column("episodes").sum())
+    bad = int(round((column("violation_rate") * column("episodes")).sum()))
+    spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
+    bound = f"{100 * bad / episodes:.1f} % (≤ {100 * upper_bound(bad, episodes):.1f} %)"
+    return [f"{returns.mean():.0f}{spread} ({norm.mean():.2f})", f"{avoidable.mean():.3f}", bound]
+
+
+def put(file: str, name: str, text: str) -> None:
+    path = ROOT / file
+    begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
+    old = path.read_text()
+    if begin not in old or end not in old:
+        raise SystemExit(f"{file} lacks the markers {begin} and {end}; put them back.")
+    path.write_text(old[: old.index(begin) + len(begin)] + "\n" + text + "\n" + old[old.index(end) :])
+    print(f"{file}: {name}")
+
+
+if __name__ == "__main__":
+    main()
