@@ -129,7 +129,17 @@ def _windows(
 ) -> WindowData:
     """Device data of a job; the last one is kept, since tables train several algorithms on one store."""
     used = data if cost_limit is None else data.select(data.episode_costs <= cost_limit)
-    return WindowData(used, task.feature_map(view, data), discount, condition, horizon, updates)
+    about = (data, task.name, view, cost_limit, discount, updates)
+    critic = _last_critic.get(about)
+    windows = WindowData(used, task.feature_map(view, data), discount, condition, horizon, updates, critic)
+    if windows.critic is not None:
+        _last_critic.clear()
+        _last_critic[about] = windows.critic
+    return windows
+
+
+# Fitting a critic takes longer than the rest of the preparation; algorithms that differ in their condition share it.
+_last_critic: dict[tuple, dict] = {}
 
 
 @dataclass(frozen=True)

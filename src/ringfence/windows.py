@@ -24,7 +24,7 @@ class WindowData:
 
     M = T + E rows of states, T steps. `arrays` is a pytree of device arrays that jitted functions take as an
     argument, so that the data is never baked into a compiled program. `critic` is what states are worth (values.py);
-    it is fitted here, once per data set, and only if an algorithm is conditioned on value or ranks plans by it.
+    it is fitted here unless it is given, and only if an algorithm is conditioned on value or ranks plans by it.
     """
 
     def __init__(
@@ -35,6 +35,7 @@ class WindowData:
         condition: values.Condition | None = None,
         horizon: int = 2,
         updates: int = 8000,
+        critic: dict[str, Array] | None = None,
     ):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
@@ -44,17 +45,18 @@ class WindowData:
         row, last = step + episode, store.episode_ends[episode] + episode
         x = jnp.asarray(np.asarray(features(store.observations, store.state), np.float32))
         self.steps, self.n_agents, self.feature_dim = store.steps, store.n_agents, x.shape[-1]
-        self.critic = None
+        self.critic = critic
         scores = np.zeros(store.steps)
         if condition is not None:
             togo = returns_to_go(team, store.lengths, discount)
-            arrived, ahead = np.zeros(len(x), np.float32), np.zeros(len(x), np.float32)
-            arrived[row + 1], ahead[row] = team, togo
-            # First rows were not arrived in: they take the reward of their own first step, a fair stand-in.
-            arrived[starts + np.arange(store.episodes)] = team[starts]
-            self.critic = values.fit_critic(
-                x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates
-            )
+            if critic is None:
+                arrived, ahead = np.zeros(len(x), np.float32), np.zeros(len(x), np.float32)
+                arrived[row + 1], ahead[row] = team, togo
+                # First rows were not arrived in: they take the reward of their own first step, a fair stand-in.
+                arrived[starts + np.arange(store.episodes)] = team[starts]
+                self.critic = values.fit_critic(
+                    x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates
+                )
             if condition == "advantage":
                 value = values.values_of(self.critic, x)
                 scores = values.normal_scores(values.advantages(value, team, row, last, horizon, discount))

@@ -72,9 +72,7 @@ def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) 
     states = arrays["states"][:EPISODES].astype(np.float64)
     if states.shape[-1] != 6 * n or "radius" not in section.hazard:
         return None
-    options = row.members[0][1].get("options") or {}
     plans = tracks(arrays, spec["feature_names"], n, run.config["config"].get("history", 0))
-    local = options.get("execution") == "decentralized"
     arena = getattr(tasks.TASKS[section.task].env, "half_width", 1.0) if section.task in tasks.TASKS else 1.0
     episodes = []
     for e in range(len(states)):
@@ -98,7 +96,6 @@ def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) 
         "radius": section.hazard["radius"] / 2,
         "contact": section.hazard["radius"],
         "total": int(plans.shape[2]) if plans is not None else 0,
-        "local": local,
         "episodes": episodes,
     }
 
@@ -125,10 +122,10 @@ def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict:
     """An episode's plans (L, P, H, N, 2) within the budget, the chosen one first."""
     steps, p, h, n, _ = plans.shape
     keep = int(np.clip(NUMBERS // (steps * h * n * 2), 1, p))
-    if chosen is None:
-        chosen = np.zeros(steps, int)
-    order = np.argsort(np.arange(p)[None] != chosen.reshape(steps, -1)[:, :1], axis=1, kind="stable")[:, :keep]
-    kept = np.take_along_axis(plans, order[:, :, None, None, None], 1)
+    chosen = np.zeros(steps, int) if chosen is None else chosen
+    chosen = np.broadcast_to(chosen.reshape(steps, -1), (steps, n))  # agents that execute apart choose apart
+    order = np.argsort(np.arange(p)[None, :, None] != chosen[:, None], axis=1, kind="stable")[:, :keep]
+    kept = np.take_along_axis(plans, order[:, :, None, :, None], 1)
     return {"plans": pack(kept), "shape": [steps, keep, h, n]}
 
 

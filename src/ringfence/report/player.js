@@ -82,7 +82,7 @@
       if (e.plans && toggle.checked) {
         const step = Math.min(Math.floor(now), steps - 1), [, p, h, m] = e.shape;
         for (let q = p - 1; q >= 0; q--) for (let i = 0; i < m; i++) {  // the chosen plan, the first, on top
-          const followed = q === 0 && !(told.local && p > 1 && i > 0);
+          const followed = q === 0;
           ink.globalAlpha = followed ? 1 : 0.3;
           ink.lineWidth = (followed ? 2.6 : 1.2) * unit;
           ink.strokeStyle = ink.fillStyle = colours[i % 7];

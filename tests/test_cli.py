@@ -1,0 +1,61 @@
+"""The command line: what it prints, what it refuses, and the whole job from data to page."""
+
+import json
+
+import pytest
+
+from ringfence import demo
+from ringfence.cli import main
+from ringfence.data import EpisodeStore
+
+
+def test_lists_tasks(capsys):
+    main(["tasks"])
+    assert "public" in capsys.readouterr().out
+
+
+def test_makes_and_describes_data(tmp_path, capsys):
+    file = tmp_path / "d.h5"
+    main(["data", "make", "simple_spread-random", "--size", "1000", "--seed", "3", "--out", str(file)])
+    assert EpisodeStore.load(file).episodes == 40
+    capsys.readouterr()
+    main(["data", "info", str(file)])
+    told = capsys.readouterr().out
+    assert "not the public files" in told and "warning" in told and "episodes starting unsafe" in told
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["train", "icfb", "simple_spread-medium"], "did you mean 'icbf'"),
+        (["train", "icbf", "simple_spread-medum"], "did you mean 'simple_spread-medium'"),
+        (["train", "icbf", "simple_spread-medium", "--set", "barier_weight=3"], "did you mean 'barrier_weight'"),
+        (["train", "icbf", "simple_spread-medium", "--set", "steps"], "name=value"),
+        (["train", "icbf", "simple_spread-medium", "--set", "steps=many"], "cannot be read as int"),
+        (["train", "icbf", "simple_spread-medium", "--set", "net=unit"], "did you mean 'unet'"),
+        (["train", "icbf", "nowhere.h5"], "No episode store"),
+        (["eval", "nowhere"], "does not exist"),
+        (["report", "nowhere"], "does not exist"),
+        (["data", "info", "nowhere.h5"], "No episode store"),
+        (["data", "make", "simple_spread-medium-replay", "--size", "1000000"], "3900 episodes"),
+    ],
+)
+def test_refuses_in_one_sentence(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    told = capsys.readouterr().err
+    assert stop.value.code == 2 and message in told and "Traceback" not in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_whole_job(tmp_path, monkeypatch, capsys):
+    """`make demo`, tiny: data, three trainings, evaluations on the same resets, the table and the page."""
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
+    page = demo.run(tmp_path / "demo", "random", quick=True)
+    text = page.read_text()
+    assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
+    results = [json.loads(f.read_text()) for f in (tmp_path / "demo").rglob("results.json")]
+    starts = {tuple(r["per_episode"]["unsafe_start"]) for found in results for r in found.values()}
+    assert len(results) == 3 and len(starts) == 1
+    assert "ICBF split, guarded" in capsys.readouterr().out
