@@ -10,9 +10,13 @@ import json
 from collections import defaultdict
 from pathlib import Path
 
+import matplotlib
 import numpy as np
 
 from ringfence.stats import upper_bound
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
@@ -39,6 +43,7 @@ def main() -> None:
     for row in table:
         groups[row["task"], row["algorithm"], row["variant"]].append(row)
     put("README.md", "table", spread(groups))
+    draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
         speed += [(r["name"], r["value"], r["unit"], r["command"]) for r in json.loads(file.read_text())]
@@ -58,6 +63,46 @@ def spread(groups: dict) -> str:
             cells += ["–"] * 3 if not rows else cell(rows)
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+MARKS = {  # colour-blind-safe, and told apart by shape as well
+    "behaviour data": ("s", "#777777"),
+    "BC": ("v", "#999933"),
+    "MADIFF (no barrier)": ("^", "#0077BB"),
+    "ICBF-Diffuser `paper`": ("D", "#CC3311"),
+    "ICBF-Diffuser `split`": ("o", "#33BBEE"),
+    "`split`, best of 8 plans": ("P", "#EE7733"),
+    "`split`, guarded planner": ("*", "#009988"),
+}
+
+
+def draw(groups: dict, path: Path) -> None:
+    """Normalised return against avoidable cost, one panel per tier, means over seeds with their spread."""
+    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.3), sharey=True, layout="constrained")
+    for panel, tier in zip(panels, TIERS):
+        for algorithm, variant, name in ROWS:
+            rows = groups.get((f"simple_spread-{tier}", algorithm, variant))
+            if not rows or name not in MARKS:
+                continue
+            mark, colour = MARKS[name]
+            x = np.array([float(r["avoidable_cost"]) for r in rows])
+            y = np.array([float(r["return_norm"]) for r in rows])
+            panel.errorbar(
+                x.mean(), y.mean(), y.std(), x.std(), mark, color=colour, ms=9 if mark != "*" else 14,
+                label=name.replace("`", ""), elinewidth=1,
+            )
+        panel.set_xscale("symlog", linthresh=0.01)
+        panel.set_xlim(-0.003, 10)
+        panel.axvline(0.02, color="#bbbbbb", lw=0.8, ls=":")
+        panel.set_title(f"simple_spread-{tier}", fontsize=10)
+        panel.grid(alpha=0.25)
+        panel.set_xlabel("avoidable collision steps per episode")
+    panels[0].set_ylabel("normalised return")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=130)
+    print(path)
 
 
 def cell(rows: list[dict]) -> list[str]:

@@ -94,8 +94,16 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
     changes = TINY["bc"]
     apart = training.train("bc", small_store, seeds=(0, 1), out=tmp_path / "a", changes=changes, quiet=True)
     together = training.train(
-        "bc", small_store, seeds=(0, 1), out=tmp_path / "b", changes=changes, quiet=True, together=True
+        "bc",
+        small_store,
+        seeds=(0, 1),
+        out=tmp_path / "b",
+        changes=changes,
+        quiet=True,
+        together=True,
+        tensorboard=True,
     )
+    assert all(list((run.path / "tensorboard").glob("events*")) for run in together)
     for x, y in zip(apart, together):
         assert x.metrics[-1]["loss/cloning"] == pytest.approx(y.metrics[-1]["loss/cloning"], rel=1e-4)
 

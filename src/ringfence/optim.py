@@ -37,7 +37,7 @@ class Optimiser:
         for name, p in params.items():
             step, kept[name] = adam.update(grads[name], moments[name], p)
             new[name] = optax.apply_updates(p, step)
-            norms[f"gradient_norm/{name}"] = optax.global_norm(grads[name])
+            norms[f"gradient_norm/{name}"] = jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(grads[name])))
         return new, kept, norms
 
 
