@@ -49,13 +49,13 @@ def players(section: Section) -> list[dict]:
     for row in section.rows:
         if row.split == "test" and (kept := recordings(row)):
             options = row.members[0][1].get("options") or {}
-            found.append((options.get("plans", 0), row, *kept))
+            found.append(((options.get("plans", 0), options.get("ascent", 0.0)), row, *kept))
     if not found:
         return []
     most = max(found, key=lambda f: f[0])  # of equals the first; the flagship is last in the table, so look backwards
     most = [f for f in found if f[0] == most[0]][-1]
     rest = [f for f in found if f[1] is not most[1]]
-    single = [f for f in rest if f[0] == 1] or rest
+    single = [f for f in rest if f[0][0] <= 1] or rest
     same = [f for f in single if (f[1].algorithm, f[1].preset) == (most[1].algorithm, most[1].preset)]
     chosen = [most, *(same or single)[-1:]][:VARIANTS]
     made = [p for _, row, run, arrays in chosen if (p := player(section, row, run, arrays))]
