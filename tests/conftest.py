@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+import tempfile
 
 # The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give.
 # Set before JAX starts; whoever sets XLA_FLAGS himself, even to nothing, tests with those.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
+
+# Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", tempfile.mkdtemp(prefix="ringfence-tests-"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 import jax
 import numpy as np
