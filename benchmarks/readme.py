@@ -20,6 +20,7 @@ import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
+SEEDS = 5  # fewer are said in the cell
 TIERS = ("expert", "medium", "medium-replay", "random")
 ROWS = (
     ("behaviour data", "reference", "behaviour data"),
@@ -41,6 +42,8 @@ def main() -> None:
         table = list(csv.DictReader(f))
     groups = defaultdict(list)
     for row in table:
+        if not row["task"]:
+            continue
         groups[row["task"], row["algorithm"], row["variant"]].append(row)
     put("README.md", "table", spread(groups))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
@@ -113,6 +116,7 @@ def cell(rows: list[dict]) -> list[str]:
     episodes = int(column("episodes").sum())
     bad = int(round((column("violation_rate") * column("episodes")).sum()))
     spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
+    spread += f" [{len(rows)} seeds]" if 1 < len(rows) < SEEDS else ""
     bound = f"{100 * bad / episodes:.1f} % (≤ {100 * upper_bound(bad, episodes):.1f} %)"
     return [f"{returns.mean():.0f}{spread} ({norm.mean():.2f})", f"{avoidable.mean():.3f}", bound]
 

@@ -1,0 +1,52 @@
+"""What states and windows are worth."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import values
+
+
+def test_advantages_match_their_definition():
+    """Σ γ^h r + γ^n V(s_{t+n}) − V(s_t) by brute force, with V = 0 at the end of an episode."""
+    rng = np.random.default_rng(0)
+    lengths, horizon, discount = [3, 7, 1], 4, 0.9
+    ends = np.cumsum(lengths)
+    team, value = rng.normal(size=11), rng.normal(size=14)
+    row = np.arange(11) + np.repeat(np.arange(3), lengths)
+    last = np.repeat(ends + np.arange(3), lengths)
+    got = values.advantages(value, team, row, last, horizon, discount)
+    for t in range(11):
+        left = last[t] - row[t]
+        n = min(horizon - 1, left)
+        expected = sum(discount**h * team[t + h] for h in range(n)) - value[row[t]]
+        if left > n:
+            expected += discount**n * value[row[t] + n]
+        np.testing.assert_allclose(got[t], expected, atol=1e-12)
+
+
+def test_normal_scores_are_ordered_and_standard():
+    x = np.random.default_rng(0).exponential(size=5000)
+    z = values.normal_scores(x)
+    assert (np.diff(z[np.argsort(x)]) > 0).all()
+    assert abs(z.mean()) < 1e-6 and abs(z.std() - 1) < 0.01
+
+
+def test_critic_learns_what_is_there_to_learn():
+    """A team reward that is linear in every agent's features, and a return-to-go that is quadratic."""
+    x = jax.random.normal(jax.random.key(0), (4000, 3, 4))
+    reward, togo = x[..., 0].mean(-1), (x[..., 1] ** 2).mean(-1)
+    critic = values.fit_critic(x, reward, togo, jax.random.key(1), updates=600, batch=256)
+    r, g = values.state_values(critic, x)
+    for got, truth in ((r, reward), (g, togo)):
+        assert float(1 - ((got - truth) ** 2).mean() / truth.var()) > 0.9
+    np.testing.assert_allclose(values.values_of(critic, x), np.asarray(g), rtol=1e-5, atol=1e-5)
+
+
+def test_plan_value_sums_rewards_and_the_last_value():
+    critic = values.blank_critic(4)
+    rows = jax.random.normal(jax.random.key(0), (2, 3, 2, 4))
+    r, g = values.state_values(critic, rows)
+    expected = r[:, 0] + 0.5 * r[:, 1] + 0.25 * r[:, 2] + 0.125 * g[:, 2]
+    np.testing.assert_allclose(values.plan_value(critic, rows, 0.5), expected, rtol=1e-5)
+    assert jnp.isfinite(expected).all()
