@@ -106,7 +106,7 @@ def test_hinges_are_means_over_their_sets():
 def test_shaping_only_ever_raises_h_and_never_blames_the_present():
     h = jax.random.normal(jax.random.key(0), (4, 6, 3))
     valid = jnp.ones((4, 6, 1), bool).at[0, 4:].set(False)
-    shaped = lambda h: cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, jnp.ones((4, 1, 1)))  # noqa: E731
+    shaped = lambda h: cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, True, jnp.ones((4, 1, 1)))  # noqa: E731
     gradient = np.asarray(jax.jit(jax.grad(shaped))(h))
     assert (gradient <= 0).all() and (gradient[:, 1:] < 0).any()
     assert not gradient[:, 0].any()  # row 0 is the present, which no plan can change
@@ -224,13 +224,24 @@ def test_empty_sets_are_finite(scene, losses, routing, case):
         assert np.isfinite(leaf).all()
 
 
-def test_paper_needs_a_formula(scene):
-    _, batch, _, net, frozen = scene
-    one = jnp.ones((len(batch.features), 1, 1))
-    made = icbf.Generated(batch.features, batch.valid, one, one)
+def test_means_do_not_depend_on_the_number_of_agents():
+    """The same h for every agent gives the same losses and shares for 2 and for 6 of them."""
+
+    def told(n):
+        h = jnp.broadcast_to(jnp.linspace(-1, 1, 20).reshape(4, 5, 1), (4, 5, n))
+        valid = jnp.ones((4, 5, 1), bool)
+        shaped = cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, True, jnp.ones((4, 1, 1)))
+        terms = cbf.hinges(h, h < 0, h >= 0, valid, cbf.Retention(0.9), 0.0, 0.1, True)
+        return [float(x) for x in (shaped, *terms[:3], terms.metrics["share_unsafe"])]
+
+    assert told(2) == pytest.approx(told(6), rel=1e-5)
+    assert told(2)[-1] == pytest.approx(0.5)
+
+
+def test_paper_needs_a_formula():
     hazard = hazards.bind(hazards.CostColumn(), features.simple_spread("pruned", 3).names, 3)
     with pytest.raises(UserError, match="routing='paper' labels generated states"):
-        icbf.barrier_losses(net, net, frozen, batch, made, jax.random.key(0), config("paper"), hazard)
+        icbf.check(config("paper"), hazard)
 
 
 def test_the_share_of_the_barrier_rises_on_schedule():

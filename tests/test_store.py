@@ -109,7 +109,7 @@ def test_nothing_is_left_when_saving_fails(tmp_path, monkeypatch, broken):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(*((h5py.Group, "create_dataset") if broken == "create_dataset" else (os, "replace")), full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(UserError, match="No space left"):
         logs(seed=1).save(path)
     monkeypatch.undo()
     assert os.listdir(tmp_path) == ["s.h5"] and path.read_bytes() == before
