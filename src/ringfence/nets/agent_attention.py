@@ -1,7 +1,7 @@
 """The default denoiser: one token per agent holds its whole window, attention runs across agents.
 
 Flattening the window into the token turns the work into a few wide matrix products, which is what a CPU is good at;
-`docs/performance.md` has the measurements beside MADIFF's temporal U-Net. The number of agents appears in no weight.
+`benchmarks/denoisers.py` puts it beside MADIFF's temporal U-Net. The number of agents appears in no weight.
 """
 
 from __future__ import annotations
