@@ -46,6 +46,10 @@ def run(tiers: list[str], seeds: int, episodes: int) -> None:
         rows = reference.make(task, store, ROOT / "runs", episodes)
         write(OUT / task.name / "reference.json", rows)
         for algorithm, preset, evaluations in ENTRIES:
+            labels = [preset if name == "plain" else f"{preset}+{name}" for name in evaluations]
+            files = [OUT / task.name / f"{algorithm}-{v}-seed{k}.json" for v in labels for k in range(seeds)]
+            if all(f.exists() for f in files):
+                continue  # nothing to measure, so nothing to train
             trained = training.train(
                 algorithm, store, preset=preset, seeds=tuple(range(seeds)), out=ROOT / "runs", quiet=False
             )
