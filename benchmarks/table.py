@@ -26,6 +26,7 @@ ENTRIES = (
     ("bc", "default", ("plain",)),
     ("bc-safe", "default", ("plain",)),
     ("icbf", "split", ("plain", "plans8", GUARDED)),
+    ("icbf", "long", ("plain", GUARDED)),
     ("madiff", "default", ("plain", GUARDED)),
     ("icbf", "paper", ("plain",)),
 )
