@@ -20,7 +20,7 @@ import numpy as np
 from ringfence import diffusion
 from ringfence.errors import UserError, unknown
 from ringfence.features import FeatureMap
-from ringfence.hazards import BoundHazard
+from ringfence.hazards import BoundHazard, least
 from ringfence.nets.heads import barrier_on, foresee, infer_action
 from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
@@ -52,9 +52,9 @@ class PlanOptions:
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
     def __post_init__(self):
-        for name, least in (("plans", 1), ("steps", 1), ("prefix", 1), ("replan", 1), ("shield", 0)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name}={getattr(self, name)} must be at least {least}.")
+        for name, bound in (("plans", 1), ("steps", 1), ("prefix", 1), ("replan", 1), ("shield", 0)):
+            if getattr(self, name) < bound:
+                raise UserError(f"{name}={getattr(self, name)} must be at least {bound}.")
         if self.select not in ("clearance", "barrier", "both"):
             raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
         for name in ("temperature", "ascent", "repair", "persist"):
@@ -294,7 +294,7 @@ class Planner(eqx.Module):
             scores.append(self.hazard.clearance(rows))
         if self.options.select in ("barrier", "both"):
             scores.append(barrier_on(self.networks["barrier"], self.normaliser, rows))
-        return jnp.stack(scores).min(0)
+        return least(scores)
 
     def judge(self, x: Array) -> tuple[Array, Array]:
         """Plans (B, P, rows, N, D) -> safety (B, P, N), the least over the judged rows, and value (B, P).

@@ -138,7 +138,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             weight = config.alpha / jax.lax.stop_gradient(jnp.abs(q).mean(1, keepdims=True))
             merit, excess = q, jnp.zeros(spec.n_agents)
             if config.lagrange:
-                c = critics["cost"](x, acted).max(1)
+                c = jnp.maximum(*jnp.moveaxis(critics["cost"](x, acted), 1, 0))
                 merit = (q - scale[:, None] * c) / (1.0 + scale[:, None])
                 excess = c.mean(1) - allowed
             imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
