@@ -37,11 +37,14 @@ def build_report(runs: Iterable[Run | str | Path], out: str | Path, title: str |
     out = out / "report.html" if out.is_dir() else out
     context = {
         "title": title or "Ringfence report: " + ", ".join(s.task for s in found),
-        "version": __version__,
-        "css": Markup(_asset("style.css")),
         "js": Markup(_asset("player.js")),
         "sections": [_section(s, k, out) for k, s in enumerate(found)],
     }
+    return _write(out, render("template.html.j2", context))
+
+
+def render(template: str, context: dict) -> str:
+    """A page from one of the templates beside this file; a name that the context lacks is an error."""
     engine = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE),
         autoescape=True,
@@ -50,7 +53,7 @@ def build_report(runs: Iterable[Run | str | Path], out: str | Path, title: str |
         undefined=jinja2.StrictUndefined,
     )
     engine.filters |= {"count": _count, "share": _share, "number": _number, "duration": _duration}
-    return _write(out, engine.get_template("template.html.j2").render(context))
+    return engine.get_template(template).render(version=__version__, css=Markup(_asset("style.css")), **context)
 
 
 def _asset(name: str) -> str:
