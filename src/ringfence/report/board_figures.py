@@ -8,7 +8,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.report.board import Method
 from ringfence.report.figures import INK, MARKERS, STYLE, figure, to_svg
@@ -30,13 +30,12 @@ def _marker(style: Style) -> str:
 
 
 def _whiskers(ax, rows: list[tuple[float, tuple[float, float]]], styles: list[Style], digits: int) -> None:
-    """A point with its interval per row, the first on top, and the number beside it."""
+    """A point with its interval per row, the first on top, and the number at the right edge, clear of the points."""
     for y, ((value, (low, high)), style) in enumerate(zip(rows, styles)):
         ax.plot((low, high), (y, y), color=_ink(style), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
         ax.plot(value, y, _marker(style), color=_ink(style), markersize=7)
-        ax.annotate(
-            f"{value:.{digits}f}", (high, y), (5, 0), textcoords="offset points", va="center", fontsize=8.5, color=INK
-        )
+        where = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
+        ax.annotate(f"{value:.{digits}f}", (0.99, y), **where, fontsize=8.5, color=INK)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.grid(axis="y", visible=False)
     ax.xaxis.set_major_locator(MaxNLocator(5))
@@ -82,13 +81,13 @@ def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> st
                 ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=fill, edgecolor="none"))
                 ax.text(j, i, f"{p:.2f}", ha="center", va="center", color=ink, fontsize=9)
         ax.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5))
-        ax.set_yticks(range(n), [f"{m.label}  {k + 1}" for k, m in enumerate(methods)])
+        ax.set_yticks(range(n), [f"{k + 1}. {m.label}" for k, m in enumerate(methods)])
         ax.set_xticks(range(n), [str(k + 1) for k in range(n)])
         ax.xaxis.tick_top()
         ax.tick_params(length=0)
         for side in ax.spines.values():
             side.set_visible(False)
-        ax.set_xlabel("the method with this number, which it is compared with")
+        ax.set_xlabel("compared with the method of this number")
         label = f"Probability that the row's method {what} than the column's; rows are " + ", ".join(
             f"{k + 1} {m.label}" for k, m in enumerate(methods)
         )
@@ -110,7 +109,7 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
     columns = 2 if max(len(m.label) for m in methods) > 24 else 3
     rows = -(-len(methods) // columns)
     with matplotlib.rc_context(STYLE):
-        made = figure(WIDTH, 3.6 + 0.24 * rows)
+        made = figure(WIDTH, 4.2 + 0.24 * rows)
         axes = made.subplots(1, 2)
         panels = (
             (told.return_thresholds, told.return_profiles, "normalised return τ", "share of runs with return > τ"),
@@ -139,6 +138,14 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
         )
         label = "Profiles. Left: share of runs above a normalised return. Right: share of episodes within a cost."
         return to_svg(made, label, name)
+
+
+def _brief(x: float) -> str:
+    """30, 3 k, 1 M: a tick that leaves room for its neighbours."""
+    for size, letter in ((1e6, " M"), (1e3, " k")):
+        if x >= size:
+            return f"{x / size:g}{letter}"
+    return f"{x:g}"
 
 
 def expenses(rows: list[Standing], name: str) -> str:
@@ -171,6 +178,8 @@ def expenses(rows: list[Standing], name: str) -> str:
                 )
             ax.set_ylim(len(rows) - 0.5, -0.5)
             ax.grid(axis="y", visible=False)
+            ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 3.0)))
+            ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _brief(x)))
             ax.minorticks_off()
             ax.set_xlabel(title)
         axes[0].set_yticks(range(len(rows)), [r.label for r in rows])

@@ -47,7 +47,7 @@ def _context(board: Board, out: Path, title: str | None) -> dict:
         "expenses": Markup(board_figures.expenses(_typical(board, tables), "expenses")),
         "published": published(board, tables),
         "note": NOTE,
-        "missing": board.missing,
+        "missing": _missing(board),
         "environments": environments(board.runs),
         "several_seeds": len(board.seeds) > 1,
     }
@@ -77,12 +77,13 @@ def published(board: Board, tables: dict[str, list[Standing]]) -> dict | None:
     if not tasks:
         return None
     rows = []
-    for p in PUBLISHED:
+    for k, p in enumerate(PUBLISHED):
         ours = []
-        for m in (m for m in board.methods if matches(p, m.algorithm)):
+        again = any(p.algorithms == later.algorithms for later in PUBLISHED[k + 1 :])  # ours follow the last of them
+        for m in (m for m in board.methods if matches(p, m.algorithm) and not again):
             cells = [next((r for r in tables[t] if r.method == m), None) for t in tasks]
-            ours.append({"label": m.label, "values": [c and 100 * c.returns_norm for c in cells]})
-        rows.append({"name": p.name, "source": p.source, "values": [p.values.get(t) for t in tasks], "ours": ours})
+            ours.append({"label": m.label, "numbers": [c and 100 * c.returns_norm for c in cells]})
+        rows.append({"name": p.name, "source": p.source, "numbers": [p.values.get(t) for t in tasks], "ours": ours})
     return {"tasks": [short(t, board.suite) for t in tasks], "rows": rows}
 
 
@@ -122,6 +123,14 @@ def _absent(board: Board, rows: list[Standing]) -> list[Method]:
     """Methods of the board that this task has no result of: they get a row that says so."""
     there = {r.method for r in rows}
     return [m for m in board.methods if m not in there]
+
+
+def _missing(board: Board) -> list[dict]:
+    """Cells without a result; seeds of one job that lack it for the same reason share a line."""
+    groups: dict[tuple, list[int]] = {}
+    for m in board.missing:
+        groups.setdefault((m.task, m.job, m.why), []).append(m.seed)
+    return [{"task": task, "job": job, "why": why, "seeds": seeds} for (task, job, why), seeds in groups.items()]
 
 
 def _link(file: Path, out: Path) -> tuple[str, str]:

@@ -167,7 +167,7 @@ def board_markdown(board: Board) -> str:
             f", cost limit {c['cost_limit']:g}, normalised with {c['return_min']:g} → {c['return_max']:g}" if c else ""
         )
         blocks.append(f"**{_cell(task)}**{facts}\n\n" + _table(head, [_markdown(r, board) for r in rows]))
-    return "\n\n".join([*blocks, _legend(board)]) + "\n"
+    return "\n\n".join([*blocks, "± standard deviation between seeds. " + _legend(board)]) + "\n"
 
 
 def board_markdown_short(board: Board) -> str:
@@ -213,9 +213,9 @@ def _brief(r: Standing | None) -> str:
 
 
 def _legend(board: Board) -> str:
-    episodes = f"{board.episodes} {board.split} episodes per seed, protocol {board.protocol}"
     return (
-        f"± standard deviation between seeds; **bold**: highest return within the cost limit; †: over it. {episodes}."
+        "**Bold**: the highest return within the cost limit; †: over the limit. "
+        f"{board.episodes} {board.split} episodes per seed, protocol {board.protocol}."
     )
 
 

@@ -19,6 +19,8 @@ NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
     "matd3bc": "MA-TD3BC",
+    "maicq": "MA-ICQ",
+    "macql": "MA-CQL",
     "omar": "OMAR",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
