@@ -125,7 +125,7 @@ def test_settings_that_differ_between_tasks_are_one_method_within_a_task_two(fol
 
 
 ODD = {
-    "protocol": ({"protocol": 2}, "protocol 2.*bench.json.*protocol"),
+    "protocol": ({"protocol": 2}, "protocol 2.*bench.json' declares 1"),
     "split": ({"split": "validation"}, "split validation.*bench.json.*declares test"),
     "task": ({"task": MEDIUM}, "of task 'simple_spread-medium'"),
     "old version": ({"per_episode": None}, "per_episode"),

@@ -47,7 +47,7 @@ def overall(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
     """IQM of normalised return and of normalised cost over all tasks, the best return on top."""
     methods = sorted(told.methods, key=lambda m: -told.iqm_returns[m][0])
     with matplotlib.rc_context(STYLE):
-        made = figure(WIDTH, 1.0 + 0.32 * len(methods))
+        made = figure(WIDTH, 1.4 + 0.32 * len(methods))
         axes = made.subplots(1, 2, sharey=True)
         inks = [styles[m] for m in methods]
         _whiskers(axes[0], [told.iqm_returns[m] for m in methods], inks, 2)
@@ -70,7 +70,7 @@ def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> st
     n = len(methods)
     longest = max(len(m.label) for m in methods)
     with matplotlib.rc_context(STYLE | {"axes.grid": False}):
-        made = figure(1.4 + LABEL * longest + 0.5 * n, 1.0 + 0.36 * n)
+        made = figure(1.4 + LABEL * longest + 0.5 * n, 1.2 + 0.36 * n)
         ax = made.add_subplot()
         for i in range(n):
             for j in range(n):
@@ -156,7 +156,7 @@ def expenses(rows: list[Standing], name: str) -> str:
         ("one joint action, ms", [r.plan_ms for r in rows], "{:.2g}"),
     )
     with matplotlib.rc_context(STYLE):
-        made = figure(WIDTH, 1.0 + 0.32 * len(rows))
+        made = figure(WIDTH, 1.4 + 0.32 * len(rows))
         axes = made.subplots(1, len(panels), sharey=True)
         for ax, (title, values, form) in zip(axes, panels):
             there = [v for v in values if v]
