@@ -21,6 +21,11 @@ TINY = {
                    critic_updates=20),
     "bc": dict(steps=12, batch=32, width=16, depth=1),
     "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
+    "ma-td3bc": dict(steps=12, batch=32, width=16, centralised_critic=True, delay=2, target_noise=0.2),
+    "ma-td3bc-lag": dict(steps=12, batch=32, width=16),
+    "omar": dict(steps=12, batch=32, width=16),
+    "ma-cql": dict(steps=12, batch=32, width=16, cql_actions="policy"),
+    "fisor": dict(steps=12, batch=32, width=16, candidates=2),
 }  # fmt: skip
 QUICK = {"episodes": 4, "steps": 2}
 
@@ -136,7 +141,7 @@ def test_gradient_depths(small_store, gradient):
         dict(),
         dict(plans=3, select="both"),
         dict(replan=2, sampler="dpm++"),
-        dict(plans=2, ascent=5.0, repair=5.0, guidance=1.0, sampler="ddpm"),
+        dict(plans=2, ascent=5.0, repair=5.0, guidance=1.0, sampler="ddpm", shield=2),
     ],
 )
 def test_planner_options(trained, options):
@@ -144,6 +149,28 @@ def test_planner_options(trained, options):
     result = evaluate.evaluate(run, **QUICK, record=2, **options)
     assert result["episodes"] == 4 and np.isfinite(result["return_mean"])
     assert len(run.results) >= 1
+
+
+def test_the_shield_corrects_what_falls_short_and_nothing_else(trained):
+    """Actions are left alone where the plan keeps its margin, and otherwise lead to more clearance, within bounds."""
+    env = tasks.get("simple_spread-random").env
+    state = env.reset(jax.random.key(3), 64)
+    told = {"steps": 2, "prefix": 2, "foresight": True}
+    acted, foreseen = {}, {}
+    for name, options in {"none": {}, "easy": {"margin": -9.0}, "hard": {"margin": 0.3}}.items():
+        shield = {} if name == "none" else {"shield": 8}
+        _, policy = evaluate.load(trained["icbf"], **told, **options, **shield)
+        _, out = policy.act(policy.start(64), env.observe(state), env.global_state(state), jax.random.key(1))
+        acted[name] = out.action
+        now = policy.feature_map(env.observe(state), env.global_state(state))
+        foreseen[name] = np.asarray(policy.safety(policy.foreseen_step(now[:, None], now, out.action)).min(-1))
+    np.testing.assert_allclose(acted["easy"], acted["none"], atol=1e-6)
+    assert np.abs(acted["hard"]).max() <= 1.0
+    short = foreseen["none"] < 0.3
+    assert 5 < short.sum() < 64
+    assert foreseen["hard"][short].mean() > foreseen["none"][short].mean()
+    with pytest.raises(UserError, match="shield"):
+        evaluate.load(trained["icbf"], shield=3, replan=2)
 
 
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])

@@ -267,11 +267,108 @@ def demo(
     run(out_dir, tier, quick)
 
 
+def bench(
+    suite: Positional[str],
+    seeds: int = 5,
+    episodes: int = 200,
+    out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    tasks: list[str] = [],  # noqa: B006
+    algorithms: list[str] = [],  # noqa: B006
+    steps: int | None = None,
+    engine: Literal["local", "ray"] = "local",
+    workers: int | None = None,
+    threads: int = 1,
+    memory: float | None = None,
+    address: str | None = None,
+) -> None:
+    """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
+
+    Args:
+        suite: simple_spread.
+        seeds: per algorithm and task.
+        episodes: test episodes per run.
+        out_dir: folder of results, results/SUITE by default.
+        tasks: these alone.
+        algorithms: these alone, as algorithm or algorithm:preset.
+        steps: updates of every algorithm, for a quick trial.
+        engine: processes on this machine, or Ray tasks.
+        workers: processes; one per `threads` cores by default.
+        threads: per worker or Ray task.
+        memory: GiB that a worker may hold before it is stopped.
+        address: of the Ray cluster, e.g. auto; without it a local one is started.
+    """
+    from ringfence.bench import make_grid, run_local
+
+    out_dir = out_dir or Path("results") / suite
+    grid = make_grid(suite, out_dir, seeds=seeds, episodes=episodes, only_tasks=tasks, only=algorithms, steps=steps)
+    if engine == "ray":
+        from ringfence.bench.cluster import run_ray
+
+        counts = run_ray(grid, address=address, threads=threads)
+    else:
+        counts = run_local(grid, workers=workers, threads=threads, memory=memory)
+    out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
+    if counts["done"]:
+        bench_results(out_dir)
+    if counts["failed"] or counts["to do"]:
+        bench_status(out_dir)
+        sys.exit(1)
+
+
+def bench_status(folder: Positional[Path]) -> None:
+    """What a results folder holds: finished cells, and failed ones with the reason."""
+    from ringfence.bench.cells import statuses
+
+    table = Table("task", "run", "state", "train s", "eval s", "why")
+    for s in statuses(folder):
+        seconds = [f"{s[k]:.0f}" if k in s else "" for k in ("train_seconds", "eval_seconds")]
+        table.add_row(s["task"], s["run"], s["state"], *seconds, s.get("error", ""))
+    out.print(table)
+
+
+def bench_results(folder: Positional[Path]) -> None:
+    """Rank the methods of every task and write FOLDER/table.csv."""
+    from ringfence.bench import table as results
+
+    found = results.rows(folder)
+    for task in sorted({r["task"] for r in found}):
+        table = Table(*results.HEADER, title=task)
+        for line in results.summaries(found, task):
+            table.add_row(*results.cells_of(line))
+        out.print(table)
+    print(results.write_csv(folder))
+
+
+def bench_export(
+    folder: Positional[Path], format: Literal["csv", "markdown", "latex"] = "markdown", out_file: Path | None = None
+) -> None:
+    """Write the ranked tables of a results folder.
+
+    Args:
+        folder: the --out of `ringfence bench`.
+        format: csv (one line per run), markdown or latex (booktabs).
+        out_file: where to; FOLDER/table.EXT by default.
+    """
+    from ringfence.bench import table as results
+    from ringfence.files import whole
+
+    if format == "csv":
+        print(results.write_csv(folder))
+        return
+    text = results.markdown(folder) if format == "markdown" else results.latex(folder)
+    path = out_file or folder / ("table.md" if format == "markdown" else "table.tex")
+    with whole(path) as temporary:
+        temporary.write_text(text)
+    print(path)
+
+
 DATA = {"make": make, "import-omar": import_omar, "info": info, "train-behaviour": train_behaviour}
+BENCH = {"status": bench_status, "results": bench_results, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,
     "train": train,
     "eval": evaluate,
+    "bench": bench,
     "report": report,
     "demo": demo,
     "doctor": doctor,
@@ -284,6 +381,10 @@ def main(arguments: list[str] | None = None) -> None:
         if arguments[:1] == ["data"]:
             tyro.extras.subcommand_cli_from_dict(
                 DATA, prog="ringfence data", description="Episode stores: make, import, inspect.", args=arguments[1:]
+            )
+        elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in BENCH:
+            tyro.extras.subcommand_cli_from_dict(
+                BENCH, prog="ringfence bench", description="Look into a results folder.", args=arguments[1:]
             )
         else:
             tyro.extras.subcommand_cli_from_dict(

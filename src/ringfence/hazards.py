@@ -11,6 +11,7 @@ and gives a `BoundHazard`, whose functions are differentiable and batched over a
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -84,6 +85,12 @@ class BoundHazard:
         return unsafe, ~unsafe
 
 
+def least(x: list[Array]) -> Array:
+    """Elementwise minimum. Not `min` over an axis: its derivative asks which entry *equals* the result, and 0/0 where a
+    compiler rounds the two differently."""
+    return functools.reduce(jnp.minimum, x)
+
+
 def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
     """Resolve a hazard's feature names; an absent one is refused with the nearest name."""
     if isinstance(hazard, CostColumn):
@@ -101,7 +108,7 @@ def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
 
     return BoundHazard(
         hazard,
-        lambda x: jnp.stack([p.clearance(x) for p in parts]).min(0),
+        lambda x: least([p.clearance(x) for p in parts]),
         endanger,
         max(p.safe_margin for p in parts),
     )
@@ -158,7 +165,8 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
 
     def clearance(x: Array) -> Array:
         squared = (offsets(x) ** 2).sum(-1)
-        return jnp.sqrt(jnp.maximum(squared, 1e-12)).min(-1) - hazard.radius
+        distance = jnp.sqrt(jnp.maximum(squared, 1e-12))
+        return least([distance[..., j] for j in range(n_agents - 1)]) - hazard.radius
 
     return BoundHazard(hazard, clearance, endanger, hazard.safe_margin)
 

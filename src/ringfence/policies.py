@@ -20,7 +20,7 @@ import numpy as np
 from ringfence import diffusion
 from ringfence.errors import UserError, unknown
 from ringfence.features import FeatureMap
-from ringfence.hazards import BoundHazard
+from ringfence.hazards import BoundHazard, least
 from ringfence.nets.heads import barrier_on, foresee, infer_action
 from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
@@ -45,15 +45,16 @@ class PlanOptions:
     select: Literal["clearance", "barrier", "both"] = "clearance"  # what a plan's safety is judged by
     margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
     prefix: int = 3  # rows of the plan that are judged
+    shield: int = 0  # rounds that correct the actions which forward dynamics finds unsafe; 0: act as planned
     foresight: bool = True  # judge plans by where forward dynamics says they lead, not by what they say
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: int = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
     def __post_init__(self):
-        for name, least in (("plans", 1), ("steps", 1), ("prefix", 1), ("replan", 1)):
-            if getattr(self, name) < least:
-                raise UserError(f"{name}={getattr(self, name)} must be at least {least}.")
+        for name, bound in (("plans", 1), ("steps", 1), ("prefix", 1), ("replan", 1), ("shield", 0)):
+            if getattr(self, name) < bound:
+                raise UserError(f"{name}={getattr(self, name)} must be at least {bound}.")
         if self.select not in ("clearance", "barrier", "both"):
             raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
         for name in ("temperature", "ascent", "repair", "persist"):
@@ -63,13 +64,24 @@ class PlanOptions:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):
             raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
+        if self.shield and (self.execution == "decentralized" or self.replan > 1):
+            raise UserError("shield corrects a joint action at every step; use execution='centralized' and replan=1.")
 
 
-# Named sets of evaluation-time choices. `guarded` uses everything that is known at run time: value and clearance
-# steer the sample, the best safe one of eight plans is followed. Chosen on validation resets; docs/evaluation.md.
+# Named sets of evaluation-time choices. `guarded` uses everything that is known at run time: value steers the samples,
+# the best safe one of eight plans is followed, and what it would do is corrected until it keeps its distance.
+# Chosen on validation resets; docs/evaluation.md.
 PLANNERS: dict[str, dict] = {
     "plain": {},
-    "guarded": {"plans": 8, "guidance": 1.0, "ascent": 30.0, "repair": 100.0, "margin": 0.1},
+    "guarded": {
+        "plans": 8,
+        "steps": 10,
+        "guidance": 1.0,
+        "ascent": 100.0,
+        "persist": 0.5,
+        "shield": 10,
+        "margin": 0.03,
+    },
 }
 
 
@@ -98,7 +110,7 @@ class Planner(eqx.Module):
             raise UserError(
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
             )
-        judged = o.plans > 1 or o.repair > 0
+        judged = o.plans > 1 or o.repair > 0 or o.shield > 0
         if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if judged and o.select != "barrier" and not self.hazard.has_formula:
@@ -141,6 +153,8 @@ class Planner(eqx.Module):
             ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
         action = infer_action(self.networks["inverse"], self.normaliser, present, ahead)
         action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
+        if o.shield:
+            action = self.shielded(plan)
         if self.history:
             past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
         return {"past": past, "plan": plan, "age": memory["age"] + 1}, PolicyStep(action, info)
@@ -230,16 +244,48 @@ class Planner(eqx.Module):
         """
         o, now = self.options, self.history
         last = min(now + 1 + o.prefix, x.shape[1])
-        if not o.foresight or "forward" not in self.networks:
-            return x[:, now + 1 : last]
-        state, rows = x[:, now], []
-        for row in range(now + 1, last):
+        return self.tracked(x)[0] if o.foresight else x[:, now + 1 : last]
+
+    def tracked(self, x: Array) -> tuple[Array, Array]:
+        """States (B, P, N, D), actions (B, P, N, A) when inverse dynamics tracks the first P = prefix rows of plans."""
+        now = self.history
+        state, states, actions = x[:, now], [], []
+        for row in range(now + 1, min(now + 1 + self.options.prefix, x.shape[1])):
             action = infer_action(self.networks["inverse"], self.normaliser, state, x[:, row])
-            action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
-            state = foresee(self.networks["forward"], self.normaliser, state, action)
-            state = self.agreed(jnp.concatenate([x[:, : now + 1], state[:, None]], 1))[:, -1]
-            rows.append(state)
-        return jnp.stack(rows, 1)
+            actions.append(jnp.clip(action, self.spec.action_low, self.spec.action_high))
+            state = self.foreseen_step(x[:, : now + 1], state, actions[-1])
+            states.append(state)
+        return jnp.stack(states, 1), jnp.stack(actions, 1)
+
+    def foreseen_step(self, known: Array, state: Array, action: Array) -> Array:
+        """Where actions (B, N, A) lead from states (B, N, D), all agents agreeing; `known` (B, now+1, N, D) before."""
+        state = foresee(self.networks["forward"], self.normaliser, state, action)
+        return self.agreed(jnp.concatenate([known, state[:, None]], 1))[:, -1]
+
+    def shielded(self, plan: Array) -> Array:
+        """Joint action (B, N, A) of the plan (B, rows, N, D), corrected until its foreseen rows keep the margin.
+
+        Polyak's steps on the shortfall f(a) = Σ min(safety − margin, 0) over agents and rows, whose goal is 0:
+        a ← a − f ∇f / ‖∇f‖², within the action bounds. Where nothing falls short the plan's own action is kept.
+        """
+        o, known = self.options, plan[:, : self.history + 1]
+        _, actions = self.tracked(plan)
+
+        def shortfall(actions: Array) -> Array:
+            state, rows = known[:, -1], []
+            for p in range(actions.shape[1]):
+                state = self.foreseen_step(known, state, actions[:, p])
+                rows.append(state)
+            return jnp.minimum(self.safety(jnp.stack(rows, 1)) - o.margin, 0.0).sum((1, 2))
+
+        def correct(actions: Array, _) -> tuple[Array, None]:
+            f, back = jax.vjp(shortfall, actions)
+            slope = back(jnp.ones_like(f))[0]
+            size = jnp.maximum((slope**2).sum((1, 2, 3)), 1e-6)
+            moved = actions - (f / size)[:, None, None, None] * slope
+            return jnp.clip(moved, self.spec.action_low, self.spec.action_high), None
+
+        return jax.lax.scan(correct, actions, length=o.shield)[0][:, 0]
 
     def safety(self, rows: Array) -> Array:
         """(..., N) the configured safety score of states (..., N, D): clearance, barrier or the least of both."""
@@ -248,7 +294,7 @@ class Planner(eqx.Module):
             scores.append(self.hazard.clearance(rows))
         if self.options.select in ("barrier", "both"):
             scores.append(barrier_on(self.networks["barrier"], self.normaliser, rows))
-        return jnp.stack(scores).min(0)
+        return least(scores)
 
     def judge(self, x: Array) -> tuple[Array, Array]:
         """Plans (B, P, rows, N, D) -> safety (B, P, N), the least over the judged rows, and value (B, P).

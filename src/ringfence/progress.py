@@ -9,7 +9,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Rich
 
-SHOWN = ("loss/denoising", "loss/shaping", "barrier/data_accuracy_safe", "barrier/data_accuracy_unsafe", "loss/cloning")
+SHOWN = (
+    "loss/denoising",
+    "loss/shaping",
+    "barrier/data_accuracy_safe",
+    "barrier/data_accuracy_unsafe",
+    "loss/cloning",
+    "loss/critic",
+    "loss/actor",
+    "value",
+)
 
 
 class Progress:

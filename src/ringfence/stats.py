@@ -1,9 +1,19 @@
-"""Statistics that a table is believed by: exact bounds for violations, intervals for means, tail risk."""
+"""Statistics that a table is believed by: exact bounds for violations, intervals for means, tail risk, comparisons.
+
+Aggregates over tasks follow Agarwal et al. 2021 ("Deep reinforcement learning at the edge of the statistical
+precipice"): a matrix of scores (R runs, M tasks), whose intervals resample runs within every task.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from scipy import stats
+
+from ringfence.errors import UserError
+
+BLOCK = 4_000_000  # numbers drawn at once
 
 
 def clopper_pearson(violations: int, episodes: int, level: float = 0.95) -> tuple[float, float]:
@@ -29,13 +39,123 @@ def bootstrap_mean(
     groups = [x] if strata is None else [x[strata == s] for s in np.unique(strata)]
     total = np.zeros(draws)
     for g in groups:
-        total += g[rng.integers(0, len(g), (draws, len(g)))].sum(1)
-    tail = (1 - level) / 2 * 100
-    low, high = np.percentile(total / len(x), [tail, 100 - tail])
-    return float(low), float(high)
+        block = max(1, BLOCK // len(g))  # 2000 draws of 40 000 episodes at once would take more than a gigabyte
+        for first in range(0, draws, block):
+            part = slice(first, min(first + block, draws))
+            total[part] += g[rng.integers(0, len(g), (part.stop - part.start, len(g)))].sum(1)
+    return _percentiles(total / len(x), level)
 
 
 def cvar(x: np.ndarray, share: float = 0.1) -> float:
     """Mean of the worst (largest) `share` of x: conditional value at risk."""
     x = np.sort(np.asarray(x, np.float64))[::-1]
     return float(x[: max(1, int(np.ceil(share * len(x))))].mean())
+
+
+def iqm(scores: np.ndarray) -> np.ndarray:
+    """Interquartile mean of (..., R, M) scores: the mean of the middle half of all R·M of them."""
+    x = np.asarray(scores, np.float64)
+    return stats.trim_mean(x.reshape(*x.shape[:-2], -1), 0.25, axis=-1)
+
+
+def optimality_gap(scores: np.ndarray, target: float = 1.0) -> np.ndarray:
+    """How far (..., R, M) scores fall short of `target` on average; what exceeds it does not count."""
+    return target - np.minimum(np.asarray(scores, np.float64), target).mean((-2, -1))
+
+
+def stratified_bootstrap(
+    scores: np.ndarray,
+    statistic: Callable[[np.ndarray], np.ndarray],
+    level: float = 0.95,
+    draws: int = 2000,
+    seed: int = 0,
+) -> tuple[float | np.ndarray, float | np.ndarray]:
+    """Percentile interval of statistic(scores) for (R, M) scores; runs are resampled within every task.
+
+    `statistic` maps (draws, R, M) to (draws, ...), e.g. `iqm`.
+    """
+    x = _matrix(scores)
+    parts = [statistic(part) for part in _resamples(x, draws, np.random.default_rng(seed))]
+    return _percentiles(np.concatenate(parts), level)
+
+
+def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
+    """Mean over tasks of P(X > Y) + P(X = Y)/2 for a run of X (R, M) and one of Y (R', M)."""
+    x, y = _matrix(x), _matrix(y)
+    if x.shape[1] != y.shape[1]:
+        raise UserError(f"The two have {x.shape[1]} and {y.shape[1]} tasks; compare them on the same tasks.")
+    return float(_improvement(x[None], y[None])[0])
+
+
+def improvement_interval(
+    x: np.ndarray, y: np.ndarray, level: float = 0.95, draws: int = 2000, seed: int = 0
+) -> tuple[float, float]:
+    """Stratified bootstrap interval of `probability_of_improvement`; both sides are resampled."""
+    probability_of_improvement(x, y)
+    rng = np.random.default_rng(seed)
+    x, y = _matrix(x), _matrix(y)
+    pairs = zip(_resamples(x, draws, rng, 200), _resamples(y, draws, rng, 200))
+    return _percentiles(np.concatenate([_improvement(a, b) for a, b in pairs]), level)
+
+
+def profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """(..., T) share of (..., R, M) scores above each threshold: a performance profile."""
+    x = np.asarray(scores, np.float64)
+    return np.stack([(x > t).mean((-2, -1)) for t in np.asarray(thresholds)], -1)
+
+
+def cost_profile(costs: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
+    """(T,) share of episodes whose cost is at most each threshold."""
+    x = np.asarray(costs, np.float64).ravel()
+    return np.array([(x <= t).mean() for t in np.asarray(thresholds)])
+
+
+def paired_test(x: np.ndarray, y: np.ndarray) -> dict[str, float | tuple[float, float]]:
+    """x against y on the same resets: mean difference, its bootstrap interval, Wilcoxon's signed-rank p-value."""
+    difference = np.asarray(x, np.float64) - np.asarray(y, np.float64)
+    p = 1.0 if not difference.any() else float(stats.wilcoxon(difference).pvalue)
+    return {"difference": float(difference.mean()), "interval": bootstrap_mean(difference), "p": p}
+
+
+def holm(p_values: np.ndarray) -> np.ndarray:
+    """Holm's step-down adjustment: p-values of a family of tests, in the input's order."""
+    p = np.asarray(p_values, np.float64)
+    order = np.argsort(p, kind="stable")
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
+    return adjusted
+
+
+def rank(returns: np.ndarray, costs: np.ndarray, limit: float) -> np.ndarray:
+    """Order of entries, best first: those whose cost is within the limit by higher return, then the rest by lower
+    cost. Pass the upper ends of the costs' intervals to demand more than a point estimate."""
+    returns, costs = np.asarray(returns, np.float64), np.asarray(costs, np.float64)
+    safe = costs <= limit
+    return np.lexsort((np.where(safe, -returns, costs), ~safe))
+
+
+def _matrix(scores: np.ndarray) -> np.ndarray:
+    x = np.asarray(scores, np.float64)
+    if x.ndim != 2 or not x.size:
+        raise UserError(f"Scores of shape {x.shape} are not a table; pass (runs, tasks).")
+    return x
+
+
+def _resamples(x: np.ndarray, draws: int, rng: np.random.Generator, block: int = 0) -> Iterator[np.ndarray]:
+    """Resampled copies (block, R, M), `draws` in all."""
+    block = block or max(1, BLOCK // x.size)
+    for first in range(0, draws, block):
+        rows = rng.integers(0, len(x), (min(block, draws - first), *x.shape))
+        yield np.take_along_axis(x[None], rows, 1)
+
+
+def _improvement(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(draws,) of (draws, R, M) and (draws, R', M)."""
+    a, b = x[:, :, None], y[:, None]
+    return ((a > b) + 0.5 * (a == b)).mean((1, 2, 3))
+
+
+def _percentiles(x: np.ndarray, level: float):
+    tail = (1 - level) / 2 * 100
+    low, high = np.percentile(x, [tail, 100 - tail], axis=0)
+    return (float(low), float(high)) if np.ndim(low) == 0 else (low, high)

@@ -85,15 +85,20 @@ def train(
     tensorboard: bool = False,
     quiet: bool = False,
     on_chunk: Callable[[int, dict], None] | None = None,
+    on_finish: Callable[[Run], None] | None = None,
+    folder: Callable[[int], Path] | None = None,
 ) -> list[Run]:
     """Train `algorithm` on `data` for every seed; returns one finished run folder per seed.
 
     A folder that exists is resumed from its last checkpoint if it holds the same job, and refused otherwise.
     `together` trains all seeds in one program (same results up to rounding; faster only where the networks are too
-    small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default.
+    small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default;
+    `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
+    of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
     job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
-    runs = [_prepare(Run(folder_of(out, job, seed)), job, seed, data) for seed in seeds]
+    place = folder or (lambda seed: folder_of(out, job, seed))
+    runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     windows = _windows(
         data,
         job.task,
@@ -109,10 +114,15 @@ def train(
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
     if together:
         _loop(job, windows, runs, seeds, options)
+        for run in runs:
+            if on_finish:
+                on_finish(run)
     else:
         program = None
         for run, seed in zip(runs, seeds):
             program = _loop(job, windows, [run], [seed], options, program)
+            if on_finish:
+                on_finish(run)
     return runs
 
 

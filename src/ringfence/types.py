@@ -74,6 +74,8 @@ class Batch(NamedTuple):
     valid: Array  # (B, H) bool: the row is a real state of the episode
     score: Array  # (B,) normal score of the window's value among the data: the condition y
     costs: Array  # (B, H) cost charged on arriving in the row
+    rewards: Array  # (B, H-1, N) of the step between rows h and h+1 (0 where padded)
+    terminated: Array  # (B, H-1) bool: that step ended the task itself
 
 
 class PolicyStep(NamedTuple):

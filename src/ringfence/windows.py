@@ -65,6 +65,8 @@ class WindowData:
         self.arrays = {
             "features": x,  # (M, N, D)
             "actions": jnp.asarray(store.actions),  # (T, N, A)
+            "rewards": jnp.asarray(store.rewards),  # (T, N)
+            "terminated": jnp.asarray(store.terminated),  # (T,)
             "scores": jnp.asarray(scores, jnp.float32),  # (T,)
             "costs": jnp.asarray(np.insert(store.costs, starts, 0.0), jnp.float32),  # (M,) charged on arriving
             "row": jnp.asarray(row, jnp.int32),  # (T,) row of the state before the step
@@ -95,6 +97,8 @@ def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) ->
         valid=valid,
         score=arrays["scores"][step],
         costs=arrays["costs"][row],
+        rewards=jnp.where(acted[..., None], arrays["rewards"][after], 0.0),
+        terminated=acted & arrays["terminated"][after],
     )
 
 

@@ -96,6 +96,7 @@ DYNAMICS_STEPS = 3  # steps of every window that inverse and forward dynamics le
 
 PRESETS: dict[str, dict] = {
     "split": {},
+    "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "paper": {
         "condition": "return",
         "routing": "paper",
@@ -399,9 +400,7 @@ def barrier_losses(
         loss_omega = jnp.zeros(())
     else:
         slow = jax.lax.stop_gradient(average)
-        loss_theta = cbf.shaping(
-            barrier_on(slow, norm, x), rows, ret, eta, config.delta, config.scaled_margin, weight
-        )
+        loss_theta = cbf.shaping(barrier_on(slow, norm, x), rows, ret, eta, config.delta, config.scaled_margin, weight)
     m = config.barrier_batch
     data_x, data_rows = batch.features[:m, now:], batch.valid[:m, now:, None]
     unsafe, safe = hazard.labels(data_x, batch.costs[:m, now:])

@@ -66,4 +66,3 @@ def make(
         },
     )
     return store, store.save(path)
-

@@ -1,0 +1,225 @@
+"""OMAR: conservative critics and actors rectified by zeroth-order search (Pan et al. 2022), and its corner MA-CQL.
+
+    L_Q = Σ_heads E (Q_i(s̃, a) − (r_i + γ min_heads Q̄_i(s̃', π̄_i(s̃'))))²  +  α_CQL E [ lse_a Q_i(s̃, a) − Q_i(s̃, a_data) ]
+    L_π = c E ‖π_i(s̃) − â_i‖² − (1 − c) E Q_i(s̃, π_i(s̃)) + 10⁻³ E π²
+
+â_i is the best action, by Q_i, that a search over samples finds, or the actor's own one where that is better. `ma-cql`
+is c = 0. Coefficients are per data set; presets carry those of the study.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from ringfence import features
+from ringfence.algos import actor_critic as ac
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard
+from ringfence.optim import Optimiser
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.windows import WindowData
+
+
+@dataclass(frozen=True)
+class Config:
+    """Defaults: the study's setting for Simple Spread (expert, medium)."""
+
+    view: features.View = "decentralized"  # what an agent sees: its own observation
+    horizon: int = 2  # rows of a window: now and next
+    history: int = 0  # rows of the past; none is read
+    coefficient: float = 1.0  # c, weight of the searched action; 0: policy gradient alone, MA-CQL
+    search: Literal["softmax", "elites"] = "softmax"  # softmax-weighted refit (MPE), or cross-entropy with elites
+    search_iterations: int = 3  # rounds of the search
+    search_samples: int = 10  # actions per round
+    search_deviation: float = 2.0  # of the first round, around 0
+    elites: int = 5  # kept from round to round, and refitted to
+    cql_weight: float = 5.0  # α of the conservative term
+    cql_actions: Literal["uniform", "policy"] = "uniform"  # policy adds the actors' actions here and ahead
+    cql_samples: int = 10  # actions per state of each kind
+    cql_noise: float = 0.2  # deviation of the noise on the actors' actions
+    discount: float = 0.95  # γ
+    target_rate: float = 0.01  # τ
+    action_penalty: float = 1e-3  # weight of E π²
+    width: int = 64  # units of both hidden layers
+    steps: int = 2_000  # updates
+    batch: int = 1024  # transitions per update
+    lr: float = 0.01  # Adam, constant
+    grad_clip: float = 0.5  # global norm, per network
+
+
+def check(config: Config, hazard: BoundHazard) -> None:
+    """Refuse settings that cannot work, before anything is computed."""
+    if config.history or config.horizon != 2:
+        raise UserError("omar learns from single transitions; leave history=0 and horizon=2.")
+    if not 0.0 <= config.coefficient <= 1.0:
+        raise UserError(f"coefficient={config.coefficient} must lie between 0 (MA-CQL) and 1 (search alone).")
+    if config.search == "elites" and not 0 < config.elites <= config.search_samples:
+        raise UserError(f"elites={config.elites} must be 1 to {config.search_samples}, the samples of a round.")
+
+
+def optimiser(config: Config) -> Optimiser:
+    return Optimiser(config.lr, 0, config.steps, config.grad_clip, floor=1.0)
+
+
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+) -> PyTree:
+    """Actors, twin critics, their targets, optimiser state and the normaliser."""
+    ka, kq, kw = jax.random.split(key, 3)
+    sizes = (spec.n_agents, 2, spec.feature_dim, spec.action_dim, config.width)
+
+    def networks() -> dict:
+        return {"actor": ac.make_actor(ka, spec, config.width), "critic": ac.Critics(kq, *sizes)}
+
+    return ac.start(networks, ("actor", "critic"), optimiser(config), {"normaliser": ac.fit_states(data, spec, kw)})
+
+
+def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Config, spec: Spec) -> Array:
+    """â (B, N, A): the best action by the first head among the search's last best and the actor's own.
+
+    x (B, N, D), own (B, N, A), standard normal noise (B, N, iterations, S, A).
+    """
+    first = critic.first(spec.n_agents)
+    low, high = spec.action_low, spec.action_high
+
+    def value(actions: Array) -> Array:
+        return jnp.moveaxis(first(x, actions)[:, 0], 0, 1)  # (B, N, S)
+
+    mean, deviation, elites = jnp.zeros(own.shape), jnp.full(own.shape, config.search_deviation), None
+    for i in range(config.search_iterations):
+        actions = jnp.clip(mean[:, :, None] + deviation[:, :, None] * noise[:, :, i], low, high)
+        if elites is not None:
+            actions = jnp.concatenate([actions, elites], 2)
+        q = value(actions)
+        if config.search == "softmax":
+            mean = (jax.nn.softmax(q, -1)[..., None] * actions).sum(2)
+            # The study spreads around the weighted mean with equal weights.
+            deviation = jnp.sqrt(((actions - mean[:, :, None]) ** 2).mean(2))
+        else:
+            best = jax.lax.top_k(q, config.elites)[1]
+            elites = jnp.take_along_axis(actions, best[..., None], 2)
+            mean, deviation = elites.mean(2), elites.std(2, ddof=1)
+    top = jnp.take_along_axis(actions, q.argmax(-1)[..., None, None], 2)[:, :, 0]
+    rival = value(own[:, :, None])[..., 0]
+    return jnp.where((q.max(-1) > rival)[..., None], top, own)
+
+
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
+    """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
+    opt = optimiser(config)
+    low, high = spec.action_low, spec.action_high
+    uniform_density = -spec.action_dim * jnp.log(high - low)
+
+    def noisy(key: Key, action: Array) -> tuple[Array, Array]:
+        """Samples (B, N, S, A) around the actors' actions, and their log densities (B, N, S)."""
+        shape = (*action.shape[:2], config.cql_samples, action.shape[-1])
+        noise = config.cql_noise * jax.random.normal(key, shape)
+        density = -0.5 * (noise / config.cql_noise) ** 2 - jnp.log(config.cql_noise) - 0.5 * jnp.log(2 * jnp.pi)
+        return jnp.clip(action[:, :, None] + noise, low, high), density.sum(-1)
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        ku, kp, kn, ks = jax.random.split(key, 4)
+        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        params, target = state["params"], state["target"]
+        goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
+            t.ahead, ac.act(target["actor"], t.ahead, spec)
+        ).min(1)
+        b, n, a = t.action.shape
+        drawn = jax.random.uniform(ku, (b, n, config.cql_samples, a), minval=low, maxval=high)
+        densities = jnp.full((b, n, config.cql_samples), uniform_density)
+        if config.cql_actions == "policy":
+            here, d_here = noisy(kp, ac.act(params["actor"], t.x, spec))
+            ahead, d_ahead = noisy(kn, ac.act(params["actor"], t.ahead, spec))
+            drawn = jnp.concatenate([drawn, here, ahead], 2)
+            densities = jnp.concatenate([densities, d_here, d_ahead], 2)
+        # The logged action rides along as one more sample: the critic is then read once.
+        asked = jnp.concatenate([t.action[:, :, None], drawn], 2)
+        pieces = ac.pieces_of(b)
+
+        def critic_loss(critic, x, asked, goal, densities) -> tuple[Array, Metrics]:
+            q = critic(x, asked)  # (N, 2, B, 1 + S)
+            logged, others = q[..., 0], q[..., 1:] - jnp.moveaxis(densities, 0, 1)[:, None]
+            error = ((logged - goal.T[:, None]) ** 2).mean(2).sum()
+            conservative = (jax.nn.logsumexp(others, -1) - logged).mean(2).sum()
+            loss = error + config.cql_weight * conservative
+            return loss, {"loss/critic": error, "loss/conservative": conservative, "value": logged.mean()}
+
+        slope = lambda *part: jax.grad(critic_loss, has_aux=True)(params["critic"], *part)  # noqa: E731
+        parts = ac.in_pieces(slope, pieces, t.x, asked, goal.T, densities)
+        grads, metrics = jax.tree.map(lambda g: g.mean(0), parts)
+        critics, moments, norms = opt.update({"critic": grads}, state["opt"], {"critic": params["critic"]})
+        critic, searched = critics["critic"], None
+        if config.coefficient > 0:
+            own = ac.act(params["actor"], t.x, spec)
+            noise = jax.random.normal(ks, (b, n, config.search_iterations, config.search_samples, a))
+            look = lambda *part: rectified(critic, *part, config, spec)  # noqa: E731
+            searched = ac.in_pieces(look, pieces, t.x, own, noise).reshape(own.shape)
+
+        def actor_loss(actor) -> tuple[Array, Metrics]:
+            own = ac.act(actor, t.x, spec)
+            loss = config.action_penalty * (own**2).mean((0, 2)).sum()
+            if config.coefficient > 0:
+                loss = loss + config.coefficient * ((own - searched) ** 2).mean((0, 2)).sum()
+            if config.coefficient < 1:
+                q = critic.first(spec.n_agents)(t.x, own)[:, 0]
+                loss = loss - (1.0 - config.coefficient) * q.mean(1).sum()
+            return loss, {"loss/actor": loss, "imitation_gap": ((own - t.action) ** 2).mean()}
+
+        slope, more = jax.grad(actor_loss, has_aux=True)(params["actor"])
+        actor, actor_moments, actor_norms = opt.update({"actor": slope}, state["opt"], {"actor": params["actor"]})
+        new = {**actor, **critics}
+        state = {
+            **state,
+            "params": new,
+            "target": ac.soft_update(target, new, config.target_rate),
+            "opt": {**actor_moments, **moments},
+            "step": state["step"] + 1,
+        }
+        return state, metrics | more | norms | actor_norms
+
+    return update
+
+
+# Coefficients of the study's released settings for Simple Spread; it trains three times as long on random.
+_TIERS = {
+    "expert": {"cql_weight": 5.0},
+    "medium": {"cql_weight": 5.0},
+    "medium-replay": {"cql_weight": 1.0},
+    "random": {"cql_weight": 0.5, "steps": 6_000},
+}
+OMAR = Algorithm(
+    "omar",
+    Config,
+    check,
+    init,
+    make_update,
+    ac.no_diagnosis,
+    ac.make_policy,
+    {
+        "default": {},
+        **_TIERS,
+        "mujoco": {
+            "search": "elites",
+            "search_iterations": 2,
+            "search_samples": 20,
+            "cql_actions": "policy",
+            "width": 256,
+            "batch": 256,
+            "lr": 3e-4,
+            "target_rate": 0.005,
+            "steps": 100_000,
+        },
+    },
+)
+MA_CQL = replace(
+    OMAR, name="ma-cql", presets={name: {"coefficient": 0.0, **p} for name, p in {"default": {}, **_TIERS}.items()}
+)

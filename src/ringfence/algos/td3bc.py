@@ -1,0 +1,180 @@
+"""MA-TD3BC: TD3 per agent whose actors also imitate (Fujimoto & Gu 2021), and its safe version with a cost critic.
+
+    L_Q  = Σ_heads E (Q_i(s̃, a) − (r_i + γ min_heads Q̄_i(s̃', π̄_i(s̃'))))²
+    L_π  = E −w Q_i(s̃, π_i(s̃)) + ‖π_i(s̃) − a_i‖²,   w = α / E|Q_i|
+
+`ma-td3bc-lag` adds cost critics C_i, which learn the shared cost in the same way, and a multiplier λ ≥ 0:
+
+    L_π  = E −w (Q_i − λ C_i)/(1 + λ) + ‖π_i − a_i‖²,   λ ← [λ + η (E C_i(s̃, π(s̃)) − d)]₊
+
+with d the discounted form of the limit per episode, l (1 − γ^T) / ((1 − γ) T).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+
+from ringfence import features
+from ringfence.algos import actor_critic as ac
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard
+from ringfence.optim import Optimiser
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.windows import WindowData
+
+
+@dataclass(frozen=True)
+class Config:
+    """The learner of OMAR's study (networks, γ, τ, rates) with TD3+BC's actor."""
+
+    view: features.View = "decentralized"  # what an agent sees: its own observation
+    horizon: int = 2  # rows of a window: now and next
+    history: int = 0  # rows of the past; none is read
+    centralised_critic: bool = False  # critics read everybody's observations and actions
+    alpha: float = 2.5  # α, weight of Q against imitation (TD3+BC)
+    discount: float = 0.95  # γ
+    target_rate: float = 0.01  # τ
+    target_noise: float = 0.0  # deviation of the noise on target actions; TD3 has 0.2, OMAR's study none
+    target_noise_clip: float = 0.5  # bound on that noise
+    delay: int = 1  # actors and targets move every so many updates; TD3 has 2, OMAR's study 1
+    action_penalty: float = 1e-3  # weight of E π²
+    width: int = 64  # units of both hidden layers
+    lagrange: bool = False  # learn cost critics and a multiplier
+    limit: float = 1.0  # l, cost per episode that the multiplier allows
+    multiplier_rate: float = 0.01  # η
+    multiplier_max: float = 100.0  # bound on λ
+    steps: int = 2_000  # updates
+    batch: int = 1024  # transitions per update
+    lr: float = 0.01  # Adam, constant
+    grad_clip: float = 0.5  # global norm, per network
+
+
+def check(config: Config, hazard: BoundHazard) -> None:
+    """Refuse settings that cannot work, before anything is computed."""
+    if config.history or config.horizon != 2:
+        raise UserError("ma-td3bc learns from single transitions; leave history=0 and horizon=2.")
+    if config.delay < 1:
+        raise UserError(f"delay={config.delay} must be at least 1.")
+    if config.limit < 0:
+        raise UserError(f"limit={config.limit} must not be negative; it is a cost per episode.")
+
+
+def optimiser(config: Config) -> Optimiser:
+    return Optimiser(config.lr, 0, config.steps, config.grad_clip, floor=1.0)
+
+
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+) -> PyTree:
+    """Actors, twin critics, their targets, optimiser state and the normaliser."""
+    ka, kq, kc, kw = jax.random.split(key, 4)
+    n, d, a = spec.n_agents, spec.feature_dim, spec.action_dim
+    sizes = (n, 2, n * d, n * a) if config.centralised_critic else (n, 2, d, a)
+
+    def networks() -> dict:
+        params = {"actor": ac.make_actor(ka, spec, config.width), "critic": ac.Critics(kq, *sizes, config.width)}
+        if config.lagrange:
+            params["cost"] = ac.Critics(kc, *sizes, config.width)
+        return params
+
+    targets = ("actor", "critic", "cost") if config.lagrange else ("actor", "critic")
+    state = ac.start(networks, targets, optimiser(config), {"normaliser": ac.fit_states(data, spec, kw)})
+    return state | {"multiplier": jnp.zeros(spec.n_agents)}
+
+
+def threshold(config: Config, spec: Spec) -> float:
+    """d: what a discounted cost value may be if `limit` is spread evenly over an episode."""
+    g, t = config.discount, spec.episode_length
+    return config.limit * (1 - g**t) / ((1 - g) * t)
+
+
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
+    """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
+    opt, allowed = optimiser(config), threshold(config, spec)
+
+    def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
+        return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        params, target = state["params"], state["target"]
+        next_action = ac.act(target["actor"], t.ahead, spec)
+        if config.target_noise > 0:
+            bound = config.target_noise_clip
+            noise = jnp.clip(config.target_noise * jax.random.normal(key, next_action.shape), -bound, bound)
+            next_action = jnp.clip(next_action + noise, spec.action_low, spec.action_high)
+        here, there = critic_inputs(t.x, t.action), critic_inputs(t.ahead, next_action)
+        goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](*there).min(1)
+
+        def critic_loss(p: PyTree) -> tuple[Array, Metrics]:
+            error = ((p["critic"](*here) - goal[:, None]) ** 2).mean(2).sum()
+            metrics = {"loss/critic": error}
+            if config.lagrange:
+                cost = batch.costs[:, 1][None] + config.discount * t.bootstrap.T * target["cost"](*there).max(1)
+                metrics["loss/cost"] = ((p["cost"](*here) - cost[:, None]) ** 2).mean(2).sum()
+            return sum(metrics.values()), metrics
+
+        critics = {k: v for k, v in params.items() if k != "actor"}
+        grads, metrics = jax.grad(critic_loss, has_aux=True)(critics)
+        critics, moments, norms = opt.update(grads, state["opt"], critics)
+        scale = state["multiplier"]
+
+        def actor_loss(actor) -> tuple[Array, tuple[Metrics, Array]]:
+            own = ac.act(actor, t.x, spec)
+            x = t.x
+            if config.centralised_critic:
+                x, acted = ac.joint(t.x), ac.joint_actions(t.action, own)
+            else:
+                acted = own
+            q = critics["critic"].first(spec.n_agents)(x, acted)[:, 0]  # (N, B)
+            weight = config.alpha / jax.lax.stop_gradient(jnp.abs(q).mean(1, keepdims=True))
+            merit, excess = q, jnp.zeros(spec.n_agents)
+            if config.lagrange:
+                c = jnp.maximum(*jnp.moveaxis(critics["cost"](x, acted), 1, 0))
+                merit = (q - scale[:, None] * c) / (1.0 + scale[:, None])
+                excess = c.mean(1) - allowed
+            imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
+            penalty = (own**2).mean((0, 2)).sum()
+            loss = imitation - (weight * merit).mean(1).sum() + config.action_penalty * penalty
+            return loss, ({"loss/actor": loss, "loss/cloning": imitation, "value": q.mean()}, excess)
+
+        slope, (more, excess) = jax.grad(actor_loss, has_aux=True)(params["actor"])
+        actor, actor_moments, actor_norms = opt.update({"actor": slope}, state["opt"], {"actor": params["actor"]})
+        new = {"actor": actor["actor"], **critics}
+        moved = ac.soft_update(target, {k: new[k] for k in target}, config.target_rate)
+        opts = {"actor": actor_moments["actor"], **moments}
+        if config.delay > 1:  # in between, actors and targets stay where they are
+            go = state["step"] % config.delay == 0
+            keep = lambda a, b: jax.tree.map(lambda x, y: jnp.where(go, x, y), a, b)  # noqa: E731
+            new["actor"], moved = keep(new["actor"], params["actor"]), keep(moved, target)
+            opts["actor"] = keep(opts["actor"], state["opt"]["actor"])
+        if config.lagrange:
+            scale = jnp.clip(scale + config.multiplier_rate * excess, 0.0, config.multiplier_max)
+            more |= {"multiplier": scale.mean(), "cost_value": (excess + allowed).mean()}
+        state = {**state, "params": new, "target": moved, "opt": opts, "step": state["step"] + 1, "multiplier": scale}
+        return state, metrics | more | norms | actor_norms
+
+    return update
+
+
+MA_TD3BC = Algorithm(
+    "ma-td3bc",
+    Config,
+    check,
+    init,
+    make_update,
+    ac.no_diagnosis,
+    ac.make_policy,
+    {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}},
+)
+MA_TD3BC_LAG = replace(
+    MA_TD3BC, name="ma-td3bc-lag", presets={"default": {"lagrange": True}, "random": {"lagrange": True, "steps": 6_000}}
+)

@@ -1,0 +1,263 @@
+"""Cells of a grid: content-addressed run folders that are made once, resumed when cut short, and never made twice.
+
+DIR/bench.json                                      suite, protocol and the number of episodes
+DIR/reference/<task>/reference.json                 do-nothing, random actions, the data itself
+DIR/cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   a run folder (runs.py), and status.json
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+import traceback
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
+from ringfence.bench.suites import EVALUATIONS, SUITES, Entry, Suite
+from ringfence.data.make import make
+from ringfence.errors import UserError, unknown
+from ringfence.policies import PLANNERS, PlanOptions
+from ringfence.runs import Run, build_config, read_json, write_json
+
+FORMAT = 1  # of a results folder
+STATES = ("done", "failed", "to do")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training run and its evaluations; all that must be known to make it anywhere."""
+
+    task: str
+    algorithm: str
+    preset: str
+    seed: int
+    changes: tuple[tuple[str, float], ...] = ()  # to the preset, e.g. (("steps", 100),)
+    evaluations: tuple[tuple[str, str], ...] = ()  # (variant in results.json, name in EVALUATIONS)
+    transitions: int | None = None  # of the data set; None: the task's own number
+
+    @property
+    def group(self) -> tuple:
+        """Cells of one group differ in their seed alone: they share data, critic and compiled programs."""
+        return self.task, self.algorithm, self.preset
+
+    @property
+    def id(self) -> str:
+        """Hash of all that training depends on; how the run is played does not count."""
+        task, algorithm = tasks.get(self.task), algos.get(self.algorithm)
+        config = build_config(
+            algorithm.Config, {**algorithm.presets[self.preset], **dict(self.changes)}, self.algorithm
+        )
+        content = {
+            "format": FORMAT,
+            "data": [__version__, self.task, self.transitions or task.transitions, hazards.to_dict(task.hazard)],
+            "algorithm": self.algorithm,
+            "config": dataclasses.asdict(config),
+            "seed": self.seed,
+        }
+        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
+
+    def folder(self, out: Path) -> Path:
+        name = self.algorithm if self.preset == "default" else f"{self.algorithm}-{self.preset}"
+        return out / "cells" / self.task / name / f"seed-{self.seed}-{self.id}"
+
+    def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
+        """Evaluations that the folder does not hold yet."""
+        known = Run(self.folder(out)).results
+
+        def there(variant: str, name: str) -> bool:
+            r = known.get(variant, {})
+            same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
+            return same and (not r["options"] or same_options(r["options"], EVALUATIONS[name]))
+
+        return [e for e in self.evaluations if not there(*e)]
+
+    def state(self, out: Path, episodes: int) -> str:
+        """done, failed or to do."""
+        if not self.missing(out, episodes):
+            return "done"
+        return "failed" if self.status(out).get("state") == "failed" else "to do"
+
+    def status(self, out: Path) -> dict:
+        file = self.folder(out) / "status.json"
+        return read_json(file, "is damaged; delete it") if file.exists() else {}
+
+
+def same_options(stored: dict, evaluation: dict) -> bool:
+    """Whether a result was played with the planner options that an evaluation's name stands for today."""
+    told = {k: v for k, v in evaluation.items() if k != "planner"}
+    wanted = PlanOptions(**{**PLANNERS[evaluation.get("planner", "plain")], **told})
+    plain = dataclasses.asdict(PlanOptions())  # an option that is newer than the result had its default then
+    return {**plain, **stored} == dataclasses.asdict(wanted)
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The cells of one results folder."""
+
+    out: Path
+    suite: str
+    cells: tuple[Cell, ...]
+    episodes: int = 200
+
+    def count(self) -> dict[str, int]:
+        """How many cells are done, failed and to do."""
+        states = [c.state(self.out, self.episodes) for c in self.cells]
+        return {s: states.count(s) for s in STATES}
+
+    def groups(self) -> list[list[Cell]]:
+        """Unfinished cells by group, in the grid's order; failed ones are tried again."""
+        left: dict[tuple, list[Cell]] = {}
+        for cell in self.cells:
+            if cell.missing(self.out, self.episodes):
+                left.setdefault(cell.group, []).append(cell)
+        return list(left.values())
+
+    def open(self) -> None:
+        """Make the folder, or check that it holds results of this suite and protocol."""
+        mine = about(self.suite, self.episodes)
+        file = self.out / "bench.json"
+        if not file.exists():
+            if self.out.exists() and any(self.out.iterdir()):
+                raise UserError(f"'{self.out}' holds something else; give --out an empty or a results folder.")
+            write_json(file, mine)
+        there = read_about(self.out)
+        wrong = [k for k in mine if there.get(k) != mine[k]]
+        if wrong:
+            raise UserError(
+                f"'{file}' has {wrong[0]}={there.get(wrong[0])!r}, this grid {mine[wrong[0]]!r}; give another --out."
+            )
+
+
+def about(suite: str, episodes: int) -> dict:
+    """Contents of bench.json."""
+    return {"format": FORMAT, "protocol": evaluate.PROTOCOL, "suite": suite, "episodes": episodes, "split": "test"}
+
+
+def read_about(out: Path) -> dict:
+    """bench.json of a results folder of this version."""
+    there = read_json(out / "bench.json", "is no results folder; give the --out of `ringfence bench`")
+    if there.get("format") != FORMAT:
+        raise UserError(
+            f"'{out}' has format {there.get('format')}, this version reads {FORMAT}; run `ringfence bench` again."
+        )
+    return there
+
+
+def statuses(out: str | Path) -> list[dict]:
+    """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way."""
+    read_about(Path(out))
+    found = []
+    for folder in sorted(f.parent for f in (Path(out) / "cells").glob("*/*/*/config.json")):
+        file = folder / "status.json"
+        told = read_json(file, "is damaged; delete it") if file.exists() else {"state": "under way"}
+        task, algorithm, seed = folder.parts[-3:]
+        found.append({**told, "task": task, "run": f"{algorithm}/{seed}"})
+    return found
+
+
+def make_grid(
+    suite: str,
+    out: str | Path,
+    *,
+    seeds: int = 5,
+    episodes: int = 200,
+    only_tasks: Iterable[str] = (),
+    only: Iterable[str] = (),
+    steps: int | None = None,
+    transitions: int | None = None,
+) -> Grid:
+    """The grid of a suite, or of the named tasks and entries (`algorithm` or `algorithm:preset`) of it."""
+    if suite not in SUITES:
+        raise unknown("suite", suite, SUITES)
+    if seeds < 1 or episodes < 1:
+        raise UserError(f"seeds={seeds} and episodes={episodes} must be at least 1.")
+    chosen = SUITES[suite]
+    entries = _chosen_entries(chosen, tuple(only))
+    names = tuple(only_tasks) or chosen.tasks
+    for name in names:
+        if name not in chosen.tasks:
+            raise unknown(f"task of the suite {suite}", name, chosen.tasks)
+    changes = () if steps is None else (("steps", steps),)
+    cells = []
+    for name in names:
+        task = tasks.get(name)
+        for e in entries:
+            if e.tiers and task.tier not in e.tiers:
+                continue
+            played = tuple((e.variant(task, v), v) for v in e.evaluations)
+            preset = e.preset_for(task)
+            cells += [Cell(name, e.algorithm, preset, k, changes, played, transitions) for k in range(seeds)]
+    return Grid(Path(out), suite, tuple(cells), episodes)
+
+
+def _chosen_entries(suite: Suite, only: tuple[str, ...]) -> list[Entry]:
+    known = {e.name for e in suite.entries} | {e.algorithm for e in suite.entries}
+    for name in only:
+        if name not in known:
+            raise unknown("entry", name, known)
+    return [e for e in suite.entries if not only or e.name in only or e.algorithm in only]
+
+
+def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, Cell], None]) -> None:
+    """Train and play cells of one group, one after the other; `tell(event, cell)` hears of start, done and failed.
+
+    A cell that fails is recorded and does not stop the others.
+    """
+    left = list(cells)
+    while left:
+        begun = time.perf_counter()
+        current = left[0]
+
+        def finish(run: Run) -> None:
+            nonlocal begun, current
+            trained = time.perf_counter() - begun
+            for variant, name in current.missing(out, episodes):
+                record = 4 if current.seed == 0 else 0
+                found = evaluate.evaluate(run, episodes=episodes, record=record, **EVALUATIONS[name])
+                if found["variant"] != variant:
+                    raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
+            seconds = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
+            _record(current, out, "done", seconds)
+            tell("done", left.pop(0))
+            begun = time.perf_counter()
+            if left:
+                current = left[0]
+                tell("start", current)
+
+        tell("start", current)
+        try:
+            store, _ = make(tasks.get(current.task), current.transitions)
+            training.train(
+                current.algorithm,
+                store,
+                preset=current.preset,
+                seeds=tuple(c.seed for c in left),
+                changes=dict(current.changes),
+                folder={c.seed: c.folder(out) for c in left}.__getitem__,
+                on_finish=finish,
+                quiet=True,
+            )
+        except Exception as error:
+            record_failure(current, out, f"{type(error).__name__}: {error}", traceback.format_exc())
+            tell("failed", left.pop(0))
+
+
+def _record(cell: Cell, out: Path, state: str, more: dict) -> None:
+    attempts = cell.status(out).get("attempts", 0) + 1
+    write_json(cell.folder(out) / "status.json", {"state": state, "attempts": attempts, "id": cell.id, **more})
+
+
+def record_failure(cell: Cell, out: Path, error: str, trace: str = "") -> None:
+    """Say in the cell's folder what went wrong."""
+    _record(cell, out, "failed", {"error": error, "traceback": trace})
+
+
+def make_reference(task: str, out: Path, episodes: int, transitions: int | None = None) -> None:
+    """Reference rows of a task, once."""
+    found = tasks.get(task)
+    store, _ = make(found, transitions)
+    reference.make(found, store, out / "reference", episodes)

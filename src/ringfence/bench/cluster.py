@@ -1,0 +1,87 @@
+"""The Ray engine: the same cells as Ray tasks, for more machines than one; no shared file system is needed.
+
+A task makes its data where it runs, trains in a temporary folder and returns the run folder; the driver puts it in
+place whole. Ray repeats a task whose worker or node died.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+import tarfile
+import tempfile
+from pathlib import Path
+
+from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group
+from ringfence.bench.local import owned
+from ringfence.errors import UserError
+from ringfence.progress import Progress
+
+RETRIES = 3
+
+
+def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: bool = False) -> dict[str, int]:
+    """Make all unfinished cells on a Ray cluster (`auto`, host:port or ray://host:port; None starts a local one)."""
+    ray = connect(address)
+    grid.open()
+
+    @ray.remote(num_cpus=threads, max_retries=RETRIES)
+    def make_cell(cell: Cell, episodes: int) -> bytes:
+        return packed(cell, episodes)
+
+    with owned(grid.out):
+        for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
+            make_reference(name, grid.out, grid.episodes, transitions)
+        cells = [c for group in grid.groups() for c in group]
+        waiting = {make_cell.remote(c, grid.episodes): c for c in cells}
+        with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
+            while waiting:
+                (ready,), _ = ray.wait(list(waiting), num_returns=1)
+                cell = waiting.pop(ready)
+                try:
+                    unpack(ray.get(ready), cell.folder(grid.out))
+                except ray.exceptions.RayError as error:
+                    record_failure(cell, grid.out, f"{type(error).__name__}: {str(error).splitlines()[0]}", str(error))
+                bar.advance(1)
+    return grid.count()
+
+
+def connect(address: str | None):
+    """The ray module, connected; in one sentence why not."""
+    try:
+        import ray
+    except ImportError:
+        raise UserError("The Ray engine needs an extra package; run pip install 'ringfence[ray]'.") from None
+    if ray.is_initialized():
+        return ray
+    os.environ.setdefault("RAY_gcs_rpc_server_reconnect_timeout_s", "10")
+    try:
+        ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+        raise UserError(
+            f"No Ray cluster answers at address '{address}' ({str(error).splitlines()[0]}); start one with `ray start "
+            "--head` or leave --address out."
+        ) from None
+    return ray
+
+
+def packed(cell: Cell, episodes: int) -> bytes:
+    """Make a cell in a temporary folder and return its run folder as a tar file."""
+    with tempfile.TemporaryDirectory() as place:
+        run_group([cell], Path(place), episodes, lambda event, cell: None)
+        buffer = io.BytesIO()
+        with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+            tar.add(cell.folder(Path(place)), arcname=".")
+        return buffer.getvalue()
+
+
+def unpack(packed: bytes, folder: Path) -> None:
+    """Put a returned run folder in place, whole or not at all."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    part = folder.with_name(f".{folder.name}.part")
+    shutil.rmtree(part, ignore_errors=True)
+    with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
+        tar.extractall(part, filter="data")
+    shutil.rmtree(folder, ignore_errors=True)
+    part.replace(folder)

@@ -1,0 +1,222 @@
+"""The local engine: worker processes with cores, threads and memory of their own.
+
+A worker that dies takes one attempt of its cell with it and is replaced; a cell that fails twice that way is recorded
+and left. One runner owns a results folder at a time.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ringfence.bench.cells import Cell, Grid, record_failure
+from ringfence.bench.worker import decode, encode
+from ringfence.errors import UserError
+from ringfence.progress import Progress
+
+DEATHS = 2  # of workers on one cell, after which it is left
+
+
+def run_local(
+    grid: Grid, *, workers: int | None = None, threads: int = 1, memory: float | None = None, quiet: bool = False
+) -> dict[str, int]:
+    """Make all unfinished cells; returns how many are done, failed and to do.
+
+    `workers` processes (default: one per `threads` cores) of `threads` threads each; one that outgrows `memory` GiB
+    is killed and its cell recorded as failed.
+    """
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    workers = workers or max(1, len(cores) // threads)
+    if threads < 1 or workers < 1:
+        raise UserError(f"workers={workers} and threads={threads} must be at least 1.")
+    grid.open()
+    with owned(grid.out) as lock:
+        groups = grid.groups()
+        jobs: queue.Queue[dict] = queue.Queue()
+        for job in _references(grid):
+            jobs.put(job)
+        for group in groups:
+            jobs.put({"cells": [encode(c) for c in group], "out": str(grid.out), "episodes": grid.episodes})
+        total = sum(len(g) for g in groups)
+        with Progress(f"{grid.suite}: cells", total, 0, quiet) as bar:
+            pool = _Pool(grid, jobs, bar, threads, memory, lock)
+            slots = [cores[i * threads : (i + 1) * threads] for i in range(workers)]
+            hands = [threading.Thread(target=pool.serve, args=(slot,), daemon=True) for slot in slots]
+            for hand in hands:
+                hand.start()
+            try:
+                for hand in hands:
+                    while hand.is_alive():
+                        hand.join(0.2)
+            except KeyboardInterrupt:
+                pool.stop()
+                for hand in hands:
+                    hand.join(30)
+                raise
+    return grid.count()
+
+
+def _references(grid: Grid) -> list[dict]:
+    tasks = {c.task: c.transitions for c in grid.cells}
+    done = [t for t in tasks if (grid.out / "reference" / t / "reference.json").exists()]
+    return [
+        {"reference": t, "transitions": n, "out": str(grid.out), "episodes": grid.episodes}
+        for t, n in tasks.items()
+        if t not in done
+    ]
+
+
+class _Pool:
+    """What the threads that look after workers share."""
+
+    def __init__(self, grid: Grid, jobs: queue.Queue, bar: Progress, threads: int, memory: float | None, lock: int):
+        self.grid, self.jobs, self.bar, self.threads, self.memory, self.lock = grid, jobs, bar, threads, memory, lock
+        self.deaths: dict[tuple, int] = {}
+        self.guard = threading.Lock()
+        self.stopping = False
+        self.running: set[subprocess.Popen] = set()
+        self.failed = 0
+
+    def serve(self, cores: list[int]) -> None:
+        """Keep one worker busy until no job is left."""
+        worker = None
+        while not self.stopping:
+            try:
+                job = self.jobs.get_nowait()
+            except queue.Empty:
+                break
+            if worker is None or worker.poll() is not None:
+                worker = self._start(cores)
+            self._work(worker, job)
+        if worker is not None and worker.poll() is None:
+            worker.stdin.close()
+            worker.wait(30)
+
+    def stop(self) -> None:
+        """The terminal's interrupt reached the workers, too; they save and leave."""
+        self.stopping = True
+        for _ in range(100):
+            if all(w.poll() is not None for w in self.running):
+                return
+            time.sleep(0.1)
+        for w in self.running:
+            w.kill()
+
+    def _start(self, cores: list[int]) -> subprocess.Popen:
+        environment = dict(os.environ)
+        flags = environment.get("XLA_FLAGS", "")
+        if self.threads == 1 and "multi_thread_eigen" not in flags:
+            flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        environment["XLA_FLAGS"] = flags.strip()
+        environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(self.grid.out.resolve() / "compiled"))
+        worker = subprocess.Popen(
+            [sys.executable, "-m", "ringfence.bench.worker"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+            pass_fds=[self.lock] if self.lock >= 0 else [],  # the folder stays owned until the last worker has gone
+        )
+        if cores and hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(worker.pid, cores)
+        self.running.add(worker)
+        return worker
+
+    def _work(self, worker: subprocess.Popen, job: dict) -> None:
+        current, left = None, [decode(c) for c in job.get("cells", [])]
+        too_big = threading.Event()
+        watch = threading.Thread(target=self._weigh, args=(worker, too_big), daemon=True)
+        watch.start()
+        try:
+            worker.stdin.write(json.dumps(job) + "\n")
+            worker.stdin.flush()
+        except (BrokenPipeError, OSError):
+            pass
+        for line in worker.stdout:
+            told = json.loads(line)
+            if told["event"] in ("finished", "broken"):
+                if told["event"] == "broken":
+                    raise RuntimeError(f"a worker could not take {job}: {told['error']}")
+                return
+            if told["event"] == "ready":
+                continue
+            cell = decode(told["cell"])
+            current = cell
+            if told["event"] in ("done", "failed"):
+                left = [c for c in left if c != cell]
+                self._count(told["event"] == "failed")
+        worker.wait()
+        if self.stopping:
+            return
+        self._died(worker, current if current in left else (left[0] if left else None), left, job, too_big.is_set())
+
+    def _died(self, worker, cell: Cell | None, left: list[Cell], job: dict, too_big: bool) -> None:
+        """The worker is gone before its job was done: retry the cell once, hand the others back."""
+        if cell is None:
+            if "reference" in job and self._again(("reference", job["reference"])):
+                self.jobs.put(job)
+            return
+        if too_big or not self._again((cell.task, cell.algorithm, cell.preset, cell.seed)):
+            why = f"its worker grew beyond {self.memory:g} GiB" if too_big else f"its worker died {DEATHS} times"
+            record_failure(cell, self.grid.out, f"{why} (exit status {worker.returncode})")
+            self._count(True)
+            left = [c for c in left if c != cell]
+        if left:
+            self.jobs.put({**job, "cells": [encode(c) for c in left]})
+
+    def _again(self, name: tuple) -> bool:
+        with self.guard:
+            self.deaths[name] = self.deaths.get(name, 0) + 1
+            return self.deaths[name] < DEATHS
+
+    def _count(self, failed: bool) -> None:
+        with self.guard:
+            self.failed += failed
+            self.bar.advance(1)
+
+    def _weigh(self, worker: subprocess.Popen, too_big: threading.Event) -> None:
+        while self.memory and worker.poll() is None:
+            if resident(worker.pid) > self.memory:
+                too_big.set()
+                worker.kill()
+            time.sleep(0.5)
+
+
+def resident(pid: int) -> float:
+    """GiB of memory a process holds; 0 where the system does not say."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    except (OSError, IndexError, ValueError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
+
+
+@contextmanager
+def owned(out: Path) -> Iterator[int]:
+    """Hold DIR's lock; it frees itself when the runner and all its workers are gone, however they went."""
+    try:
+        import fcntl
+    except ImportError:  # no such locks here: one runner per folder is then up to the user
+        yield -1
+        return
+    file = os.open(out / ".lock", os.O_RDWR | os.O_CREAT)
+    try:
+        for attempt in range(20):
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except OSError:
+                if attempt == 19:
+                    raise UserError(f"Another runner works on '{out}'; wait for it or stop it.") from None
+                time.sleep(0.25)
+        yield file
+    finally:
+        os.close(file)

@@ -1,0 +1,66 @@
+"""What a grid consists of, as plain data: adding an algorithm is one line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ringfence import algos
+from ringfence.tasks import Task
+
+# Named sets of evaluation-time choices; keyword arguments of evaluate.evaluate.
+EVALUATIONS: dict[str, dict] = {
+    "plain": {},
+    "plans8": {"plans": 8},
+    "guarded": {"planner": "guarded"},
+}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An algorithm in the table, and how its runs are played."""
+
+    algorithm: str
+    preset: str = ""  # empty: the preset named after the data tier where there is one, else the default
+    evaluations: tuple[str, ...] = ("plain",)
+    tiers: tuple[str, ...] = ()  # empty: all
+
+    @property
+    def name(self) -> str:
+        return f"{self.algorithm}:{self.preset}" if self.preset else self.algorithm
+
+    def preset_for(self, task: Task) -> str:
+        presets = algos.get(self.algorithm).presets
+        return self.preset or (task.tier if task.tier in presets else next(iter(presets)))
+
+    def variant(self, task: Task, evaluation: str) -> str:
+        """The name of an evaluation in results.json."""
+        preset = self.preset_for(task)
+        return preset if evaluation == "plain" else f"{preset}+{evaluation}"
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Tasks and entries; every task is played with every entry."""
+
+    tasks: tuple[str, ...]
+    entries: tuple[Entry, ...]
+
+
+SUITES = {
+    "simple_spread": Suite(
+        tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random")),
+        (
+            Entry("bc"),
+            Entry("bc-safe"),
+            Entry("ma-td3bc"),
+            Entry("ma-td3bc-lag"),
+            Entry("fisor"),
+            Entry("ma-cql"),
+            Entry("omar"),
+            Entry("madiff", "default", ("plain", "guarded")),
+            Entry("icbf", "paper"),
+            Entry("icbf", "split", ("plain", "plans8", "guarded")),
+            Entry("icbf", "long", ("plain", "guarded"), ("expert", "medium")),
+        ),
+    ),
+}

@@ -1,0 +1,65 @@
+"""A worker process: takes groups of cells as JSON lines, makes them, tells what happened as JSON lines.
+
+It leaves when its pipe closes or its parent is gone, so that a killed runner leaves nobody writing behind.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import threading
+import time
+from pathlib import Path
+
+
+def encode(cell) -> dict:
+    return {**cell.__dict__}
+
+
+def decode(told: dict):
+    from ringfence.bench.cells import Cell
+
+    pairs = lambda x: tuple(tuple(p) for p in x)  # noqa: E731
+    return Cell(**{**told, "changes": pairs(told["changes"]), "evaluations": pairs(told["evaluations"])})
+
+
+def leave_with(parent: int) -> None:
+    """End this process once its parent is another one than it was."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.2)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def main() -> None:
+    leave_with(os.getppid())
+    wire, sys.stdout = sys.stdout, sys.stderr  # prints of libraries must not mix with the messages
+
+    def say(**message) -> None:
+        print(json.dumps(message), file=wire, flush=True)
+
+    from ringfence.bench import cells as grid
+
+    say(event="ready")
+    for line in sys.stdin:
+        job = json.loads(line)
+        out = Path(job["out"])
+        try:
+            if "reference" in job:
+                grid.make_reference(job["reference"], out, job["episodes"], job["transitions"])
+            else:
+                group = [decode(c) for c in job["cells"]]
+                grid.run_group(group, out, job["episodes"], lambda event, cell: say(event=event, cell=encode(cell)))
+            say(event="finished")
+        except KeyboardInterrupt:
+            return
+        except Exception as error:
+            say(event="broken", error=f"{type(error).__name__}: {error}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""The actor-critic baselines: what their losses ask for, on networks small enough to compute by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence.algos import actor_critic as ac
+from ringfence.algos import fisor, omar, td3bc
+from ringfence.errors import UserError
+from ringfence.types import Spec
+
+SPEC = Spec("t", 2, 2, ("a", "b", "c"), -1.0, 1.0, 25)
+
+
+def by_hand(critics: ac.Critics, x, action, agent: int, head: int) -> np.ndarray:
+    """The same network, one agent and head, in NumPy."""
+    g = 2 * agent + head
+    w = [np.asarray(v[g]) for v in jax.tree.leaves(critics)]
+    names = ("of_state", "of_action", "bias", "hidden", "hidden_bias", "out", "out_bias")
+    p = dict(zip(names, w))
+    y = np.maximum(x[:, agent] @ p["of_state"] + action[:, agent] @ p["of_action"] + p["bias"], 0)
+    y = np.maximum(y @ p["hidden"] + p["hidden_bias"], 0)
+    return (y @ p["out"] + p["out_bias"])[:, 0]
+
+
+def test_critics_are_the_networks_they_say():
+    """Every agent and head has weights of its own, and a sampled action is scored like a lone one."""
+    k = jax.random.split(jax.random.key(0), 4)
+    critics = ac.Critics(k[0], 2, 2, 3, 2, 8)
+    critics = jax.tree.map(lambda w: w + 0.1, critics)  # biases that are not zero
+    x, actions = jax.random.normal(k[1], (5, 2, 3)), jax.random.uniform(k[2], (5, 2, 4, 2))
+    several = critics(x, actions)
+    assert several.shape == (2, 2, 5, 4)
+    for s in range(4):
+        np.testing.assert_allclose(several[..., s], critics(x, actions[:, :, s]), rtol=1e-5, atol=1e-6)
+    one = critics(x, actions[:, :, 0])
+    for agent in range(2):
+        for head in range(2):
+            expected = by_hand(critics, np.asarray(x), np.asarray(actions[:, :, 0]), agent, head)
+            np.testing.assert_allclose(one[agent, head], expected, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(critics.first(2)(x, actions[:, :, 0])[:, 0], one[:, 0], rtol=1e-6)
+
+
+def test_pieces_change_nothing():
+    x = jnp.arange(24.0).reshape(12, 2)
+    whole = x.sum(1) ** 2
+    np.testing.assert_array_equal(ac.in_pieces(lambda z: z.sum(1) ** 2, 4, x).reshape(-1), whole)
+    assert ac.pieces_of(1024) == 64 and ac.pieces_of(30) == 1 and ac.pieces_of(17 * 32) == 34
+
+
+class Bowl:
+    """A critic whose best action is known: −‖a − goal‖²."""
+
+    def __init__(self, goal):
+        self.goal = jnp.asarray(goal)
+
+    def first(self, agents):
+        return self
+
+    def __call__(self, x, actions):
+        gone = actions - (self.goal if actions.ndim == 3 else self.goal[:, :, None])
+        return jnp.moveaxis(-10 * (gone**2).sum(-1), 1, 0)[:, None]
+
+
+@pytest.mark.parametrize("search", ["softmax", "elites"])
+def test_the_search_finds_the_best_action_and_never_does_worse_than_the_actor(search):
+    config = omar.Config(search=search, search_samples=60, elites=6)
+    goal = np.array([[0.5, -0.3], [-0.8, 0.9]])
+    critic = Bowl(np.broadcast_to(goal, (7, 2, 2)))
+    noise = jax.random.normal(jax.random.key(0), (7, 2, 3, 60, 2))
+    x, own = jnp.zeros((7, 2, 3)), jnp.full((7, 2, 2), 0.9)
+    found = omar.rectified(critic, x, own, noise, config, SPEC)
+    value = critic(x, found)[:, 0]
+    assert (value >= critic(x, own)[:, 0]).all()
+    assert np.abs(np.asarray(found) - goal).max() < 0.45
+    perfect = jnp.broadcast_to(jnp.asarray(goal), (7, 2, 2))
+    np.testing.assert_array_equal(omar.rectified(critic, x, perfect, noise, config, SPEC), perfect)
+
+
+def test_joint_critics_see_the_own_action_of_their_agent_alone():
+    action, own = jnp.arange(8.0).reshape(2, 2, 2), -jnp.ones((2, 2, 2))
+    seen = np.asarray(ac.joint_actions(action, own)).reshape(2, 2, 2, 2)
+    for i in range(2):
+        np.testing.assert_array_equal(seen[:, i, i], own[:, i])
+        np.testing.assert_array_equal(seen[:, i, 1 - i], action[:, 1 - i])
+
+
+def test_expectile_is_asymmetric():
+    errors = np.array([-2.0, 1.0])
+    np.testing.assert_allclose(fisor.expectile(jnp.asarray(errors), 0.9), [0.1 * 4, 0.9], rtol=1e-6)
+    # Its minimiser over a sample is the expectile: from above for τ = 0.9.
+    sample, grid = jnp.asarray([0.0, 1.0]), jnp.linspace(0, 1, 1001)
+    best = grid[jnp.argmin(fisor.expectile(sample[None] - grid[:, None], 0.9).sum(1))]
+    assert abs(float(best) - 0.9) < 2e-3
+
+
+def test_units_of_actions_are_inverse():
+    spec = Spec("t", 1, 2, ("a",), -0.5, 2.0, 25)
+    a = jnp.asarray([[-0.5, 2.0], [0.0, 1.0]])
+    np.testing.assert_allclose(fisor.from_unit(fisor.to_unit(a, spec), spec), a, atol=1e-6)
+    assert float(jnp.abs(fisor.to_unit(a, spec)).max()) == 1.0
+
+
+def test_threshold_of_the_multiplier():
+    """A limit of one per episode, spread evenly, costs Σ γ^t / T in discounted value."""
+    config = td3bc.Config(limit=3.0)
+    expected = 3.0 / 25 * sum(0.95**t for t in range(25))
+    assert td3bc.threshold(config, SPEC) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    "check, config, word",
+    [
+        (td3bc.check, td3bc.Config(delay=0), "delay"),
+        (td3bc.check, td3bc.Config(limit=-1.0), "limit"),
+        (td3bc.check, td3bc.Config(horizon=4), "horizon"),
+        (omar.check, omar.Config(coefficient=1.5), "coefficient"),
+        (omar.check, omar.Config(search="elites", elites=11), "elites"),
+        (fisor.check, fisor.Config(expectile_reward=1.0), "expectile_reward"),
+        (fisor.check, fisor.Config(candidates=0), "candidates"),
+    ],
+)
+def test_bad_settings_are_refused(check, config, word):
+    with pytest.raises(UserError, match=word):
+        check(config, None)

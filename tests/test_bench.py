@@ -1,0 +1,187 @@
+"""The grid: cells are made once, survive whatever happens to the runner, and make one honest table."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ringfence import evaluate
+from ringfence.bench import cells as grid
+from ringfence.bench import local, make_grid, rows, run_local, suites, table, write_csv
+from ringfence.errors import UserError
+from ringfence.policies import PLANNERS, PlanOptions
+from ringfence.runs import Run
+
+QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], steps=20, transitions=500)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def home(tmp_path_factory):
+    """Data of 500 steps, in a cache of its own."""
+    before = os.environ.get("RINGFENCE_HOME")
+    os.environ["RINGFENCE_HOME"] = str(tmp_path_factory.mktemp("home"))
+    yield
+    os.environ.pop("RINGFENCE_HOME") if before is None else os.environ.__setitem__("RINGFENCE_HOME", before)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A finished grid of two algorithms and two seeds."""
+    g = make_grid("simple_spread", tmp_path_factory.mktemp("grid") / "out", only=["bc", "ma-td3bc"], **QUICK)
+    counts = run_local(g, workers=2, quiet=True)
+    assert counts == {"done": 4, "failed": 0, "to do": 0}
+    return g
+
+
+def stamps(g) -> dict[Path, int]:
+    return {f: f.stat().st_mtime_ns for f in g.out.glob("cells/*/*/*/*.json")}
+
+
+def test_a_finished_grid_is_not_made_again(made):
+    before = stamps(made)
+    assert len(before) == 4 * 4  # config, env, results, status
+    assert run_local(made, workers=1, quiet=True)["done"] == 4
+    assert stamps(made) == before
+
+
+def test_cells_are_addressed_by_what_training_depends_on(made):
+    a = made.cells[0]
+    assert a.id == grid.Cell(**{**a.__dict__, "evaluations": ()}).id
+    for change in ({"seed": 7}, {"changes": (("steps", 21),)}, {"transitions": 525}):
+        assert grid.Cell(**{**a.__dict__, **change}).id != a.id
+    ids = [c.id for c in made.cells]
+    assert len(set(ids)) == 4
+    assert all(c.folder(made.out).name.endswith(c.id) for c in made.cells)
+
+
+def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch):
+    """Results that the named planner of today would not give do not count."""
+    cell = grid.Cell("simple_spread-random", "icbf", "split", 0, (), (("split+guarded", "guarded"),))
+    options = {**grid.dataclasses.asdict(PlanOptions()), **PLANNERS["guarded"]}
+    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": options}
+    Run(cell.folder(tmp_path)).add_result("split+guarded", told)
+    assert cell.state(tmp_path, 4) == "done"
+    assert cell.state(tmp_path, 5) == "to do"
+    monkeypatch.setitem(PLANNERS, "guarded", {**PLANNERS["guarded"], "margin": 0.5})
+    assert cell.state(tmp_path, 4) == "to do"
+
+
+def test_every_suite_names_algorithms_and_presets_that_exist():
+    for name, suite in suites.SUITES.items():
+        g = make_grid(name, "nowhere", seeds=1)
+        assert {c.task for c in g.cells} == set(suite.tasks)
+        assert len({c.id for c in g.cells}) == len(g.cells)
+
+
+def test_table(made):
+    found = rows(made.out)
+    ours = [r for r in found if r["variant"] != "reference"]
+    assert len(ours) == 4 and all((made.out / r["run"] / "config.json").exists() for r in ours)
+    lines = write_csv(made.out).read_text().splitlines()
+    assert len(lines) == 1 + len(found)
+    best = table.summaries(found, "simple_spread-random")
+    within = [line["cost"] <= line["limit"] for line in best]
+    assert within == sorted(within, reverse=True)
+    text = table.markdown(made.out)
+    mean = sum(r["return_mean"] for r in ours if r["algorithm"] == "bc") / 2
+    assert f"| bc | default | 2 | {mean:.1f} ±" in text
+    assert table.latex(made.out).count(r"\toprule") == 1
+
+
+def test_mixed_protocols_are_refused(made, tmp_path):
+    file = made.cells[0].folder(made.out) / "results.json"
+    kept = file.read_text()
+    told = json.loads(kept)
+    told["default"]["episodes"] = 5
+    file.write_text(json.dumps(told))
+    try:
+        with pytest.raises(UserError, match="episodes=5"):
+            rows(made.out)
+    finally:
+        file.write_text(kept)
+    with pytest.raises(UserError, match="episodes"):
+        make_grid("simple_spread", made.out, **{**QUICK, "episodes": 6}).open()
+
+
+def test_bad_names_and_folders_are_refused(made, tmp_path):
+    with pytest.raises(UserError, match="did you mean 'simple_spread'"):
+        make_grid("simple_sprad", tmp_path)
+    with pytest.raises(UserError, match="did you mean 'omar'"):
+        make_grid("simple_spread", tmp_path, only=["omarr"])
+    with pytest.raises(UserError, match="task"):
+        make_grid("simple_spread", tmp_path, only_tasks=["simple_spread-exprt"])
+    with pytest.raises(UserError, match="no results folder"):
+        rows(tmp_path)
+    (tmp_path / "bench.json").write_text(json.dumps({**grid.about("simple_spread", 4), "format": 0}))
+    with pytest.raises(UserError, match="format 0"):
+        rows(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thing").write_text("mine")
+    with pytest.raises(UserError, match="something else"):
+        make_grid("simple_spread", tmp_path / "other", **QUICK).open()
+
+
+def test_a_failing_cell_is_recorded_and_stops_nobody(tmp_path, monkeypatch):
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
+    g.open()
+    real, broken = evaluate.evaluate, g.cells[0].folder(g.out)
+
+    def fails(run, **options):
+        if run.path == broken:
+            raise RuntimeError("the moon is in the way")
+        return real(run, **options)
+
+    monkeypatch.setattr(grid.evaluate, "evaluate", fails)
+    heard = []
+    grid.run_group(list(g.cells), g.out, g.episodes, lambda event, cell: heard.append((event, cell.seed)))
+    assert heard == [("start", 0), ("failed", 0), ("start", 1), ("done", 1)]
+    assert g.count() == {"done": 1, "failed": 1, "to do": 0}
+    told = g.cells[0].status(g.out)
+    assert "moon" in told["error"] and "Traceback" in told["traceback"]
+    monkeypatch.undo()
+    grid.run_group(g.groups()[0], g.out, g.episodes, lambda *_: None)
+    assert g.count()["done"] == 2 and g.cells[0].status(g.out)["attempts"] == 2
+
+
+def test_a_worker_that_outgrows_its_memory_is_stopped_and_said_so(tmp_path):
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
+    (tmp_path / "out" / "reference" / "simple_spread-random").mkdir(parents=True)
+    grid.write_json(g.out / "bench.json", grid.about(g.suite, g.episodes))
+    (tmp_path / "out" / "reference" / "simple_spread-random" / "reference.json").write_text("{}")
+    assert run_local(g, workers=1, memory=0.05, quiet=True) == {"done": 0, "failed": 1, "to do": 0}
+    assert "grew beyond 0.05 GiB" in g.cells[0].status(g.out)["error"]
+
+
+def test_a_killed_runner_loses_no_finished_cell(tmp_path):
+    """Killed without warning after its first cell; the next runner keeps that cell and finishes the others."""
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
+    code = (
+        "from ringfence.bench import make_grid, run_local\n"
+        f"run_local(make_grid('simple_spread', {str(g.out)!r}, only=['bc'], **{QUICK!r}), workers=1, quiet=True)"
+    )
+    runner = subprocess.Popen([sys.executable, "-c", code], start_new_session=True)
+    first = g.cells[0]
+    until = time.monotonic() + 120
+    while first.status(g.out).get("state") != "done" and time.monotonic() < until:
+        time.sleep(0.05)
+    os.kill(runner.pid, signal.SIGKILL)  # the worker is left to notice by itself
+    runner.wait()
+    assert first.state(g.out, g.episodes) == "done"
+    before = (first.folder(g.out) / "results.json").stat().st_mtime_ns
+    assert run_local(g, workers=1, quiet=True) == {"done": 2, "failed": 0, "to do": 0}
+    assert (first.folder(g.out) / "results.json").stat().st_mtime_ns == before
+    assert first.status(g.out)["attempts"] == 1
+
+
+def test_one_runner_per_folder(tmp_path):
+    with local.owned(tmp_path):
+        code = f"import pathlib, ringfence.bench.local as x\nwith x.owned(pathlib.Path({str(tmp_path)!r})): pass"
+        second = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "Another runner works on" in second.stderr
+    with local.owned(tmp_path):
+        pass
