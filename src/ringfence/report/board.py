@@ -1,18 +1,23 @@
 """Reads a results folder of the benchmark and refuses what must not stand in one table.
 
 bench.json                              format, protocol, suite, episodes, split
-reference/<task>.json                   summaries of the logged data and of trivial policies, by name
+reference/<task>/reference.json         summaries of the logged data and of trivial policies, by name
+                                        (or reference/<task>.json)
 cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   run folders; results.json holds one summary per variant
+
+A preset named after the task's data tier is that algorithm's default there: one method over all tasks.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringfence import tasks
+from ringfence import algos, tasks
+from ringfence.bench.suites import SUITES
 from ringfence.errors import UserError
 from ringfence.report.table import NAMES, NEEDED, ORDER, plain_variant
 from ringfence.runs import Run, read_json
@@ -29,7 +34,7 @@ class Method:
 
     algorithm: str
     preset: str
-    variant: str  # as in results.json
+    variant: str  # as in results.json, `default` in place of a preset that is the tier's own
     apart: str = ""  # config fields in which cells of the same algorithm and preset differ
 
     @property
@@ -90,6 +95,7 @@ class Board:
     entries: list[Entry]
     references: dict[str, dict[str, dict]]  # task -> name -> summary
     missing: list[Missing]
+    unstarted: list[str]  # entries of the suite that no cell was begun of
     constants: dict[str, dict[str, float]]  # by task
     runs: list[Run] = field(repr=False, default_factory=list)  # finished ones
 
@@ -114,27 +120,32 @@ def read(folder: str | Path) -> Board:
     finished, missing = [], []
     for path, task, job, seed in cells:
         run = Run(path)
+        state, reason = _status(path)
         if run.results and (path / "config.json").exists():
             finished.append((run, task, job, seed))
+            if state == "failed":
+                missing.append(
+                    Missing(task, job, seed, f"not every evaluation is there, the last one failed: {reason}")
+                )
         else:
-            missing.append(Missing(task, job, seed, _status(path)))
+            missing.append(Missing(task, job, seed, f"{state}: {reason}" if reason else state))
     if not finished:
         raise UserError(
-            f"'{folder}' holds no finished cell, so there is nothing to rank; run the benchmark into it first."
+            f"'{folder}' holds no finished cell, so there is nothing to rank; run `ringfence bench` into it first."
         )
     references = _references(folder)
     entries = _entries(finished)
     _check(entries, references, told, folder)
-    names = {task for _, task, _, _ in cells} | set(references)
+    names = {task for _, task, _, _ in cells} | {task for task, _ in references.values()}
     known = list(tasks.TASKS)
     ordered = sorted(names, key=lambda t: (known.index(t) if t in known else len(known), t))
     seeds = tuple(sorted({seed for *_, seed in cells}))
-    started = {(task, job, seed) for _, task, job, seed in cells}
-    jobs = sorted({job for _, _, job, _ in cells})
-    grid = [(t, j, s) for t in ordered for j in jobs for s in seeds]
-    missing += [Missing(*cell, "not started") for cell in grid if cell not in started]
-    done = {(task, job, seed) for _, task, job, seed in finished}
-    missing = [m for m in missing if (m.task, m.job, m.seed) not in done]
+    done = {(task, _job(task, job), seed) for _, task, job, seed in finished}
+    missing = [m for m in missing if "evaluation" in m.why or (m.task, _job(m.task, m.job), m.seed) not in done]
+    begun = {(task, _job(task, job), seed) for _, task, job, seed in cells}
+    jobs = sorted({job for _, job, _ in begun})
+    grid = [(t, j, s) for t in ordered for j in jobs for s in seeds if _planned(told["suite"], t, j)]
+    missing += [Missing(*place, "not started") for place in grid if place not in begun]
     return Board(
         path=folder,
         suite=told["suite"],
@@ -144,8 +155,11 @@ def read(folder: str | Path) -> Board:
         tasks=ordered,
         seeds=seeds,
         entries=entries,
-        references=references,
+        references={task: rows for task, rows in references.values()},
         missing=sorted(missing, key=lambda m: (ordered.index(m.task), m.job, m.seed)),
+        unstarted=[
+            e.name for e in _suite(told["suite"]) if e.name.replace(":default", "").replace(":", "-") not in jobs
+        ],
         constants=_constants(entries, references),
         runs=[run for run, *_ in finished],
     )
@@ -171,25 +185,44 @@ def _place_of(path: Path) -> tuple[str, str, int]:
     return path.parent.parent.name, path.parent.name, int(CELL.match(path.name)[1])
 
 
-def _status(path: Path) -> str:
-    """What the runner left about a cell without results, in a few words."""
+def _status(path: Path) -> tuple[str, str]:
+    """(state, reason in a line) of a cell; one that was begun and left nothing behind yet is under way."""
     file = path / "status.json"
-    if not file.exists():
-        return "no results yet"
-    told = read_json(file, "has a damaged status.json; delete that file")
-    said = told.get("state") or told.get("status") or "no results yet"
+    told = read_json(file, "has a damaged status.json; delete that file") if file.exists() else {}
     reason = str(told.get("error") or "").strip().splitlines()
-    return f"{said}: {reason[-1]}" if reason else str(said)
+    return str(told.get("state") or "under way"), reason[-1] if reason else ""
 
 
-def _references(folder: Path) -> dict[str, dict[str, dict]]:
-    files = sorted((folder / "reference").glob("*.json"))
-    return {f.stem: read_json(f, "holds a damaged reference file; delete it and make it again") for f in files}
+def _tier(task: str) -> str:
+    return tasks.TASKS[task].tier if task in tasks.TASKS else ""
+
+
+def _job(task: str, job: str) -> str:
+    """A folder's name without the preset of the tier: the same job on every task."""
+    return job.removesuffix(f"-{_tier(task)}") if _tier(task) else job
+
+
+def _suite(name: str) -> tuple:
+    return SUITES[name].entries if name in SUITES else ()
+
+
+def _planned(suite: str, task: str, job: str) -> bool:
+    """Whether the suite has this job on this task; jobs it does not know are expected on every task."""
+    entries = [e for e in _suite(suite) if job == e.name.replace(":default", "").replace(":", "-")]
+    return not entries or any(not e.tiers or _tier(task) in e.tiers for e in entries)
+
+
+def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
+    """File -> (task, rows by name)."""
+    inside, damaged = folder / "reference", "holds a damaged reference file; delete it and make it again"
+    files = [(f, f.parent.name) for f in sorted(inside.glob("*/reference.json"))]
+    files += [(f, f.stem) for f in sorted(inside.glob("*.json"))]
+    return {f: (task, read_json(f, damaged)) for f, task in files}
 
 
 def _entries(finished: list[tuple[Run, str, str, int]]) -> list[Entry]:
     configs = {run.path: run.config for run, *_ in finished}
-    apart = _differing([(task, configs[run.path]) for run, task, *_ in finished])
+    apart = _differing([(task, configs[run.path]) for run, task, *_ in finished])  # by (algorithm, preset)
     entries: dict[tuple, Entry] = {}
     data: dict[str, tuple[str, Path]] = {}
     for run, task, _, seed in finished:
@@ -207,10 +240,12 @@ def _entries(finished: list[tuple[Run, str, str, int]]) -> list[Entry]:
                 f"'{run.path}' was trained on other data ({provenance}) than '{first[1]}' ({first[0]}); "
                 "keep one results folder for each data set."
             )
-        algorithm, preset = told["algorithm"], told.get("preset", "default")
-        fields = apart.get((algorithm, preset), [])
-        words = "[" + ", ".join(f"{k}={told['config'].get(k)}" for k in fields) + "]" if fields else ""
+        algorithm, preset = told["algorithm"], _preset(task, told)
+        fields, config = apart.get((algorithm, preset), []), _config(told)
+        words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
+            if told["preset"] != preset:
+                variant = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)
             method = Method(algorithm, preset, variant, words)
             entry = Entry(task, algorithm, variant, seed, summary, run.path, method)
             other = entries.setdefault((task, method, seed), entry)
@@ -226,7 +261,7 @@ def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[st
     A setting that is one thing on one task and another on the next is no reason for two rows."""
     groups: dict[tuple, list[dict]] = {}
     for task, told in configs:
-        groups.setdefault((told["algorithm"], told.get("preset", "default"), task), []).append(told.get("config") or {})
+        groups.setdefault((told["algorithm"], _preset(task, told), task), []).append(_config(told))
     found: dict[tuple[str, str], list[str]] = {}
     for (algorithm, preset, _), several in groups.items():
         names = found.setdefault((algorithm, preset), [])
@@ -235,7 +270,21 @@ def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[st
     return found
 
 
-def _check(entries: list[Entry], references: dict[str, dict[str, dict]], told: dict, folder: Path) -> None:
+def _preset(task: str, told: dict) -> str:
+    """A run's preset, where the one named after the tier counts as the default."""
+    return "default" if told["preset"] == _tier(task) else told["preset"]
+
+
+def _config(told: dict) -> dict:
+    """A run's config; a field that is younger than the run had its default then."""
+    try:
+        fields = dataclasses.fields(algos.get(told["algorithm"]).Config)
+    except UserError:  # an algorithm of somebody else's
+        return dict(told["config"])
+    return {f.name: f.default for f in fields} | told["config"]
+
+
+def _check(entries: list[Entry], references: dict[Path, tuple[str, dict[str, dict]]], told: dict, folder: Path) -> None:
     """Every summary must be of the protocol, split, length and normalisation that the folder declares."""
     leaders: dict[str, tuple[Path, dict]] = {}
     for e in entries:
@@ -245,8 +294,7 @@ def _check(entries: list[Entry], references: dict[str, dict[str, dict]], told: d
         for key in ("protocol", "split", "episodes"):
             _same(who, key, e.summary[key], told[key], folder)
         _normalised(file, who, e.summary, leaders.setdefault(e.task, (file, e.summary)))
-    for task, rows in references.items():
-        file = folder / "reference" / f"{task}.json"
+    for file, (task, rows) in references.items():
         for name, summary in rows.items():
             who = f"'{file}' row '{name}'"
             _complete(who, summary, task, (*NEEDED, "split"))
@@ -282,6 +330,6 @@ def _normalised(file: Path, who: str, summary: dict, leader: tuple[Path, dict]) 
         )
 
 
-def _constants(entries: list[Entry], references: dict[str, dict[str, dict]]) -> dict[str, dict[str, float]]:
-    found = {task: row["constants"] for task, rows in references.items() for row in rows.values()}
+def _constants(entries: list[Entry], references: dict[Path, tuple[str, dict]]) -> dict[str, dict[str, float]]:
+    found = {task: row["constants"] for task, rows in references.values() for row in rows.values()}
     return found | {e.task: e.summary["constants"] for e in entries}

@@ -13,7 +13,7 @@ class Published:
 
     name: str
     source: str
-    algorithms: tuple[str, ...]  # what the method is called here
+    algorithms: tuple[str, ...]  # what the method is called here, without hyphens
     values: dict[str, float]
 
 
@@ -32,9 +32,9 @@ def _spread(expert: float, replay: float, medium: float, random: float) -> dict[
 
 PUBLISHED = (
     Published("BC", OMAR, ("bc",), _spread(35.0, 10.0, 31.6, -0.5)),
-    Published("MA-ICQ", OMAR, ("icq", "maicq"), _spread(104.0, 13.6, 29.3, 6.3)),
-    Published("MA-TD3+BC", OMAR, ("td3bc", "matd3bc"), _spread(108.3, 15.4, 29.3, 9.8)),
-    Published("MA-CQL", OMAR, ("cql", "macql"), _spread(98.2, 20.0, 34.1, 24.0)),
+    Published("MA-ICQ", OMAR, ("maicq",), _spread(104.0, 13.6, 29.3, 6.3)),
+    Published("MA-TD3+BC", OMAR, ("matd3bc",), _spread(108.3, 15.4, 29.3, 9.8)),
+    Published("MA-CQL", OMAR, ("macql",), _spread(98.2, 20.0, 34.1, 24.0)),
     Published("OMAR", OMAR, ("omar",), _spread(114.9, 37.9, 47.9, 34.4)),
     Published("MADiff-D (each agent plans for itself)", MADIFF, ("madiff",), _spread(95.0, 30.3, 64.9, 6.9)),
     Published("MADiff-C (one joint plan)", MADIFF, ("madiff",), _spread(116.7, 42.2, 58.2, 4.3)),

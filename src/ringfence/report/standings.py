@@ -90,7 +90,7 @@ def standings(board: Board) -> dict[str, list[Standing]]:
     made = {}
     for task in board.tasks:
         rows = [_standing(board, task, m, styles[m]) for m in board.methods if board.of(task, m)]
-        made[task] = _ranked(rows)
+        made[task] = _ranked(rows, board.constants[task]["cost_limit"]) if rows else []
     return made
 
 
@@ -99,13 +99,14 @@ def references(board: Board) -> dict[str, list[Standing]]:
     return {t: [_reference(t, name, r) for name, r in board.references.get(t, {}).items()] for t in board.tasks}
 
 
-def _ranked(rows: list[Standing]) -> list[Standing]:
-    """Lexicographic: within the cost limit first, by return; then the rest, by cost. Equal rows share a rank."""
-    keys = {id(r): (0, -r.returns) if r.safe else (1, r.cost) for r in rows}
-    rows = sorted(rows, key=lambda r: keys[id(r)])
-    for row in rows:
-        row.rank = 1 + sum(keys[id(other)] < keys[id(row)] for other in rows)
-        row.best = row.safe and row.rank == 1
+def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
+    """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
+    rest, by cost."""
+    order = stats.rank([r.returns for r in rows], [r.cost_interval[1] for r in rows], limit)
+    rows = [rows[i] for i in order]
+    for place, row in enumerate(rows, 1):
+        row.rank = place
+        row.best = row.safe and place == 1
     return rows
 
 
@@ -274,7 +275,7 @@ def aggregate(board: Board) -> Aggregate | None:
         improves=_pairs(returns, methods),
         cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
         return_thresholds=return_thresholds,
-        return_profiles=np.array([stats.performance_profile(returns[m], return_thresholds) for m in methods]),
+        return_profiles=np.array([stats.profile(returns[m], return_thresholds) for m in methods]),
         cost_thresholds=cost_thresholds,
         cost_profiles=np.array([stats.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
     )
