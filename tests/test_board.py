@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import json
 import re
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import cli, evaluate, tasks
+from ringfence import algos, cli, evaluate, tasks
 from ringfence.errors import UserError
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
 from ringfence.report.board import Method, read
@@ -111,6 +112,57 @@ def test_cells_without_results_are_named_with_the_reason(folder):
 def test_a_cell_done_under_another_mark_is_not_missing(folder):
     cell(folder, {"split": summary([1] * 4, [0] * 4)}, "icbf", "split", seed=1, mark="b2")
     assert all(m.task == MEDIUM for m in read(folder).missing)
+
+
+def test_cells_that_the_suite_leaves_out_are_not_missing_and_entries_without_cells_are_named(folder):
+    cell(folder, {"long": summary([1] * 4, [0] * 4)}, "icbf", "long")
+    replay = "simple_spread-medium-replay"  # the suite has no icbf:long there
+    cell(folder, {"default": summary([1] * 4, [0] * 4, replay)}, task=replay)
+    board = read(folder)
+    missing = {(m.task, m.seed) for m in board.missing if m.job == "icbf-long"}
+    assert missing == {(EXPERT, 1), (MEDIUM, 0), (MEDIUM, 1)}
+    assert "omar" in board.unstarted and not {"bc", "icbf:split", "icbf:long"} & set(board.unstarted)
+
+
+def test_a_cell_that_failed_after_an_evaluation_keeps_its_row_and_is_named(folder):
+    path = folder / "cells" / EXPERT / "icbf-split" / "seed-0-a1"
+    write(path / "status.json", {"state": "failed", "error": "KeyError: 'x'"})
+    board = read(folder)
+    assert ("icbf-split", 0, "not every evaluation is there, one failed: KeyError: 'x'") in {
+        (m.job, m.seed, m.why) for m in board.missing
+    }
+    assert len(board.entries) == 6
+
+
+def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
+    for task, preset in ((EXPERT, "expert"), (MEDIUM, "default")):
+        told = {preset: summary([1] * 4, [0] * 4, task), f"{preset}+plans8": summary([2] * 4, [0] * 4, task)}
+        for seed in (0, 1):
+            cell(folder, told, "omar", preset, seed, task)
+    board = read(folder)
+    labels = {e.method.label for e in board.entries if e.algorithm == "omar"}
+    assert labels == {"OMAR", "OMAR plans8"}
+    assert {m.label for m in aggregate(board).methods} == {"BC"} | labels
+    assert not [m for m in board.missing if "omar" in m.job]
+    assert {e.variant for e in board.entries if e.algorithm == "omar" and e.task == EXPERT} == {
+        "expert",
+        "expert+plans8",
+    }
+
+
+def test_fields_younger_than_a_run_do_not_set_it_apart(folder):
+    steps = cell(folder, {"default": summary([1] * 4, [0] * 4)}, seed=2)
+    told = json.loads((steps / "config.json").read_text())
+    defaults = {f.name: f.default for f in dataclasses.fields(algos.get("bc").Config)}
+    write(steps / "config.json", told | {"config": defaults | {"steps": 100}})
+    assert [m.label for m in read(folder).methods if m.algorithm == "bc"] == ["BC"]
+
+
+def test_references_lie_in_a_file_or_in_a_folder_of_the_task(folder):
+    write(folder / "reference" / MEDIUM / "reference.json", {"do nothing": summary([170] * 4, [0] * 4, MEDIUM)})
+    found = references(read(folder))
+    assert [r.name for r in found[EXPERT]] == ["behaviour data", "do nothing"]
+    assert [r.returns for r in found[MEDIUM]] == [170.0]
 
 
 def test_settings_that_differ_between_tasks_are_one_method_within_a_task_two(folder):

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ringfence import algos, tasks
-from ringfence.bench.suites import SUITES
+from ringfence.bench import suites
 from ringfence.errors import UserError
 from ringfence.report.table import NAMES, NEEDED, ORDER, plain_variant
 from ringfence.runs import Run, read_json
@@ -117,18 +117,16 @@ def read(folder: str | Path) -> Board:
     folder = Path(folder)
     told = _declared(folder)
     cells = [(path, *_place_of(path)) for path in sorted((folder / "cells").glob("*/*/*/")) if CELL.match(path.name)]
-    finished, missing = [], []
+    finished, missing, partial = [], [], []
     for path, task, job, seed in cells:
         run = Run(path)
         state, reason = _status(path)
-        if run.results and (path / "config.json").exists():
-            finished.append((run, task, job, seed))
-            if state == "failed":
-                missing.append(
-                    Missing(task, job, seed, f"not every evaluation is there, the last one failed: {reason}")
-                )
-        else:
+        if not run.results or not (path / "config.json").exists():
             missing.append(Missing(task, job, seed, f"{state}: {reason}" if reason else state))
+            continue
+        finished.append((run, task, job, seed))
+        if state == "failed":
+            partial.append(Missing(task, job, seed, f"not every evaluation is there, one failed: {reason}"))
     if not finished:
         raise UserError(
             f"'{folder}' holds no finished cell, so there is nothing to rank; run `ringfence bench` into it first."
@@ -141,7 +139,7 @@ def read(folder: str | Path) -> Board:
     ordered = sorted(names, key=lambda t: (known.index(t) if t in known else len(known), t))
     seeds = tuple(sorted({seed for *_, seed in cells}))
     done = {(task, _job(task, job), seed) for _, task, job, seed in finished}
-    missing = [m for m in missing if "evaluation" in m.why or (m.task, _job(m.task, m.job), m.seed) not in done]
+    missing = partial + [m for m in missing if (m.task, _job(m.task, m.job), m.seed) not in done]
     begun = {(task, _job(task, job), seed) for _, task, job, seed in cells}
     jobs = sorted({job for _, job, _ in begun})
     grid = [(t, j, s) for t in ordered for j in jobs for s in seeds if _planned(told["suite"], t, j)]
@@ -157,9 +155,7 @@ def read(folder: str | Path) -> Board:
         entries=entries,
         references={task: rows for task, rows in references.values()},
         missing=sorted(missing, key=lambda m: (ordered.index(m.task), m.job, m.seed)),
-        unstarted=[
-            e.name for e in _suite(told["suite"]) if e.name.replace(":default", "").replace(":", "-") not in jobs
-        ],
+        unstarted=[e.name for e in _suite(told["suite"]) if _entry_job(e) not in jobs],
         constants=_constants(entries, references),
         runs=[run for run, *_ in finished],
     )
@@ -202,13 +198,18 @@ def _job(task: str, job: str) -> str:
     return job.removesuffix(f"-{_tier(task)}") if _tier(task) else job
 
 
-def _suite(name: str) -> tuple:
-    return SUITES[name].entries if name in SUITES else ()
+def _suite(name: str) -> tuple[suites.Entry, ...]:
+    return suites.SUITES[name].entries if name in suites.SUITES else ()
+
+
+def _entry_job(entry: suites.Entry) -> str:
+    """The folder's name of a suite's entry, as `_job` has it."""
+    return entry.algorithm if entry.preset in ("", "default") else f"{entry.algorithm}-{entry.preset}"
 
 
 def _planned(suite: str, task: str, job: str) -> bool:
     """Whether the suite has this job on this task; jobs it does not know are expected on every task."""
-    entries = [e for e in _suite(suite) if job == e.name.replace(":default", "").replace(":", "-")]
+    entries = [e for e in _suite(suite) if _entry_job(e) == job]
     return not entries or any(not e.tiers or _tier(task) in e.tiers for e in entries)
 
 
@@ -244,9 +245,10 @@ def _entries(finished: list[tuple[Run, str, str, int]]) -> list[Entry]:
         fields, config = apart.get((algorithm, preset), []), _config(told)
         words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
+            shown = variant
             if told["preset"] != preset:
-                variant = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)
-            method = Method(algorithm, preset, variant, words)
+                shown = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)
+            method = Method(algorithm, preset, shown, words)
             entry = Entry(task, algorithm, variant, seed, summary, run.path, method)
             other = entries.setdefault((task, method, seed), entry)
             if other is not entry:

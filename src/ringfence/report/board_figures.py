@@ -47,15 +47,15 @@ def overall(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
     """IQM of normalised return and of normalised cost over all tasks, the best return on top."""
     methods = sorted(told.methods, key=lambda m: -told.iqm_returns[m][0])
     with matplotlib.rc_context(STYLE):
-        made = figure(WIDTH, 1.4 + 0.32 * len(methods))
+        made = figure(WIDTH, 1.2 + 0.32 * len(methods))
         axes = made.subplots(1, 2, sharey=True)
         inks = [styles[m] for m in methods]
+        axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))  # first, so that it is in view
         _whiskers(axes[0], [told.iqm_returns[m] for m in methods], inks, 2)
         _whiskers(axes[1], [told.iqm_costs[m] for m in methods], inks, 2)
         axes[0].set_yticks(range(len(methods)), [m.label for m in methods])
         axes[0].set_xlabel("normalised return, IQM (more is better)")
         axes[1].set_xlabel("normalised cost, IQM (less is better)")
-        axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
         axes[1].annotate(
             "limit", (1.0, 1.0), (3, 2), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8.5
         )
@@ -156,7 +156,7 @@ def expenses(rows: list[Standing], name: str) -> str:
         ("one joint action, ms", [r.plan_ms for r in rows], "{:.2g}"),
     )
     with matplotlib.rc_context(STYLE):
-        made = figure(WIDTH, 1.4 + 0.32 * len(rows))
+        made = figure(WIDTH, 1.2 + 0.32 * len(rows))
         axes = made.subplots(1, len(panels), sharey=True)
         for ax, (title, values, form) in zip(axes, panels):
             there = [v for v in values if v]

@@ -262,7 +262,8 @@ def aggregate(board: Board) -> Aggregate | None:
         )
     low, high = _range(returns)
     return_thresholds = np.linspace(low, high, 101)
-    cost_thresholds = np.linspace(0.0, max(3.0, *(float(np.quantile(c, 0.9)) for c in episode_costs.values())), 101)
+    top = int(np.ceil(max(3.0, *(float(np.quantile(c, 0.9)) for c in episode_costs.values()))))
+    cost_thresholds = np.linspace(0.0, top, 20 * top + 1)  # whole numbers are among them, since costs count steps
     return Aggregate(
         tasks=board.tasks,
         methods=methods,
