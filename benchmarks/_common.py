@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import platform
 import shlex
 import sys
 from pathlib import Path
@@ -12,18 +11,15 @@ from typing import Any
 
 import jax
 
+from ringfence.runs import processor
+
 
 def machine() -> str:
     """CPU model, usable cores, the accelerator if JAX runs on one, and the JAX version, in one line."""
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():  # Linux; elsewhere the platform's own answer has to do
-        names = [line.split(":", 1)[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0] if names else model
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     device = jax.devices()[0]
     accelerator = "" if device.platform == "cpu" else f", {device.device_kind}"
-    return f"{model}, {cores} cores{accelerator}, jax {jax.__version__}"
+    return f"{processor()}, {cores} cores{accelerator}, jax {jax.__version__}"
 
 
 def command() -> str:

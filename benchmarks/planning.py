@@ -37,7 +37,11 @@ def team_task(n: int) -> Task:
 def random_store(task: Task, episodes: int) -> EpisodeStore:
     played = behaviour.collect(task.env, "random", episodes, jax.random.key(0), batch=min(episodes, 500))
     return EpisodeStore.from_episodes(
-        played["observations"], played["actions"], played["rewards"], played["costs"], state=played["state"],
+        played["observations"],
+        played["actions"],
+        played["rewards"],
+        played["costs"],
+        state=played["state"],
         card={"task": task.name, "hazard": task.hazard},
     )
 

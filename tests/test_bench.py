@@ -185,3 +185,55 @@ def test_one_runner_per_folder(tmp_path):
     assert "Another runner works on" in second.stderr
     with local.owned(tmp_path):
         pass
+
+
+def test_an_unreachable_cluster_is_refused(tmp_path):
+    pytest.importorskip("ray", reason="ray is an extra")
+    from ringfence.bench.cluster import connect
+
+    with pytest.raises(UserError, match="No Ray cluster answers at address '127.0.0.1:1'"):
+        connect("127.0.0.1:1")
+
+
+def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
+    """Two nodes on this machine; the process that works on the first cell is killed, and Ray makes the cell again."""
+    ray = pytest.importorskip("ray", reason="ray is an extra")
+    from ray.cluster_utils import Cluster
+
+    from ringfence.bench import cluster as engine
+
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
+    # What the driver would make itself is given, so that the tasks begin at once.
+    (g.out / "reference" / "simple_spread-random").mkdir(parents=True)
+    grid.write_json(g.out / "bench.json", grid.about(g.suite, g.episodes))
+    known = made.out / "reference" / "simple_spread-random" / "reference.json"
+    (g.out / "reference" / "simple_spread-random" / "reference.json").write_text(known.read_text())
+    killed = tmp_path / "killed"
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        cluster.add_node(num_cpus=1)
+        ray.init(address=cluster.address, log_to_driver=False, logging_level="ERROR")
+        assert len(ray.nodes()) == 2
+        real = engine.packed
+
+        def packed(cell, episodes):
+            """The first task kills its own process once, half-way."""
+            if not killed.exists():
+                killed.write_text("")
+                os.kill(os.getpid(), signal.SIGKILL)
+            return real(cell, episodes)
+
+        engine.packed = packed
+        try:
+            counts = engine.run_ray(g, quiet=True)
+        finally:
+            engine.packed = real
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
+    assert killed.exists() and counts == {"done": 2, "failed": 0, "to do": 0}
+    for a, b in zip(g.cells, [c for c in made.cells if c.algorithm == "bc"]):
+        mine, other = a.folder(g.out), b.folder(made.out)
+        assert mine.name == other.name
+        same = [json.loads((f / "results.json").read_text())["default"]["per_episode"] for f in (mine, other)]
+        assert same[0] == same[1]

@@ -41,6 +41,12 @@ class Noised(NamedTuple):
     epsilon: Array
 
 
+def known_entries(visible: Array, history: int, rows: int) -> Array:
+    """(B, H, N, 1) bool: what is in-painted into a plan: the past and present rows of visible agents (B, N)."""
+    known = jnp.arange(rows) <= history
+    return (known[None, :, None] & visible[:, None, :])[..., None]
+
+
 def add_noise(x0: Array, mask: Array, alpha_bar: Array, key: Key) -> Noised:
     """Noise plans (B, ...) to random steps; `mask` is true on in-painted entries, which stay clean."""
     k1, k2 = jax.random.split(key)

@@ -17,6 +17,7 @@ import numpy as np
 
 from ringfence import algos, features, hazards, stats, tasks, training
 from ringfence.errors import UserError, unknown
+from ringfence.files import whole
 from ringfence.hazards import BoundHazard
 from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
@@ -163,7 +164,8 @@ def load_job(run: Run) -> training.Job:
     config = build_config(algorithm.Config, told["config"], algorithm.name)
     spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
     if told["feature_map"] is None:
-        task = tasks.get(told["task"])
+        # Danger is what the run's data said it is, as in training.
+        task = dataclasses.replace(tasks.get(told["task"]), hazard=hazards.from_dict(told["hazard"]))
         feature_map = task.feature_map(config.view)
     else:
         card = told["data"]
@@ -210,16 +212,17 @@ def evaluate(
     if planner not in PLANNERS:
         raise unknown("planner", planner, PLANNERS)
     job, policy = load(run, step, **{**PLANNERS[planner], **options})
+    told = run.config
     plans = isinstance(policy, Planner)
     variant = variant_name(job, planner if plans else "plain", options if plans else {}, split)
     variant += "" if step is None else f"@step{step}"
-    seed = run.config["seed"]
+    seed = told["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
     result, played = evaluate_policy(policy, job.task, episodes, split, seed, record, label, quiet)
     result |= {
         "algorithm": job.algorithm.name,
         "variant": variant,
-        "provenance": run.config["data"]["provenance"],
+        "provenance": told["data"]["provenance"],
         "planner": planner if plans else "plain",
         "options": dataclasses.asdict(policy.options) if plans else {},
         "train_seconds": sum(r["seconds"] for r in run.metrics),
@@ -228,7 +231,8 @@ def evaluate(
     run.add_result(variant, result)
     if record:
         keep = {k: v[:record] for k, v in played.items()}
-        np.savez_compressed(run.path / f"rollout-{variant}.npz", **keep)
+        with whole(run.path / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **keep)
     return result
 
 

@@ -50,6 +50,12 @@ class FeatureMap:
         rows = np.arange(self.plus.shape[0])[:, None]
         return observations[..., rows, self.plus]
 
+    def agreed(self, plan: Array, history: int = 0) -> Array:
+        """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
+        if self.reconcile is None:
+            return plan
+        return jnp.concatenate([plan[:, :history], self.reconcile(plan[:, history:])], 1)
+
 
 def simple_spread(view: str, n_agents: int) -> FeatureMap:
     """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import jax
@@ -41,6 +42,17 @@ class Optimiser:
             new[name] = optax.apply_updates(p, step)
             norms[f"gradient_norm/{name}"] = jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(grads[name])))
         return new, kept, norms
+
+
+def fresh(optimiser: Optimiser, params: dict[str, PyTree], copied_as: str, names: Iterable[str] = ()) -> PyTree:
+    """The state of a run at step 0: parameters, copies of those in `names` (all, if none), optimiser moments."""
+    copies = {name: jax.tree.map(jnp.copy, params[name]) for name in names or params}
+    return {
+        "params": params,
+        copied_as: copies,
+        "opt": optimiser.init(params),
+        "step": jnp.zeros((), jnp.int32),
+    }
 
 
 def average(ema: PyTree, params: PyTree, decay: float, step: Array) -> PyTree:

@@ -194,7 +194,7 @@ class Planner(eqx.Module):
         o, (b, _, n, d) = self.options, context.shape
         rows = self.history + self.horizon
         known = self.normaliser.state(context)
-        mask = (jnp.arange(rows) <= self.history)[None, :, None, None] & visible[:, None, :, None]
+        mask = diffusion.known_entries(visible, self.history, rows)
         known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
         bar = np.asarray(self.alpha_bar)
         target = jnp.full(b, o.target)
@@ -219,10 +219,7 @@ class Planner(eqx.Module):
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
-        if self.feature_map.reconcile is None:
-            return x
-        later = self.feature_map.reconcile(x[:, self.history :])
-        return jnp.concatenate([x[:, : self.history], later], 1)
+        return self.feature_map.agreed(x, self.history)
 
     def merit(self, clean: Array) -> Array:
         """(B,) what gradient guidance climbs: value in deviations of the data's, and safety up to the margin."""

@@ -39,10 +39,6 @@ class Run:
     path: Path
 
     @property
-    def name(self) -> str:
-        return self.path.name
-
-    @property
     def config(self) -> dict:
         """Contents of config.json."""
         return read_json(self.path / "config.json", "is no run folder; give the folder that `ringfence train` made")

@@ -23,6 +23,7 @@ import numpy as np
 from ringfence import algos, features, hazards, tasks
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.files import whole
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config, environment, write_json
 from ringfence.tasks import Task
@@ -99,7 +100,7 @@ def train(
     job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
-    windows = _windows(
+    windows = windows_of(
         data,
         job.task,
         job.config.view,
@@ -127,7 +128,7 @@ def train(
 
 
 @functools.lru_cache(maxsize=1)
-def _windows(
+def windows_of(
     data: EpisodeStore,
     task: Task,
     view: str,
@@ -312,7 +313,8 @@ def _trim_metrics(run: Run, step: int) -> None:
     rows = [r for r in run.metrics if r["step"] <= step]
     file = run.path / "metrics.jsonl"
     if file.exists():
-        file.write_text("".join(json.dumps(r) + "\n" for r in rows))
+        with whole(file) as temporary:
+            temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
 def _tensorboard(run: Run):

@@ -44,7 +44,7 @@ class WindowData:
         team = store.rewards.mean(1)
         row, last = step + episode, store.episode_ends[episode] + episode
         x = jnp.asarray(np.asarray(features(store.observations, store.state), np.float32))
-        self.steps, self.n_agents, self.feature_dim = store.steps, store.n_agents, x.shape[-1]
+        self.steps = store.steps
         self.critic = critic
         scores = np.zeros(store.steps)
         if condition is not None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ringfence import normalise
 from ringfence.nets import MLP
-from ringfence.optim import Optimiser
+from ringfence.optim import Optimiser, fresh
 from ringfence.policies import Direct, squash
 from ringfence.types import Array, Batch, Key, PyTree, Spec
 from ringfence.windows import WindowData, at
@@ -116,16 +116,7 @@ def soft_update(target: PyTree, params: PyTree, rate: float) -> PyTree:
 def start(networks, targets: tuple[str, ...], optimiser: Optimiser, frozen: PyTree) -> PyTree:
     """The state of a run: parameters made by `networks()`, copies of those named in `targets`, moments, step 0."""
 
-    def make() -> dict:
-        params = networks()
-        return {
-            "params": params,
-            "target": {name: jax.tree.map(jnp.copy, params[name]) for name in targets},
-            "opt": optimiser.init(params),
-            "step": jnp.zeros((), jnp.int32),
-        }
-
-    return jax.jit(make)() | {"frozen": frozen}
+    return jax.jit(lambda: fresh(optimiser, networks(), "target", targets))() | {"frozen": frozen}
 
 
 def make_actor(key: Key, spec: Spec, width: int) -> MLP:

@@ -12,7 +12,7 @@ from ringfence import features, normalise
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
-from ringfence.optim import Optimiser, average
+from ringfence.optim import Optimiser, average, fresh
 from ringfence.policies import Direct, squash
 from ringfence.types import Algorithm, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData, at
@@ -51,12 +51,7 @@ def init(
     def networks() -> dict:
         sizes = (d, *[config.width] * config.depth, spec.action_dim)
         params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
-        return {
-            "params": params,
-            "ema": jax.tree.map(jnp.copy, params),
-            "opt": _optimiser(config).init(params),
-            "step": jnp.zeros((), jnp.int32),
-        }
+        return fresh(_optimiser(config), params, "ema")
 
     if data is None:
         one, step = jnp.zeros(d), jnp.zeros((1, d))

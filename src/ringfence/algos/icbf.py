@@ -26,7 +26,7 @@ from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP, build_denoiser
 from ringfence.nets.heads import barrier_on, foresee, infer_action
-from ringfence.optim import Optimiser, average
+from ringfence.optim import Optimiser, average, fresh
 from ringfence.policies import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData, at
@@ -158,12 +158,7 @@ def init(
         if config.barrier:
             groups = n if config.scope == "individual" else 1
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
-        return {
-            "params": params,
-            "ema": jax.tree.map(jnp.copy, params),
-            "opt": optimiser(config).init(params),
-            "step": jnp.zeros((), jnp.int32),
-        }
+        return fresh(optimiser(config), params, "ema")
 
     frozen = blank_statistics(spec, config) if data is None else statistics(ks, config, data, hazard)
     return jax.jit(networks)() | {"frozen": frozen}
@@ -246,12 +241,6 @@ def visible_agents(config: Config, key: Key, shape: tuple[int, int]) -> Array:
     return jnp.where(jax.random.bernoulli(k2, 0.5, (shape[0], 1)), everyone, one)
 
 
-def inpainted(visible: Array, history: int, rows: int) -> Array:
-    """(B, H, N, 1) bool: entries of a plan that are known: the past and present rows of visible agents."""
-    known = jnp.arange(rows) <= history
-    return (known[None, :, None] & visible[:, None, :])[..., None]
-
-
 def carries_own(config: Config, feature_map: features.FeatureMap) -> bool:
     """Whether plans hold own entries only; needs a view that knows how the rest follows."""
     return config.carry == "own" and feature_map.reconcile is not None and config.net == "attention"
@@ -269,7 +258,9 @@ def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndar
 def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: Array, carried: Array):
     """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted."""
     k1, k2, k3 = jax.random.split(key, 3)
-    mask = inpainted(visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1])
+    mask = diffusion.known_entries(
+        visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1]
+    )
     noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
     keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
     output = params["denoiser"](noised.x, noised.k, batch.score, keep)
@@ -414,15 +405,15 @@ def barrier_losses(
         bank_loss = (jax.nn.relu(config.delta + bank_h) * own).sum() / jnp.maximum(own.sum(), 1)
         loss_omega = on_data.safe + on_data.unsafe + on_data.retention + bank_loss
         if unsafe_made is not None:
-            made_h = barrier_on(net, norm, jax.lax.stop_gradient(x[:m]))
+            made_h = barrier_on(net, norm, jax.lax.stop_gradient(x))
             # Unlabelled noise levels teach nothing: only estimates from mostly-signal plans count, by their weight.
             on_made = cbf.hinges(
                 made_h,
-                unsafe_made[:m],
-                safe_made[:m],
-                rows[:m],
+                unsafe_made,
+                safe_made,
+                rows,
                 *argued,
-                weight=jax.lax.stop_gradient(weight[:m]),
+                weight=jax.lax.stop_gradient(weight),
             )
             loss_omega = loss_omega + 0.5 * (on_made.safe + on_made.unsafe + on_made.retention)
     if unsafe_made is not None:
@@ -456,8 +447,7 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
             made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
             if carries_own(config, feature_map):
                 # Where others will be is what *they* plan: a gradient must move bodies, not one's image of them.
-                now = feature_map.reconcile(made.features[:, config.history :])
-                made = made._replace(features=jnp.concatenate([made.features[:, : config.history], now], 1))
+                made = made._replace(features=feature_map.agreed(made.features, config.history))
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
                 made = jax.lax.stop_gradient(made)
             omega, theta, more = barrier_losses(

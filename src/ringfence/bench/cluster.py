@@ -7,8 +7,8 @@ place whole. Ray repeats a task whose worker or node died.
 from __future__ import annotations
 
 import io
-import os
 import shutil
+import socket
 import tarfile
 import tempfile
 from pathlib import Path
@@ -23,12 +23,12 @@ RETRIES = 3
 
 def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: bool = False) -> dict[str, int]:
     """Make all unfinished cells on a Ray cluster (`auto`, host:port or ray://host:port; None starts a local one)."""
-    ray = connect(address)
+    ray, make = connect(address), packed
     grid.open()
 
     @ray.remote(num_cpus=threads, max_retries=RETRIES)
     def make_cell(cell: Cell, episodes: int) -> bytes:
-        return packed(cell, episodes)
+        return make(cell, episodes)
 
     with owned(grid.out):
         for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
@@ -55,15 +55,22 @@ def connect(address: str | None):
         raise UserError("The Ray engine needs an extra package; run pip install 'ringfence[ray]'.") from None
     if ray.is_initialized():
         return ray
-    os.environ.setdefault("RAY_gcs_rpc_server_reconnect_timeout_s", "10")
     try:
+        knock(address)
         ray.init(address=address, logging_level="ERROR", log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError, TimeoutError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
             f"No Ray cluster answers at address '{address}' ({str(error).splitlines()[0]}); start one with `ray start "
             "--head` or leave --address out."
         ) from None
     return ray
+
+
+def knock(address: str | None, seconds: float = 5.0) -> None:
+    """Fail at once where nobody listens; Ray itself would try for minutes."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if colon and port.isdigit():
+        socket.create_connection((host, int(port)), timeout=seconds).close()
 
 
 def packed(cell: Cell, episodes: int) -> bytes:

@@ -118,7 +118,7 @@ class _Pool:
         environment["XLA_FLAGS"] = flags.strip()
         environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(self.grid.out.resolve() / "compiled"))
         worker = subprocess.Popen(
-            [sys.executable, "-m", "ringfence.bench.worker"],
+            [sys.executable, "-c", "from ringfence.bench.worker import main; main()"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

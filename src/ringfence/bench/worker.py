@@ -59,7 +59,3 @@ def main() -> None:
             return
         except Exception as error:
             say(event="broken", error=f"{type(error).__name__}: {error}")
-
-
-if __name__ == "__main__":
-    main()

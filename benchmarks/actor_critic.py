@@ -1,0 +1,159 @@
+"""Updates per second of omar and ma-td3bc, beside a straightforward PyTorch loop over agents in the same run.
+
+    pip install torch
+    python benchmarks/actor_critic.py        # writes results/performance/actor_critic.json
+
+Three agents, batch 1024, the study's networks (two layers of 64). The loop is what one writes first: a module per agent
+and head, one agent after the other, minibatches indexed from tensors in memory. Both use all cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+from _common import record
+
+from ringfence import tasks, training
+from ringfence.data.make import make
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "actor_critic.json"
+
+
+def ours(algorithm: str, store, updates: int) -> tuple[float, float]:
+    """(updates per second, seconds to compile)."""
+    task = tasks.from_store(store)
+    job = training.make_job(algorithm, task, None, {}, store)
+    c = job.config
+    data = training.windows_of(store, task, c.view, None, c.discount, None, c.horizon, 0)
+    state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
+    advance, _ = training.make_program(job)
+    roots = jax.vmap(jax.random.key)(jnp.arange(1))
+    state = jax.tree.map(lambda x: x[None], state)
+    begun = time.perf_counter()
+    state, metrics = advance(state, roots, data.arrays, 1)
+    jax.block_until_ready(metrics)
+    compiling = time.perf_counter() - begun
+    rates = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        state, metrics = advance(state, roots, data.arrays, updates)
+        jax.block_until_ready(metrics)
+        rates.append(updates / (time.perf_counter() - begun))
+    return sorted(rates)[1], compiling
+
+
+def loop(algorithm: str, store, updates: int) -> float:
+    """Updates per second of the PyTorch loop."""
+    import torch
+    from torch import nn
+    from torch.nn import functional as F
+
+    n, batch, gamma, tau = 3, 1024, 0.95, 0.01
+    rows = len(store.actions)
+    episode = store.episode_of_step
+    here = torch.arange(rows) + torch.as_tensor(episode)
+    seen = torch.as_tensor(store.observations, dtype=torch.float32)
+    acted = torch.as_tensor(store.actions, dtype=torch.float32)
+    paid = torch.as_tensor(store.rewards, dtype=torch.float32)
+    d, a = seen.shape[-1], acted.shape[-1]
+
+    def network(inputs: int, outputs: int, *last) -> nn.Module:
+        layers = [nn.BatchNorm1d(inputs), nn.Linear(inputs, 64), nn.ReLU(), nn.Linear(64, 64), nn.ReLU()]
+        return nn.Sequential(*layers, nn.Linear(64, outputs), *last)
+
+    agents = []
+    for _ in range(n):
+        actor, critics = network(d, a, nn.Tanh()), [network(d + a, 1) for _ in range(2)]
+        targets = [network(d, a, nn.Tanh()), *[network(d + a, 1) for _ in range(2)]]
+        for target, net in zip(targets, [actor, *critics]):
+            target.load_state_dict(net.state_dict())
+        parameters = [p for q in critics for p in q.parameters()]
+        optimisers = torch.optim.Adam(actor.parameters(), 0.01), torch.optim.Adam(parameters, 0.01)
+        agents.append((actor, critics, targets, optimisers))
+
+    def value(critic: nn.Module, x, action):
+        return critic(torch.cat([x, action], -1))[:, 0]
+
+    def sampled(critic: nn.Module, x, actions):
+        b, s, _ = actions.shape
+        return value(critic, x.repeat_interleave(s, 0), actions.reshape(b * s, -1)).reshape(b, s)
+
+    def update() -> None:
+        for i, (actor, critics, targets, (of_actor, of_critics)) in enumerate(agents):
+            pick = torch.randint(rows, (batch,))
+            x, ahead = seen[here[pick], i], seen[here[pick] + 1, i]
+            action, reward = acted[pick, i], paid[pick, i]
+            with torch.no_grad():
+                after = targets[0](ahead)
+                goal = reward + gamma * torch.minimum(*[value(q, ahead, after) for q in targets[1:]])
+            loss = sum(F.mse_loss(value(q, x, action), goal) for q in critics)
+            if algorithm == "omar":
+                drawn = torch.rand(batch, 10, a) * 2 - 1
+                for q in critics:
+                    spread = torch.logsumexp(sampled(q, x, drawn) + a * torch.log(torch.tensor(2.0)), 1)
+                    loss = loss + 5.0 * (spread - value(q, x, action)).mean()
+            of_critics.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_([p for q in critics for p in q.parameters()], 0.5)
+            of_critics.step()
+            own = actor(x)
+            if algorithm == "omar":
+                with torch.no_grad():
+                    mean, deviation = torch.zeros(batch, a), torch.full((batch, a), 2.0)
+                    for _ in range(3):
+                        tried = (mean[:, None] + deviation[:, None] * torch.randn(batch, 10, a)).clamp(-1, 1)
+                        q = sampled(critics[0], x, tried)
+                        mean = (q.softmax(1)[..., None] * tried).sum(1)
+                        deviation = ((tried - mean[:, None]) ** 2).mean(1).sqrt()
+                    best = tried[torch.arange(batch), q.argmax(1)]
+                    better = q.max(1).values > value(critics[0], x, own)
+                    best = torch.where(better[:, None], best, own)
+                loss = F.mse_loss(own, best)
+            else:
+                q = value(critics[0], x, own)
+                loss = F.mse_loss(own, action) - 2.5 / q.abs().mean().detach() * q.mean()
+            loss = loss + 1e-3 * (own**2).mean()
+            of_actor.zero_grad()
+            loss.backward()
+            nn.utils.clip_grad_norm_(actor.parameters(), 0.5)
+            of_actor.step()
+            with torch.no_grad():
+                for target, net in zip(targets, [actor, *critics]):
+                    for p, q in zip(target.parameters(), net.parameters()):
+                        p.lerp_(q, tau)
+
+    update()
+    rates = []
+    for _ in range(3):
+        begun = time.perf_counter()
+        for _ in range(updates):
+            update()
+        rates.append(updates / (time.perf_counter() - begun))
+    return sorted(rates)[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--updates", type=int, default=60)
+    parser.add_argument("--out", type=Path, default=OUT)
+    a = parser.parse_args()
+    store, _ = make(tasks.get("simple_spread-expert"))
+    rows = []
+    for name in ("ma-td3bc", "omar"):
+        rate, compiling = ours(name, store, a.updates)
+        other = loop(name, store, a.updates)
+        rows += [
+            {"name": f"{name}, 3 agents, batch 1024", "value": rate, "unit": "updates/s"},
+            {"name": f"{name}, compile time", "value": compiling, "unit": "s"},
+            {"name": f"{name}, PyTorch loop", "value": other, "unit": "updates/s"},
+            {"name": f"{name}, over the PyTorch loop", "value": rate / other, "unit": "x"},
+        ]
+    record(a.out, rows)
+
+
+if __name__ == "__main__":
+    main()
