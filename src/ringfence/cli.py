@@ -216,15 +216,19 @@ PLAN_OPTIONS = (
 def report(
     runs: Positional[list[Path]], out_file: Annotated[Path, tyro.conf.arg(name="out")] = Path("report.html")
 ) -> None:
-    """One self-contained HTML page from evaluated runs.
+    """One self-contained HTML page from evaluated runs, or the leaderboard of a benchmark's results folder.
 
     Args:
-        runs: run folders, or folders that hold some.
+        runs: run folders, or folders that hold some; or one results folder, which has a bench.json.
         out_file: the page.
     """
-    from ringfence.report import build_report
+    from ringfence.report import build_board, build_report
+    from ringfence.report.board import is_board
 
-    print(build_report(_runs(runs), out_file))
+    boards = [path for path in runs if is_board(path)]
+    if boards and len(runs) > 1:
+        raise UserError(f"'{boards[0]}' is a results folder, and a page shows one of them; give it alone.")
+    print(build_board(boards[0], out_file) if boards else build_report(_runs(runs), out_file))
 
 
 def doctor() -> None:

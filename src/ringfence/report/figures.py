@@ -17,7 +17,7 @@ from ringfence.errors import UserError
 from ringfence.report.table import Row, Section
 from ringfence.runs import Run
 
-COLOURS = 7  # series colours in style.css
+COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
 INK, GRID = "#010203", "#010204"
 STYLE = {

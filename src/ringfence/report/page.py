@@ -37,11 +37,14 @@ def build_report(runs: Iterable[Run | str | Path], out: str | Path, title: str |
     out = out / "report.html" if out.is_dir() else out
     context = {
         "title": title or "Ringfence report: " + ", ".join(s.task for s in found),
-        "version": __version__,
-        "css": Markup(_asset("style.css")),
         "js": Markup(_asset("player.js")),
         "sections": [_section(s, k, out) for k, s in enumerate(found)],
     }
+    return _write(out, render("template.html.j2", context))
+
+
+def render(template: str, context: dict) -> str:
+    """A page from one of the templates beside this file; a name that the context lacks is an error."""
     engine = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE),
         autoescape=True,
@@ -49,8 +52,8 @@ def build_report(runs: Iterable[Run | str | Path], out: str | Path, title: str |
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    engine.filters |= {"count": _count, "share": _share, "number": _number, "duration": _duration}
-    return _write(out, engine.get_template("template.html.j2").render(context))
+    engine.filters |= {"count": _count, "share": share, "number": _number, "duration": _duration}
+    return engine.get_template(template).render(version=__version__, css=Markup(_asset("style.css")), **context)
 
 
 def _asset(name: str) -> str:
@@ -88,8 +91,8 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "players_json": Markup(json.dumps(recorded).replace("<", "\\u003c")),
         "commands": commands(section, out),
         "differences": differences(section),
-        "environments": _environments(section.runs),
-        "card": _facts(section.card),
+        "environments": environments(section.runs),
+        "card": facts(section.card),
         "regenerated": "regenerated" in str(section.card.get("provenance", "")),
     }
 
@@ -122,7 +125,7 @@ def headline(section: Section) -> list[str]:
         )
         said.append(
             f"{lead} {best.returns:.1f} per episode (95 % interval {_range(best.returns_interval, 1)}), with {event} "
-            f"in {_share(best.violation_rate)} of {best.episodes:,} episodes, at most {_share(best.violation_upper)} "
+            f"in {share(best.violation_rate)} of {best.episodes:,} episodes, at most {share(best.violation_upper)} "
             "with 95 % confidence."
         )
         near = [r for r in safe if r is not best and r.returns_interval[1] >= best.returns_interval[0]]
@@ -154,7 +157,7 @@ def _range(interval: tuple[float, float], digits: int) -> str:
     return f"{interval[0]:.{digits}f} to {interval[1]:.{digits}f}"
 
 
-def _share(x: float) -> str:
+def share(x: float) -> str:
     """A probability as a percentage that never rounds a danger away."""
     percent = 100 * x
     return f"{percent:.1f} %" if percent >= 1 or percent == 0 else f"{percent:.2f} %"
@@ -306,19 +309,19 @@ def differences(section: Section) -> list[dict]:
     return list(found.values())
 
 
-def _environments(runs: list[Run]) -> list[dict]:
+def environments(runs: list[Run]) -> list[dict]:
     """Distinct env.json of the runs, flattened, with the runs' names where there are several."""
     found: dict[str, dict] = {}
     for run in runs:
         file = run.path / "env.json"
         told = read_json(file, "has a damaged env.json; delete that file") if file.exists() else {}
         if told:
-            entry = found.setdefault(json.dumps(told, sort_keys=True), {"facts": _facts(told), "runs": []})
+            entry = found.setdefault(json.dumps(told, sort_keys=True), {"facts": facts(told), "runs": []})
             entry["runs"].append(f"{run.path.parent.name}/{run.path.name}")
     return list(found.values())
 
 
-def _facts(told: dict) -> list[tuple[str, str]]:
+def facts(told: dict) -> list[tuple[str, str]]:
     """A JSON object as rows of a list; long entries are cut, since the file itself lies in the run folder."""
     rows = []
     for name, value in told.items():

@@ -18,7 +18,11 @@ SPLITS = ("test", "validation")
 NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
-    "matd3bc": "MA-TD3BC",
+    "ma-td3bc": "MA-TD3BC",
+    "ma-td3bc-lag": "MA-TD3BC with a cost multiplier",
+    "fisor": "FISOR",
+    "ma-cql": "MA-CQL",
+    "ma-icq": "MA-ICQ",
     "omar": "OMAR",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
@@ -203,7 +207,7 @@ def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
                 f"'{members[k][0].path}' and '{members[seeds.index(seed)][0].path}' are the same job with the same "
                 f"seed {seed}; give only one of them."
             )
-    shown = re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
+    shown = plain_variant(variant)
     apart = differing.get((told["algorithm"], told["preset"]), [])
     if apart:
         shown += " [" + ", ".join(f"{k}={told['config'][k]}" for k in apart) + "]"
@@ -222,6 +226,11 @@ def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
         members=members,
         **_numbers(results),
     )
+
+
+def plain_variant(variant: str) -> str:
+    """A variant's name without what a table says elsewhere: `default+plans4@validation` -> `plans4`."""
+    return re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
 
 
 def _mean(results: list[dict], key: str) -> float | None:

@@ -1,0 +1,175 @@
+"""The leaderboard of a results folder on one page that needs nothing but itself."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from markupsafe import Markup
+
+from ringfence.files import whole
+from ringfence.report import board_figures, figures
+from ringfence.report.board import Board, Method, read
+from ringfence.report.page import WORDS, environments, facts, headline, render
+from ringfence.report.published import NOTE, PUBLISHED, matches
+from ringfence.report.standings import DRAWS, Standing, aggregate, references, standings
+from ringfence.report.table import Section
+from ringfence.runs import Run
+
+
+def build_board(folder: str | Path, out: str | Path, title: str | None = None) -> Path:
+    """Write the leaderboard of a results folder as one self-contained HTML page and return its path.
+
+    `out` is the page, or a folder that gets `report.html`. `UserError` where the folder holds no finished cell or
+    numbers that must not be compared.
+    """
+    board = read(folder)
+    out = Path(out)
+    out = out / "report.html" if out.is_dir() else out
+    text = render("board.html.j2", _context(board, out, title))
+    with whole(out) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return out
+
+
+def _context(board: Board, out: Path, title: str | None) -> dict:
+    tables, rows_to_beat = standings(board), references(board)
+    styles = {r.method: r.style for rows in tables.values() for r in rows}
+    return {
+        "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
+        "board": board,
+        "draws": DRAWS,
+        "ranking": ranking(board, tables),
+        "sections": [_section(board, t, k, tables[t], rows_to_beat[t], out) for k, t in enumerate(board.tasks)],
+        "aggregate": _aggregate(board, styles),
+        "expenses": Markup(board_figures.expenses(_typical(board, tables), "expenses")),
+        "published": published(board, tables),
+        "note": NOTE,
+        "missing": _missing(board),
+        "environments": environments(board.runs),
+        "several_seeds": len(board.seeds) > 1,
+    }
+
+
+def short(task: str, suite: str) -> str:
+    """`simple_spread-expert` -> `expert` on a board of simple_spread."""
+    return task.removeprefix(f"{suite}-") or task
+
+
+def ranking(board: Board, tables: dict[str, list[Standing]]) -> list[dict]:
+    """Methods by their mean rank over the tasks; those that lack a task come last, since they have none."""
+    rows = []
+    for m in board.methods:
+        cells = [next((r for r in tables[t] if r.method == m), None) for t in board.tasks]
+        whole_row = all(cells)
+        mean = float(np.mean([c.rank for c in cells])) if whole_row else None
+        style = next(c.style for c in cells if c)
+        rows.append({"name": m.name, "variant": m.shown, "style": style, "reference": False, "cells": cells})
+        rows[-1] |= {"mean": mean, "within": sum(c.safe for c in cells if c), "measured": sum(map(bool, cells))}
+    return sorted(rows, key=lambda r: (r["mean"] is None, r["mean"] or 0.0))
+
+
+def published(board: Board, tables: dict[str, list[Standing]]) -> dict | None:
+    """Printed values with ours below them, for the tasks of this board; None where nothing was printed."""
+    tasks = [t for t in board.tasks if any(t in p.values for p in PUBLISHED)]
+    if not tasks:
+        return None
+    rows = []
+    for k, p in enumerate(PUBLISHED):
+        ours = []
+        again = any(p.algorithms == later.algorithms for later in PUBLISHED[k + 1 :])  # ours follow the last of them
+        for m in (m for m in board.methods if matches(p, m.algorithm) and not again):
+            cells = [next((r for r in tables[t] if r.method == m), None) for t in tasks]
+            ours.append({"label": m.label, "numbers": [c and 100 * c.returns_norm for c in cells]})
+        rows.append({"name": p.name, "source": p.source, "numbers": [p.values.get(t) for t in tasks], "ours": ours})
+    return {"tasks": [short(t, board.suite) for t in tasks], "rows": rows}
+
+
+def _section(board: Board, task: str, k: int, rows: list[Standing], rows_to_beat: list[Standing], out: Path) -> dict:
+    told = rows[0].entries[0].path if rows else None
+    config = Run(told).config if told else {}
+    hazard = config.get("hazard") or {}
+    card = config.get("data") or {}
+    unit, event = WORDS.get(hazard.get("kind"), ("cost", "a violation"))
+    constants = board.constants.get(task)
+    section = Section(task, hazard, card, constants, board.protocol, [], {board.split: rows}, rows_to_beat)
+    drawn = figures.scatter(section, rows, f"{unit} per episode", f"s{k}") if rows else None
+    return {
+        "id": f"task{k}",
+        "task": task,
+        "short": short(task, board.suite),
+        "unit": unit,
+        "headline": _headline(section, board),
+        "rows": rows,
+        "references": rows_to_beat,
+        "absent": _absent(board, rows),
+        "constants": constants,
+        "scatter": Markup(drawn) if drawn else None,
+        "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],
+        "card": facts(card),
+        "regenerated": "regenerated" in str(card.get("provenance", "")),
+    }
+
+
+def _headline(section: Section, board: Board) -> list[str]:
+    if not section.tables[board.split]:
+        return ["No method has been measured on this task yet."]
+    return headline(section)
+
+
+def _absent(board: Board, rows: list[Standing]) -> list[Method]:
+    """Methods of the board that this task has no result of: they get a row that says so."""
+    there = {r.method for r in rows}
+    return [m for m in board.methods if m not in there]
+
+
+def _missing(board: Board) -> list[dict]:
+    """Cells without a result; seeds of one job that lack it for the same reason share a line."""
+    groups: dict[tuple, list[int]] = {}
+    for m in board.missing:
+        groups.setdefault((m.task, m.job, m.why), []).append(m.seed)
+    return [{"task": task, "job": job, "why": why, "seeds": seeds} for (task, job, why), seeds in groups.items()]
+
+
+def _link(file: Path, out: Path) -> tuple[str, str]:
+    """(text, href): the path from the page's folder."""
+    relative = Path(os.path.relpath(file.resolve(), out.resolve().parent)).as_posix()
+    return relative, quote(relative)
+
+
+def _aggregate(board: Board, styles: dict) -> dict | None:
+    told = aggregate(board)
+    if told is None:
+        return None
+    best_first = sorted(told.methods, key=lambda m: -told.iqm_returns[m][0])
+    order = [told.methods.index(m) for m in best_first]
+    pick = np.ix_(order, order)
+    several = len(told.methods) > 1
+    return {
+        "overall": Markup(board_figures.overall(told, styles, "overall")),
+        "rows": [
+            {
+                "name": m.name,
+                "variant": m.shown,
+                "style": styles[m],
+                "reference": False,
+                "returns": told.iqm_returns[m],
+                "costs": told.iqm_costs[m],
+                "seeds": len(told.seeds[m]),
+            }
+            for m in best_first
+        ],
+        "earns": Markup(board_figures.duels(told.improves[pick], best_first, "earns more", "earns")) if several else "",
+        "costs": Markup(board_figures.duels(told.cheaper[pick], best_first, "costs less", "costs")) if several else "",
+        "profiles": Markup(board_figures.profiles(told, styles, "profiles")),
+        "left_out": [(m.label, [short(t, board.suite) for t in at]) for m, at in told.left_out.items()],
+        "fewer": [(m.label, told.seeds[m]) for m in told.methods if len(told.seeds[m]) < len(board.seeds)],
+    }
+
+
+def _typical(board: Board, tables: dict[str, list[Standing]]) -> list[Standing]:
+    """One row per method for the figure of time and size: that of the first task it was measured on."""
+    rows = {r.method: r for t in reversed(board.tasks) for r in tables[t]}
+    return [rows[m] for m in board.methods]

@@ -1,0 +1,237 @@
+"""The leaderboard as text for other programs: CSV, LaTeX (booktabs) and Markdown, whole or short."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+from ringfence.errors import unknown
+from ringfence.files import whole
+from ringfence.report.board import Board, Method, read
+from ringfence.report.board_page import ranking, short
+from ringfence.report.page import share
+from ringfence.report.standings import Standing, references, standings
+
+# CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
+COLUMNS = (
+    "suite, task, algorithm, preset, variant, method, rank, within_limit, best, return_mean, return_sd, return_low, "
+    "return_high, return_norm, cost_mean, cost_sd, cost_low, cost_high, cost_norm, avoidable_cost, avoidable_low, "
+    "avoidable_high, unsafe_episodes, unsafe_upper, seeds, episodes, train_seconds, plan_ms_p50, parameters"
+).split(", ")
+
+
+def export_board(folder: str | Path, form: str, out: str | Path) -> Path:
+    """Write the leaderboard of a results folder to the file `out`; `form` is a name in FORMS."""
+    if form not in FORMS:
+        raise unknown("format", form, FORMS)
+    text, out = FORMS[form](read(folder)), Path(out)
+    with whole(out) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    return out
+
+
+def _rows(board: Board) -> dict[str, list[Standing | Method]]:
+    """By task: standings by rank, then the methods that were not measured on it, then the references."""
+    tables, rows_to_beat = standings(board), references(board)
+    absent = {t: [m for m in board.methods if not board.of(t, m)] for t in board.tasks}
+    return {t: [*tables[t], *absent[t], *rows_to_beat[t]] for t in board.tasks}
+
+
+# --- CSV ---
+
+
+def board_csv(board: Board) -> str:
+    """One line per task and method, references included; full precision to six digits."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    for task, rows in _rows(board).items():
+        for r in rows:
+            known = {"suite": board.suite, "task": task} | (_absent(r) if isinstance(r, Method) else _numbers(r))
+            writer.writerow({k: _plain(v) for k, v in known.items()})
+    return file.getvalue()
+
+
+def _absent(m: Method) -> dict:
+    return {"algorithm": m.algorithm, "preset": m.preset, "variant": m.variant, "method": m.label, "seeds": 0}
+
+
+def _numbers(r: Standing) -> dict:
+    who = {"method": r.label, "variant": "reference"}
+    if r.method:
+        who = {"algorithm": r.method.algorithm, "preset": r.method.preset, "variant": r.method.variant}
+        who |= {"method": r.label, "rank": r.rank, "best": int(r.best), "seeds": len(r.seeds)}
+    return who | {
+        "within_limit": int(r.safe),
+        "return_mean": r.returns,
+        "return_sd": r.returns_sd,
+        "return_low": r.returns_interval[0],
+        "return_high": r.returns_interval[1],
+        "return_norm": r.returns_norm,
+        "cost_mean": r.cost,
+        "cost_sd": r.cost_sd,
+        "cost_low": r.cost_interval[0],
+        "cost_high": r.cost_interval[1],
+        "cost_norm": r.cost_norm,
+        "avoidable_cost": r.avoidable,
+        "avoidable_low": r.avoidable_interval[0],
+        "avoidable_high": r.avoidable_interval[1],
+        "unsafe_episodes": r.violation_rate,
+        "unsafe_upper": r.violation_upper,
+        "episodes": r.episodes,
+        "train_seconds": r.train_seconds,
+        "plan_ms_p50": r.plan_ms,
+        "parameters": r.parameters,
+    }
+
+
+def _plain(value):
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+# --- LaTeX ---
+
+SPECIAL = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "≤": r"$\le$",
+    "±": r"$\pm$",
+    "–": "--",
+    "−": "$-$",
+} | {c: f"\\{c}" for c in "&%$#_{}"}
+HEAD = r"Method & Return & Norm.\ return & Cost & Avoidable cost & Unsafe episodes (\%) & Seeds \\"
+
+
+def escape(text: str) -> str:
+    """Text that LaTeX prints as it stands."""
+    return "".join(SPECIAL.get(c, c) for c in text)
+
+
+def board_latex(board: Board) -> str:
+    """A booktabs `tabular` per task: ± is the deviation between seeds, bold the best within the limit, † over it."""
+    lines = ["% needs \\usepackage{booktabs}"]
+    for task, rows in _rows(board).items():
+        c = board.constants.get(task)
+        limit = f", cost limit {c['cost_limit']:g} per episode" if c else ""
+        lines += [
+            "",
+            f"% {task}{limit}, {board.episodes} {board.split} episodes per seed, protocol {board.protocol}",
+            "% bold: the highest return within the limit; dagger: over the limit; in brackets: exact 95 % upper bound",
+            r"\begin{tabular}{lrrrrrr}",
+            r"\toprule",
+            HEAD,
+            r"\midrule",
+        ]
+        between = False
+        for r in rows:
+            if isinstance(r, Standing) and r.reference and not between:
+                between = True
+                lines.append(r"\midrule")
+            lines.append(_latex(r))
+        lines += [r"\bottomrule", r"\end{tabular}"]
+    return "\n".join(lines) + "\n"
+
+
+def _latex(r: Standing | Method) -> str:
+    name = escape(r.label)
+    if isinstance(r, Method):
+        return " & ".join([name, *["--"] * 5, "0"]) + r" \\"
+    returns = _pm(r.returns, r.returns_sd, 1, r"\pm")
+    norm = _pm(r.returns_norm, r.returns_norm_sd, 2, r"\pm")
+    cost = _pm(r.cost, r.cost_sd, 2, r"\pm") + ("" if r.safe else r"^{\dagger}")
+    cells = [returns, norm, cost, f"{r.avoidable:.3f}"]
+    cells += [rf"{100 * r.violation_rate:.1f}\;({100 * r.violation_upper:.1f})"]
+    if r.best:
+        name, cells = rf"\textbf{{{name}}}", [rf"\mathbf{{{c}}}" for c in cells]
+    return " & ".join([name, *(f"${c}$" for c in cells), str(len(r.seeds)) if r.method else "--"]) + r" \\"
+
+
+def _pm(value: float, deviation: float | None, digits: int, sign: str) -> str:
+    text = f"{value:.{digits}f}"
+    return text if deviation is None else f"{text} {sign} {deviation:.{digits}f}"
+
+
+# --- Markdown ---
+
+
+def board_markdown(board: Board) -> str:
+    """A table per task with every column of the page that is a number."""
+    head = ["method", "rank", "return", "norm. return", "cost", "avoidable cost", "unsafe episodes", "seeds"]
+    head += ["training s", "plan ms", "parameters"]
+    blocks = []
+    for task, rows in _rows(board).items():
+        c = board.constants.get(task)
+        facts = (
+            f", cost limit {c['cost_limit']:g}, normalised with {c['return_min']:g} → {c['return_max']:g}" if c else ""
+        )
+        blocks.append(f"**{_cell(task)}**{facts}\n\n" + _table(head, [_markdown(r, board) for r in rows]))
+    return "\n\n".join([*blocks, "± standard deviation between seeds. " + _legend(board)]) + "\n"
+
+
+def board_markdown_short(board: Board) -> str:
+    """One table, methods by tasks: normalised return and avoidable cost, by mean rank."""
+    tables, rows_to_beat = standings(board), references(board)
+    head = ["norm. return (avoidable cost)", *(short(t, board.suite) for t in board.tasks), "mean rank"]
+    rows = []
+    names = dict.fromkeys(r.name for t in board.tasks for r in rows_to_beat[t])
+    for name in names:
+        cells = [next((r for r in rows_to_beat[t] if r.name == name), None) for t in board.tasks]
+        rows.append([name, *map(_brief, cells), "–"])
+    for row in ranking(board, tables):
+        mean = "–" if row["mean"] is None else f"{row['mean']:.2f}"
+        rows.append([f"{row['name']} {row['variant']}".strip(), *map(_brief, row["cells"]), mean])
+    return _table(head, rows) + "\n\n" + _legend(board) + "\n"
+
+
+def _markdown(r: Standing | Method, board: Board) -> list[str]:
+    if isinstance(r, Method):
+        return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *["–"] * 3]
+    returns, norm = _pm(r.returns, r.returns_sd, 1, "±"), _pm(r.returns_norm, r.returns_norm_sd, 3, "±")
+    several = f"{len(r.seeds)}" if len(r.seeds) == len(board.seeds) else f"{len(r.seeds)} of {len(board.seeds)}"
+    return [
+        r.label,
+        str(r.rank or "–"),
+        f"**{returns}**" if r.best else returns,
+        norm,
+        _pm(r.cost, r.cost_sd, 3, "±") + ("" if r.safe else " †"),
+        f"{r.avoidable:.3f} ({r.avoidable_interval[0]:.3f} to {r.avoidable_interval[1]:.3f})",
+        f"{share(r.violation_rate)} (≤ {share(r.violation_upper)})",
+        several if r.method else "–",
+        "–" if r.train_seconds is None else f"{r.train_seconds:,.0f}",
+        "–" if r.plan_ms is None else f"{r.plan_ms:.1f}",
+        "–" if r.parameters is None else f"{r.parameters:,}",
+    ]
+
+
+def _brief(r: Standing | None) -> str:
+    if r is None:
+        return "not measured"
+    text = f"{r.returns_norm:.2f} ({r.avoidable:.3f})" + ("" if r.safe else " †")
+    return f"**{text}**" if r.best else text
+
+
+def _legend(board: Board) -> str:
+    return (
+        "**Bold**: the highest return within the cost limit; †: over the limit. "
+        f"{board.episodes} {board.split} episodes per seed, protocol {board.protocol}."
+    )
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *([_cell(c) for c in row] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    """A bar would end the cell, an underscore might begin an emphasis."""
+    return text.replace("|", "\\|").replace("_", "\\_")
+
+
+FORMS = {
+    "csv": board_csv,
+    "latex": board_latex,
+    "markdown": board_markdown,
+    "markdown-short": board_markdown_short,
+}

@@ -1,0 +1,302 @@
+"""From a board's rows to numbers: one standing per task and method, ranks, and what holds over all tasks."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ringfence import stats
+from ringfence.report.board import Board, Entry, Method
+from ringfence.report.figures import COLOURS
+from ringfence.types import Array
+
+DRAWS = 2000  # of every bootstrap
+Interval = tuple[float, float]
+
+
+@dataclass
+class Standing:
+    """A method on a task over its seeds, or a reference policy. Intervals are 95 %; all numbers are per episode."""
+
+    task: str
+    name: str
+    variant: str
+    method: Method | None  # None: a reference
+    seeds: tuple[int, ...]
+    episodes: int  # over all seeds
+    returns: float
+    returns_sd: float | None  # between seeds; None with fewer than two
+    returns_interval: Interval
+    returns_norm: float
+    returns_norm_sd: float | None
+    cost: float
+    cost_sd: float | None
+    cost_interval: Interval
+    cost_norm: float
+    avoidable: float
+    avoidable_interval: Interval
+    violations: int
+    violation_upper: float  # exact, one-sided, episodes pooled
+    safe: bool  # the upper end of the cost's interval is within the limit
+    train_seconds: float | None = None  # of one seed
+    plan_ms: float | None = None  # median of one joint action
+    parameters: int | None = None
+    rank: int = 0  # on this task, from 1; 0 for references
+    best: bool = False  # the highest return among the safe
+    style: tuple[int, int] = (0, 0)  # colour, marker
+    entries: list[Entry] = field(default_factory=list, repr=False)
+
+    @property
+    def reference(self) -> bool:
+        return self.method is None
+
+    @property
+    def violation_rate(self) -> float:
+        return self.violations / self.episodes
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} {self.variant}".strip()
+
+
+@dataclass
+class Aggregate:
+    """What holds over all tasks, for the methods that were measured on every one of them.
+
+    Scores are arrays (seeds, tasks): normalised return, and normalised cost, whose limit is 1.
+    """
+
+    tasks: list[str]
+    methods: list[Method]
+    seeds: dict[Method, tuple[int, ...]]  # those that every task has
+    left_out: dict[Method, list[str]]  # method -> tasks on which seeds are missing
+    returns: dict[Method, Array]
+    costs: dict[Method, Array]
+    iqm_returns: dict[Method, tuple[float, Interval]]
+    iqm_costs: dict[Method, tuple[float, Interval]]
+    improves: Array  # (M, M): probability that the row's return beats the column's
+    cheaper: Array  # (M, M): probability that the row's cost is below the column's
+    return_thresholds: Array  # (K,)
+    return_profiles: Array  # (M, K)
+    cost_thresholds: Array  # (K,)
+    cost_profiles: Array  # (M, K)
+
+
+def standings(board: Board) -> dict[str, list[Standing]]:
+    """By task: the methods that were measured on it, ranked, in the order of rank."""
+    styles = _styles(board.methods)
+    made = {}
+    for task in board.tasks:
+        rows = [_standing(board, task, m, styles[m]) for m in board.methods if board.of(task, m)]
+        made[task] = _ranked(rows, board.constants[task]["cost_limit"]) if rows else []
+    return made
+
+
+def references(board: Board) -> dict[str, list[Standing]]:
+    """By task: the rows that every method is read against."""
+    return {t: [_reference(t, name, r) for name, r in board.references.get(t, {}).items()] for t in board.tasks}
+
+
+def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
+    """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
+    rest, by cost."""
+    order = stats.rank([r.returns for r in rows], [r.cost_interval[1] for r in rows], limit)
+    rows = [rows[i] for i in order]
+    for place, row in enumerate(rows, 1):
+        row.rank = place
+        row.best = row.safe and place == 1
+    return rows
+
+
+def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -> Standing:
+    entries = board.of(task, method)
+    told = [e.summary for e in entries]
+    c = board.constants[task]
+    means = {k: np.array([s[k] for s in told]) for k in ("return_mean", "cost_mean", "avoidable_cost")}
+    each = {k: np.array([s["per_episode"][k] for s in told], float) for k in ("return", "cost", "unsafe_start")}
+    fine = each["unsafe_start"] == 0
+    fine = fine if fine.any() else np.ones_like(fine)
+    avoidable = each["cost"] if not each["unsafe_start"].all() else np.zeros_like(each["cost"])
+    cost_interval = interval(each["cost"])
+    sd = _deviation(means["return_mean"])
+    episodes = sum(s["episodes"] for s in told)
+    violations = sum(round(s["violation_rate"] * s["episodes"]) for s in told)
+    return Standing(
+        task=task,
+        name=method.name,
+        variant=method.shown,
+        method=method,
+        seeds=tuple(e.seed for e in entries),
+        episodes=episodes,
+        returns=float(means["return_mean"].mean()),
+        returns_sd=sd,
+        returns_interval=interval(each["return"]),
+        returns_norm=float(_normal_return(means["return_mean"].mean(), c)),
+        returns_norm_sd=None if sd is None else sd / (c["return_max"] - c["return_min"]),
+        cost=float(means["cost_mean"].mean()),
+        cost_sd=_deviation(means["cost_mean"]),
+        cost_interval=cost_interval,
+        cost_norm=float(_normal_cost(means["cost_mean"].mean(), c)),
+        avoidable=float(means["avoidable_cost"].mean()),
+        avoidable_interval=interval(avoidable, fine),
+        violations=violations,
+        violation_upper=stats.upper_bound(violations, episodes),
+        safe=cost_interval[1] <= c["cost_limit"],
+        train_seconds=_mean(told, "train_seconds"),
+        plan_ms=_mean(told, "plan_ms_p50"),
+        parameters=told[0].get("parameters"),
+        style=style,
+        entries=entries,
+    )
+
+
+def _reference(task: str, name: str, told: dict) -> Standing:
+    violations = round(told["violation_rate"] * told["episodes"])
+    c = told["constants"]
+    return Standing(
+        task=task,
+        name=name,
+        variant="",
+        method=None,
+        seeds=(),
+        episodes=told["episodes"],
+        returns=told["return_mean"],
+        returns_sd=None,
+        returns_interval=tuple(told["return_interval"]),
+        returns_norm=_normal_return(told["return_mean"], c),
+        returns_norm_sd=None,
+        cost=told["cost_mean"],
+        cost_sd=None,
+        cost_interval=tuple(told["cost_interval"]),
+        cost_norm=_normal_cost(told["cost_mean"], c),
+        avoidable=told["avoidable_cost"],
+        avoidable_interval=tuple(told["avoidable_interval"]),
+        violations=violations,
+        violation_upper=stats.upper_bound(violations, told["episodes"]),
+        safe=told["cost_interval"][1] <= c["cost_limit"],
+    )
+
+
+def interval(x: np.ndarray, counted: np.ndarray | None = None, level: float = 0.95) -> Interval:
+    """Percentile bootstrap interval of the mean of x (seeds, episodes), over the entries that are `counted`.
+
+    Seeds and episodes are both resampled. All seeds play the same resets, so an episode is drawn for all of them at
+    once; with a single seed what is left is the bootstrap over episodes (two-way: Owen 2007, The pigeonhole bootstrap).
+    """
+    seeds, episodes = _weights(*x.shape)
+    counted = np.ones_like(x) if counted is None else counted.astype(float)
+    total = ((seeds @ (x * counted)) * episodes).sum(1)
+    number = ((seeds @ counted) * episodes).sum(1)
+    tail = (1 - level) / 2 * 100
+    low, high = np.percentile(total[number > 0] / number[number > 0], [tail, 100 - tail])
+    return float(low), float(high)
+
+
+@functools.lru_cache(maxsize=32)
+def _weights(seeds: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
+    """How often each draw takes each seed (DRAWS, seeds) and each episode (DRAWS, episodes). All rows share them."""
+    rng = np.random.default_rng(0)
+    return tuple(rng.multinomial(n, np.full(n, 1 / n), DRAWS).astype(float) for n in (seeds, episodes))
+
+
+def _normal_return(x, c: dict[str, float]):
+    """0 at return_min, 1 at return_max."""
+    return (x - c["return_min"]) / (c["return_max"] - c["return_min"])
+
+
+def _normal_cost(x, c: dict[str, float]):
+    """1 at the limit."""
+    return (x + c["cost_offset"]) / (c["cost_limit"] + c["cost_offset"])
+
+
+def _deviation(x: np.ndarray) -> float | None:
+    return float(x.std(ddof=1)) if len(x) > 1 else None
+
+
+def _mean(results: list[dict], key: str) -> float | None:
+    values = [r[key] for r in results if r.get(key) is not None]
+    return float(np.mean(values)) if values else None
+
+
+def _styles(methods: list[Method]) -> dict[Method, tuple[int, int]]:
+    """A colour per algorithm and preset; no two methods have both colour and marker in common."""
+    families: dict[tuple, int] = {}
+    taken: dict[int, int] = {}
+    styles = {}
+    for m in methods:
+        colour = families.setdefault((m.algorithm, m.preset), len(families)) % COLOURS
+        taken[colour] = taken.get(colour, -1) + 1
+        styles[m] = colour, taken[colour]
+    return styles
+
+
+# --- over all tasks ---
+
+
+def aggregate(board: Board) -> Aggregate | None:
+    """Statistics over tasks; None where no method was measured on every task with one and the same seed."""
+    seeds, left_out = {}, {}
+    for m in board.methods:
+        had = {t: {e.seed for e in board.of(t, m)} for t in board.tasks}
+        common = tuple(sorted(set.intersection(*had.values())))
+        if common:
+            seeds[m] = common
+        else:
+            left_out[m] = [t for t in board.tasks if not had[t]] or list(board.tasks)
+    methods = list(seeds)
+    if not methods:
+        return None
+    returns, costs, episode_costs = {}, {}, {}
+    for m in methods:
+        cells = [[_entry(board, t, m, s) for t in board.tasks] for s in seeds[m]]
+        score = [[_normal_return(e.summary["return_mean"], board.constants[e.task]) for e in row] for row in cells]
+        price = [[_normal_cost(e.summary["cost_mean"], board.constants[e.task]) for e in row] for row in cells]
+        returns[m], costs[m] = np.array(score), np.array(price)
+        episode_costs[m] = np.array(
+            [
+                [_normal_cost(np.array(e.summary["per_episode"]["cost"]), board.constants[e.task]) for e in row]
+                for row in cells
+            ]
+        )
+    low, high = _range(returns)
+    return_thresholds = np.linspace(low, high, 101)
+    top = int(np.ceil(max(3.0, *(float(np.quantile(c, 0.9)) for c in episode_costs.values()))))
+    cost_thresholds = np.linspace(0.0, top, 20 * top + 1)  # whole numbers are among them, since costs count steps
+    return Aggregate(
+        tasks=board.tasks,
+        methods=methods,
+        seeds=seeds,
+        left_out=left_out,
+        returns=returns,
+        costs=costs,
+        iqm_returns={m: _iqm(returns[m]) for m in methods},
+        iqm_costs={m: _iqm(costs[m]) for m in methods},
+        improves=_pairs(returns, methods),
+        cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
+        return_thresholds=return_thresholds,
+        return_profiles=np.array([stats.profile(returns[m], return_thresholds) for m in methods]),
+        cost_thresholds=cost_thresholds,
+        cost_profiles=np.array([stats.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
+    )
+
+
+def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
+    return next(e for e in board.of(task, method) if e.seed == seed)
+
+
+def _iqm(scores: Array) -> tuple[float, Interval]:
+    """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
+    return float(stats.iqm(scores)), stats.stratified_bootstrap(scores, stats.iqm, draws=DRAWS)
+
+
+def _pairs(scores: dict[Method, Array], methods: list[Method]) -> Array:
+    """(M, M) probability that a run of the row scores higher than one of the column, averaged over tasks."""
+    return np.array([[stats.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])
+
+
+def _range(scores: dict[Method, Array]) -> Interval:
+    """From the worst to the best run, at least from 0 to 1."""
+    low, high = min(s.min() for s in scores.values()), max(s.max() for s in scores.values())
+    return min(0.0, float(low)), max(1.0, float(high))
