@@ -13,7 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from ringfence.bench import table as bench
+from ringfence.report import board, export
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -59,7 +59,7 @@ def main() -> None:
             continue
         groups[row["task"], row["algorithm"], row["variant"]].append(row)
     put("README.md", "table", spread(groups))
-    put("docs/benchmark.md", "table", bench.markdown(RESULTS / "simple_spread").strip())
+    put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):

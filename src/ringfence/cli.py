@@ -328,38 +328,43 @@ def bench_status(folder: Positional[Path]) -> None:
 
 def bench_results(folder: Positional[Path]) -> None:
     """Rank the methods of every task and write FOLDER/table.csv."""
-    from ringfence.bench import table as results
+    from ringfence.bench import write_csv
+    from ringfence.report import board, standings
 
-    found = results.rows(folder)
-    for task in sorted({r["task"] for r in found}):
-        table = Table(*results.HEADER, title=task)
-        for line in results.summaries(found, task):
-            table.add_row(*results.cells_of(line))
+    for task, rows in standings.standings(board.read(folder)).items():
+        table = Table("", "method", "seeds", "return", "norm", "cost", "avoidable", "unsafe (95 % ≤)", title=task)
+        for r in rows:
+            low, high = r.returns_interval
+            table.add_row(
+                str(r.rank),
+                r.label,
+                str(len(r.seeds)),
+                f"{r.returns:.1f} [{low:.1f}, {high:.1f}]",
+                f"{r.returns_norm:.3f}",
+                f"{r.cost:.3f}" + ("" if r.safe else " over"),
+                f"{r.avoidable:.4f}",
+                f"{r.violation_rate:.3f} (≤ {r.violation_upper:.3f})",
+            )
         out.print(table)
-    print(results.write_csv(folder))
+    print(write_csv(folder))
 
 
 def bench_export(
-    folder: Positional[Path], format: Literal["csv", "markdown", "latex"] = "markdown", out_file: Path | None = None
+    folder: Positional[Path],
+    format: Literal["csv", "markdown", "markdown-short", "latex"] = "markdown",
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
 ) -> None:
     """Write the ranked tables of a results folder.
 
     Args:
         folder: the --out of `ringfence bench`.
-        format: csv (one line per run), markdown or latex (booktabs).
-        out_file: where to; FOLDER/table.EXT by default.
+        format: csv, markdown, markdown-short (return and cost alone) or latex (booktabs).
+        out_file: where to; FOLDER/ranked.EXT by default.
     """
-    from ringfence.bench import table as results
-    from ringfence.files import whole
+    from ringfence.report import export_board
 
-    if format == "csv":
-        print(results.write_csv(folder))
-        return
-    text = results.markdown(folder) if format == "markdown" else results.latex(folder)
-    path = out_file or folder / ("table.md" if format == "markdown" else "table.tex")
-    with whole(path) as temporary:
-        temporary.write_text(text)
-    print(path)
+    kind = {"csv": "csv", "latex": "tex"}.get(format, "md")
+    print(export_board(folder, format, out_file or folder / f"ranked.{kind}"))
 
 
 DATA = {"make": make, "import-omar": import_omar, "info": info, "train-behaviour": train_behaviour}
