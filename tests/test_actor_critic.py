@@ -46,7 +46,7 @@ def test_pieces_change_nothing():
     x = jnp.arange(24.0).reshape(12, 2)
     whole = x.sum(1) ** 2
     np.testing.assert_array_equal(ac.in_pieces(lambda z: z.sum(1) ** 2, 4, x).reshape(-1), whole)
-    assert ac.pieces_of(1024) == 64 and ac.pieces_of(30) == 1 and ac.pieces_of(17 * 32) == 34
+    assert ac.pieces_of(1024) == 32 and ac.pieces_of(30) == 1 and ac.pieces_of(17 * 64) == 34
 
 
 class Bowl:

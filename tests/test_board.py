@@ -20,7 +20,7 @@ from ringfence.report.board import Method, read
 from ringfence.report.board_page import published
 from ringfence.report.export import escape
 from ringfence.report.published import PUBLISHED, matches
-from ringfence.report.standings import aggregate, interval, references, standings
+from ringfence.report.standings import aggregate, contests, interval, references, standings
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation
@@ -334,6 +334,21 @@ def test_aggregate_takes_methods_with_every_task(folder):
     at = [int(np.argmin(abs(told.cost_thresholds - x))) for x in (0.0, 3.0)]
     assert told.cost_profiles[0, at] == pytest.approx([10 / 16, 14 / 16])
     assert told.return_profiles[0, 0] == 1.0 and told.return_profiles[0, -1] == 0.0
+    for shares, bands in ((told.return_profiles, told.return_bands), (told.cost_profiles, told.cost_bands)):
+        assert (bands[:, 0] <= shares + 1e-12).all() and (shares <= bands[:, 1] + 1e-12).all()
+    # at cost 0, expert has 0 of 4 and 2 of 4 episodes, medium all: drawing a seed twice gives 1/2 or 3/4
+    assert told.cost_bands[0, :, at[0]] == pytest.approx([0.5, 0.75])
+
+
+def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
+    against = {c.other.label: c for c in contests(standings(read(folder))[EXPERT])}
+    assert list(against) == ["ICBF-Diffuser split", "BC"]  # the first is ICBF-Diffuser split+guarded
+    assert against["BC"].returns == 100.0 and against["BC"].cost == 0.25 - 2.5
+    assert against["BC"].cost_interval[0] <= -2.25 <= against["BC"].cost_interval[1]
+    # 400 420 410 410 against 310 each: four differences of one sign have p = 2/2^4 or, with ties, nearly so; the
+    # smallest of four tests counts four times
+    assert 0.2 <= against["BC"].returns_p <= 1.0
+    assert contests(standings(read(folder))[MEDIUM]) == []
 
 
 def test_probability_of_improvement_has_the_row_ahead(folder):

@@ -1,6 +1,6 @@
 """Ringfence: safe offline multi-agent reinforcement learning.
 
-    from ringfence import EpisodeStore, Separation, train, load, build_report
+from ringfence import EpisodeStore, Separation, train, load, build_report
 """
 
 from __future__ import annotations

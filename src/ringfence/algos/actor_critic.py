@@ -73,7 +73,7 @@ def in_pieces(step, pieces: int, *arrays: Array):
     return jax.lax.map(lambda part: step(*part), tuple(parts))
 
 
-def pieces_of(batch: int, size: int = 16) -> int:
+def pieces_of(batch: int, size: int = 32) -> int:
     """How many equal parts of about `size` a batch can be cut into."""
     return next(p for p in range(max(1, batch // size), 0, -1) if batch % p == 0)
 

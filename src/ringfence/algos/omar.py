@@ -86,7 +86,7 @@ def init(
 def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Config, spec: Spec) -> Array:
     """â (B, N, A): the best action by the first head among the search's last best and the actor's own.
 
-    x (B, N, D), own (B, N, A), standard normal noise (B, N, iterations, S, A).
+    x (B, N, D), own (B, N, A), standard normal noise (B, N or 1, iterations, S, A).
     """
     first = critic.first(spec.n_agents)
     low, high = spec.action_low, spec.action_high
@@ -134,7 +134,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             t.ahead, ac.act(target["actor"], t.ahead, spec)
         ).min(1)
         b, n, a = t.action.shape
-        drawn = jax.random.uniform(ku, (b, n, config.cql_samples, a), minval=low, maxval=high)
+        drawn = jax.random.uniform(ku, (b, 1, config.cql_samples, a), minval=low, maxval=high)
+        drawn = jnp.broadcast_to(drawn, (b, n, config.cql_samples, a))
         densities = jnp.full((b, n, config.cql_samples), uniform_density)
         if config.cql_actions == "policy":
             here, d_here = noisy(kp, ac.act(params["actor"], t.x, spec))
@@ -160,7 +161,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         critic, searched = critics["critic"], None
         if config.coefficient > 0:
             own = ac.act(params["actor"], t.x, spec)
-            noise = jax.random.normal(ks, (b, n, config.search_iterations, config.search_samples, a))
+            # Agents learn apart, so they may share the random numbers, which cost as much as the search itself.
+            noise = jax.random.normal(ks, (b, 1, config.search_iterations, config.search_samples, a))
             look = lambda *part: rectified(critic, *part, config, spec)  # noqa: E731
             searched = ac.in_pieces(look, pieces, t.x, own, noise).reshape(own.shape)
 

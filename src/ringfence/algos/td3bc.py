@@ -5,9 +5,10 @@
 
 `ma-td3bc-lag` adds cost critics C_i, which learn the shared cost in the same way, and a multiplier λ ≥ 0:
 
-    L_π  = E −w (Q_i − λ C_i)/(1 + λ) + ‖π_i − a_i‖²,   λ ← [λ + η (E C_i(s̃, π(s̃)) − d)]₊
+    L_π  = E −α (Q_i/E|Q_i| − λ C_i/E|C_i|)/(1 + λ) + ‖π_i − a_i‖²,   λ ← [λ + η (E C_i(s̃, π(s̃))/d − 1)]₊
 
-with d the discounted form of the limit per episode, l (1 − γ^T) / ((1 − γ) T).
+with d the discounted form of the limit per episode, l (1 − γ^T) / ((1 − γ) T). Both values are divided by their own
+size: a return of hundreds would otherwise drown a cost of one, whatever λ.
 """
 
 from __future__ import annotations
@@ -58,8 +59,8 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("ma-td3bc learns from single transitions; leave history=0 and horizon=2.")
     if config.delay < 1:
         raise UserError(f"delay={config.delay} must be at least 1.")
-    if config.limit < 0:
-        raise UserError(f"limit={config.limit} must not be negative; it is a cost per episode.")
+    if config.limit <= 0:
+        raise UserError(f"limit={config.limit} must be positive; it is a cost per episode.")
 
 
 def optimiser(config: Config) -> Optimiser:
@@ -135,15 +136,15 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             else:
                 acted = own
             q = critics["critic"].first(spec.n_agents)(x, acted)[:, 0]  # (N, B)
-            weight = config.alpha / jax.lax.stop_gradient(jnp.abs(q).mean(1, keepdims=True))
-            merit, excess = q, jnp.zeros(spec.n_agents)
+            size = lambda v: jax.lax.stop_gradient(jnp.abs(v).mean(1, keepdims=True))  # noqa: E731
+            merit, excess = q / size(q), jnp.zeros(spec.n_agents)
             if config.lagrange:
                 c = jnp.maximum(*jnp.moveaxis(critics["cost"](x, acted), 1, 0))
-                merit = (q - scale[:, None] * c) / (1.0 + scale[:, None])
-                excess = c.mean(1) - allowed
+                merit = (merit - scale[:, None] * c / jnp.maximum(size(c), 1e-6)) / (1.0 + scale[:, None])
+                excess = c.mean(1) / allowed - 1.0
             imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
             penalty = (own**2).mean((0, 2)).sum()
-            loss = imitation - (weight * merit).mean(1).sum() + config.action_penalty * penalty
+            loss = imitation - config.alpha * merit.mean(1).sum() + config.action_penalty * penalty
             return loss, ({"loss/actor": loss, "loss/cloning": imitation, "value": q.mean()}, excess)
 
         slope, (more, excess) = jax.grad(actor_loss, has_aux=True)(params["actor"])
@@ -158,7 +159,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             opts["actor"] = keep(opts["actor"], state["opt"]["actor"])
         if config.lagrange:
             scale = jnp.clip(scale + config.multiplier_rate * excess, 0.0, config.multiplier_max)
-            more |= {"multiplier": scale.mean(), "cost_value": (excess + allowed).mean()}
+            more |= {"multiplier": scale.mean(), "cost_value": (allowed * (excess + 1.0)).mean()}
         state = {**state, "params": new, "target": moved, "opt": opts, "step": state["step"] + 1, "multiplier": scale}
         return state, metrics | more | norms | actor_norms
 

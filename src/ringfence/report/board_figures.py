@@ -112,12 +112,25 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
         made = figure(WIDTH, 4.2 + 0.24 * rows)
         axes = made.subplots(1, 2)
         panels = (
-            (told.return_thresholds, told.return_profiles, "normalised return τ", "share of runs with return > τ"),
-            (told.cost_thresholds, told.cost_profiles, "normalised cost τ (1: the limit)", "episodes with cost ≤ τ"),
+            (
+                told.return_thresholds,
+                told.return_profiles,
+                told.return_bands,
+                "normalised return τ",
+                "share of runs with return > τ",
+            ),
+            (
+                told.cost_thresholds,
+                told.cost_profiles,
+                told.cost_bands,
+                "normalised cost τ (1: the limit)",
+                "episodes with cost ≤ τ",
+            ),
         )
-        for ax, (thresholds, shares, x, y) in zip(axes, panels):
-            for k, (m, share) in enumerate(zip(methods, shares)):
+        for ax, (thresholds, shares, bands, x, y) in zip(axes, panels):
+            for k, (m, share, band) in enumerate(zip(methods, shares, bands)):
                 style = styles[m]
+                ax.fill_between(thresholds, *band, color=_ink(style), alpha=0.12, linewidth=0, step="post")
                 ax.plot(
                     thresholds,
                     share,

@@ -14,7 +14,7 @@ from ringfence.report import board_figures, figures
 from ringfence.report.board import Board, Method, read
 from ringfence.report.page import WORDS, environments, facts, headline, render
 from ringfence.report.published import NOTE, PUBLISHED, matches
-from ringfence.report.standings import DRAWS, Standing, aggregate, references, standings
+from ringfence.report.standings import DRAWS, Standing, aggregate, contests, references, standings
 from ringfence.report.table import Section
 from ringfence.runs import Run
 
@@ -105,6 +105,7 @@ def _section(board: Board, task: str, k: int, rows: list[Standing], rows_to_beat
         "rows": rows,
         "references": rows_to_beat,
         "absent": _absent(board, rows),
+        "contests": contests(rows),
         "constants": constants,
         "scatter": Markup(drawn) if drawn else None,
         "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],

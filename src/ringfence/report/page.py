@@ -53,6 +53,7 @@ def render(template: str, context: dict) -> str:
         undefined=jinja2.StrictUndefined,
     )
     engine.filters |= {"count": _count, "share": share, "number": _number, "duration": _duration}
+    engine.filters |= {"signed": _signed, "probability": _probability}
     return engine.get_template(template).render(version=__version__, css=Markup(_asset("style.css")), **context)
 
 
@@ -165,6 +166,14 @@ def share(x: float) -> str:
 
 def _number(x: float, digits: int) -> str:
     return f"{x:,.{digits}f}".replace("-", "−")
+
+
+def _signed(x: float, digits: int) -> str:
+    return f"{x:+,.{digits}f}".replace("-", "−")
+
+
+def _probability(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
 
 
 def _count(x: int | None) -> str:

@@ -61,6 +61,23 @@ class Standing:
         return f"{self.name} {self.variant}".strip()
 
 
+@dataclass(frozen=True)
+class Contest:
+    """The first of a task against another method on the same resets, every reset averaged over a method's seeds.
+
+    Differences are first minus other, with 95 % intervals over resets; p-values are Wilcoxon's signed-rank test,
+    adjusted after Holm over all contests of the task, returns and costs together.
+    """
+
+    other: Standing
+    returns: float
+    returns_interval: Interval
+    returns_p: float
+    cost: float
+    cost_interval: Interval
+    cost_p: float
+
+
 @dataclass
 class Aggregate:
     """What holds over all tasks, for the methods that were measured on every one of them.
@@ -80,8 +97,10 @@ class Aggregate:
     cheaper: Array  # (M, M): probability that the row's cost is below the column's
     return_thresholds: Array  # (K,)
     return_profiles: Array  # (M, K)
+    return_bands: Array  # (M, 2, K) pointwise 95 % intervals, runs resampled within each task
     cost_thresholds: Array  # (K,)
     cost_profiles: Array  # (M, K)
+    cost_bands: Array  # (M, 2, K)
 
 
 def standings(board: Board) -> dict[str, list[Standing]]:
@@ -108,6 +127,25 @@ def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
         row.rank = place
         row.best = row.safe and place == 1
     return rows
+
+
+def contests(rows: list[Standing]) -> list[Contest]:
+    """The first of a task's ranked rows against each of the others."""
+    if len(rows) < 2:
+        return []
+    first, found = rows[0], []
+    for other in rows[1:]:
+        pair = [[_per_reset(row, what) for row in (first, other)] for what in ("return", "cost")]
+        found.append([stats.paired_test(*p) for p in pair])
+    adjusted = stats.holm(np.array([t["p"] for tests in found for t in tests])).reshape(-1, 2)
+    return [
+        Contest(row, r["difference"], r["interval"], float(p), c["difference"], c["interval"], float(q))
+        for row, (r, c), (p, q) in zip(rows[1:], found, adjusted)
+    ]
+
+
+def _per_reset(row: Standing, what: str) -> Array:
+    return np.mean([e.summary["per_episode"][what] for e in row.entries], 0)
 
 
 def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -> Standing:
@@ -264,6 +302,8 @@ def aggregate(board: Board) -> Aggregate | None:
     return_thresholds = np.linspace(low, high, 101)
     top = int(np.ceil(max(3.0, *(float(np.quantile(c, 0.9)) for c in episode_costs.values()))))
     cost_thresholds = np.linspace(0.0, top, 20 * top + 1)  # whole numbers are among them, since costs count steps
+    above = {m: (returns[m][..., None] > return_thresholds).astype(float) for m in methods}
+    within = {m: (episode_costs[m][..., None] <= cost_thresholds).mean(2) for m in methods}
     return Aggregate(
         tasks=board.tasks,
         methods=methods,
@@ -277,8 +317,10 @@ def aggregate(board: Board) -> Aggregate | None:
         cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
         return_thresholds=return_thresholds,
         return_profiles=np.array([stats.profile(returns[m], return_thresholds) for m in methods]),
+        return_bands=np.array([_band(above[m]) for m in methods]),
         cost_thresholds=cost_thresholds,
         cost_profiles=np.array([stats.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
+        cost_bands=np.array([_band(within[m]) for m in methods]),
     )
 
 
@@ -289,6 +331,13 @@ def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
 def _iqm(scores: Array) -> tuple[float, Interval]:
     """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
     return float(stats.iqm(scores)), stats.stratified_bootstrap(scores, stats.iqm, draws=DRAWS)
+
+
+def _band(shares: Array) -> Array:
+    """(2, K): 95 % interval, at every threshold, of the mean of shares (runs, tasks, K); runs are resampled."""
+    runs, tasks, _ = shares.shape
+    taken = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), (DRAWS, tasks)) / (runs * tasks)
+    return np.percentile(np.einsum("dmr,rmk->dk", taken, shares, optimize=True), [2.5, 97.5], axis=0)
 
 
 def _pairs(scores: dict[Method, Array], methods: list[Method]) -> Array:
