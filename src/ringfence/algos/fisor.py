@@ -52,8 +52,8 @@ class Config:
     diffusion_steps: int = 5  # K of the actor
     candidates: int = 16  # actions proposed per agent and step
     target_rate: float = 0.005  # τ
-    width: int = 128  # units of both hidden layers
-    steps: int = 6_000  # updates
+    width: int = 64  # units of both hidden layers
+    steps: int = 5_000  # updates
     batch: int = 512  # transitions per update
     lr: float = 1e-3  # Adam, cosine decay to a tenth
     warmup: int = 100  # updates

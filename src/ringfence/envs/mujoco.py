@@ -1,0 +1,299 @@
+"""Safe Multi-Agent MuJoCo: agents share the joints of one robot that must not run faster than a limit.
+
+The tasks of safety-gymnasium (Ji et al. 2023), exactly: HalfCheetah cut in two, and the Ant cut in two or four.
+Reward, shared: forward speed − control cost, the Ant also 1 for every step; cost, shared: 1 on every step whose mean
+planar speed exceeds the limit. Facts that an own implementation has to respect, all checked by tests:
+
+* the Ant's speed is the displacement of the *torso's* `xpos`, which RK4 leaves at its last stage, not that of `qpos`;
+* MuJoCo 3.5 began to add the contact margins of two geoms where it used to take the larger one; halving the Ant's
+  margins undoes it. MuJoCo 4 changed RK4 itself; nothing undoes that, so it is refused for the Ant;
+* a reset normalises the Ant's quaternion; older versions of MuJoCo did so in place.
+
+One `Simulation` holds a batch of robots and steps them natively on several threads.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ringfence.errors import UserError, unknown
+
+FRAME_SKIP = 5  # substeps of an environment step
+DT = 0.05  # s of an environment step
+RESET_SPREAD = 0.1  # of joint positions (uniform) and velocities (standard deviation) at reset
+HEALTHY_Z = (0.2, 1.0)  # m, the Ant's torso; outside the episode ends
+LIMITS = {"2x3": 3.227, "2x4": 2.522, "4x2": 2.418}  # m/s, safety-gymnasium's
+ROBOTS = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
+
+Parts = Literal["2x3", "2x4", "4x2"]
+
+
+class Outcome(NamedTuple):
+    """What a step gives, for a batch of robots; what is not running has zeros."""
+
+    reward: np.ndarray  # (B,) shared
+    cost: np.ndarray  # (B,) shared: 1 where the speed exceeds the limit
+    terminated: np.ndarray  # (B,) bool: fallen
+    speed: np.ndarray  # (B,) m/s, mean over the step; for HalfCheetah its absolute value along x
+
+
+@dataclass(frozen=True)
+class SafeMuJoCo:
+    """A robot and how it is divided: `2x3` HalfCheetah, `2x4` Ant, `4x2` Ant (agents x joints)."""
+
+    parts: Parts = "2x3"
+    speed_limit: float | None = None  # m/s; None: safety-gymnasium's
+    episode_length: int = 1000
+
+    def __post_init__(self):
+        if self.parts not in ROBOTS:
+            raise unknown("division of a robot", str(self.parts), ROBOTS)
+        if self.speed_limit is not None and not self.speed_limit > 0:
+            raise UserError(f"speed_limit={self.speed_limit} must be positive; it is in m/s.")
+
+    @property
+    def robot(self) -> str:
+        return ROBOTS[self.parts]
+
+    @property
+    def ant(self) -> bool:
+        return self.robot == "ant"
+
+    @property
+    def limit(self) -> float:
+        """m/s"""
+        return LIMITS[self.parts] if self.speed_limit is None else self.speed_limit
+
+    @property
+    def n_agents(self) -> int:
+        return int(self.parts[0])
+
+    @property
+    def action_dim(self) -> int:
+        return int(self.parts[2])
+
+    @cached_property
+    def joints(self) -> tuple[str, ...]:
+        """In the order of `qpos`."""
+        if self.ant:
+            return tuple(f"{kind}{leg}" for leg in range(1, 5) for kind in ("hip", "ankle"))
+        return ("bthigh", "bshin", "bfoot", "fthigh", "fshin", "ffoot")
+
+    @cached_property
+    def own_joints(self) -> np.ndarray:
+        """(N, A) joints of every agent, in the order of its action."""
+        return np.arange(len(self.joints)).reshape(self.n_agents, self.action_dim)
+
+    @cached_property
+    def actuators(self) -> np.ndarray:
+        """(N, A) index in `ctrl` of every action entry. The Ant's motors begin with its fourth leg."""
+        return (self.own_joints + 2) % 8 if self.ant else self.own_joints
+
+    @cached_property
+    def state_names(self) -> tuple[str, ...]:
+        """Entries of the global state: all of qpos but the planar position, then qvel."""
+        torso, moving = ("z", "pitch"), ("vx", "vz", "vpitch")
+        if self.ant:
+            torso, moving = ("z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")
+        names = [f"torso.{c}" for c in torso] + [f"{j}.q" for j in self.joints]
+        return tuple(names + [f"torso.{c}" for c in moving] + [f"{j}.v" for j in self.joints])
+
+    @cached_property
+    def observed(self) -> np.ndarray:
+        """(N, O) entries of the global state in every agent's observation: own joints by name (position, velocity),
+        positions of the neighbouring joints, the torso."""
+        at = {name: k for k, name in enumerate(self.state_names)}
+        rows = []
+        for mine in self.own_joints:
+            own = sorted((self.joints[j] for j in mine), key=lambda name: (name.rstrip("0123456789"), name))
+            rows.append([at[f"{j}.{c}"] for j in own for c in "qv"])
+            rows[-1] += [at[f"{j}.q"] for j in self._neighbours(mine)]
+            rows[-1] += [k for name, k in at.items() if name.startswith("torso.")]
+        return np.array(rows)
+
+    def _neighbours(self, mine: np.ndarray) -> list[str]:
+        """Joints next to those of an agent: the other legs' hips, or the other half's thigh."""
+        others = [j for k, j in enumerate(self.joints) if k not in mine]
+        return [j for j in others if j.startswith("hip") or j.endswith("thigh")]
+
+    @cached_property
+    def observation_names(self) -> tuple[str, ...]:
+        """Of agent 0; other agents see their own joints in the same places."""
+        return tuple(self.state_names[k] for k in self.observed[0])
+
+    def model(self):
+        """The MuJoCo model; the Ant's is refused on versions whose physics differs."""
+        import gymnasium
+        import mujoco
+
+        version = tuple(int(x) for x in re.findall(r"\d+", mujoco.__version__)[:2])
+        if self.ant and version >= (4, 0):
+            raise UserError(
+                f"MuJoCo {mujoco.__version__} integrates free joints differently, so its Ant is another robot; "
+                "install 'mujoco>=3.3,<4'."
+            )
+        text = (Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{self.robot}.xml").read_text()
+        # Newer versions warn of this attribute in a log file in the working directory.
+        model = mujoco.MjModel.from_xml_string(re.sub(r'\s+settotalmass="[^"]*"', "", text))
+        if self.ant and version >= (3, 5):
+            model.geom_margin *= 0.5
+        if not self.ant:
+            mujoco.mj_setTotalmass(model, 14.0)
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+    def simulate(self, batch: int, threads: int | None = None) -> Simulation:
+        """`batch` robots; `threads` (default: one per core) step them."""
+        return Simulation(self, batch, threads)
+
+
+class Simulation:
+    """A batch of robots, stepped together. Not pure: `reset` and `step` change it."""
+
+    def __init__(self, env: SafeMuJoCo, batch: int, threads: int | None = None):
+        if batch < 1:
+            raise UserError(f"batch={batch} must be at least 1.")
+        self.env, self.batch = env, batch
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        threads = max(1, min(threads or cores, batch))
+        model = env.model()
+        try:
+            self._robots = _Batch(model, batch, threads)
+        except ImportError:  # before MuJoCo 3.17
+            self._robots = _Loop(model, batch, threads)
+        self._rest = model.qpos0.copy()
+        self._ctrl = np.zeros((batch, model.nu))
+        self._place = np.zeros((batch, 1))  # where speeds are measured from
+        self.running = np.zeros(batch, bool)
+
+    def reset(self, seeds: Sequence[int | Sequence[int]]) -> None:
+        """Start an episode of every robot; a seed fixes its start, whatever the batch."""
+        if len(seeds) != self.batch:
+            raise UserError(f"reset() got {len(seeds)} seeds for {self.batch} robots; pass one for each.")
+        draws = [np.random.Generator(np.random.PCG64(np.random.SeedSequence(s))) for s in seeds]
+        nq, nv = self._rest.size, self._robots.qvel.shape[1]
+        qpos = np.stack([self._rest + d.uniform(-RESET_SPREAD, RESET_SPREAD, nq) for d in draws])
+        qvel = np.stack([RESET_SPREAD * d.standard_normal(nv) for d in draws])
+        if self.env.ant:
+            qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
+        self.restore(qpos, qvel)
+
+    def restore(
+        self,
+        qpos: np.ndarray,
+        qvel: np.ndarray,
+        warmstart: np.ndarray | None = None,
+        place: np.ndarray | None = None,
+    ) -> None:
+        """Put every robot into a state. `place` (B, 2): the Ant's lagged position, if it is not that of `qpos`."""
+        self._robots.place(qpos, qvel, np.zeros_like(qvel) if warmstart is None else warmstart)
+        self._place = self._measured() if place is None else np.array(place, np.float64)
+        self.running[:] = True
+
+    def _measured(self) -> np.ndarray:
+        """(B, 1 or 2) positions whose displacement is the speed."""
+        return (self._robots.torso if self.env.ant else self._robots.qpos[:, :1]).copy()
+
+    def state(self) -> np.ndarray:
+        """(B, S) float64 global states."""
+        first = 2 if self.env.ant else 1
+        return np.concatenate([self._robots.qpos[:, first:], self._robots.qvel], 1)
+
+    def observe(self, state: np.ndarray | None = None) -> np.ndarray:
+        """(B, N, O) local observations."""
+        return (self.state() if state is None else state)[:, self.env.observed]
+
+    def step(self, action: np.ndarray) -> Outcome:
+        """Advance the running robots by 0.05 s; `action` (B, N, A) is clipped to [-1, 1]."""
+        action = np.clip(np.asarray(action, np.float64).reshape(self.batch, self.env.n_agents, -1), -1.0, 1.0)
+        self._ctrl[:, self.env.actuators] = action
+        live = np.flatnonzero(self.running)
+        self._robots.advance(self._ctrl, live)
+        place = self._measured()
+        velocity, self._place = (place - self._place) / DT, place
+        speed = np.linalg.norm(velocity, axis=1)
+        effort = (action**2).sum((1, 2))
+        if self.env.ant:
+            reward = velocity[:, 0] + 1.0 - 0.5 * effort
+            z = self._robots.qpos[:, 2]
+            sound = np.isfinite(self.state()).all(1) & (z >= HEALTHY_Z[0]) & (z <= HEALTHY_Z[1])
+        else:
+            reward = velocity[:, 0] - 0.1 * effort
+            sound = np.ones(self.batch, bool)
+        on = self.running.copy()
+        self.running &= sound
+        cost = (speed > self.env.limit).astype(np.float64)
+        return Outcome(*(np.where(on, x, 0.0) for x in (reward, cost)), on & ~sound, np.where(on, speed, 0.0))
+
+
+class _Batch:
+    """MuJoCo's own batched stepping (3.17 and later)."""
+
+    def __init__(self, model, batch: int, threads: int):
+        from mujoco.batch import Batch
+
+        self._batch = Batch(model, batch, threads)
+        bind = self._batch.bind
+        self.qpos, self.qvel, self._ctrl, self._warm = (bind(x) for x in ("qpos", "qvel", "ctrl", "qacc_warmstart"))
+        self._xpos = bind("xpos")
+
+    @property
+    def torso(self) -> np.ndarray:
+        return self._xpos[:, 1, :2]
+
+    def place(self, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
+        self._batch.reset(stage=0)
+        self.qpos[:], self.qvel[:] = qpos, qvel
+        self._batch.forward()
+        self._warm[:] = warmstart
+
+    def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
+        if len(live):
+            self._ctrl[:] = ctrl
+            self._batch.step(ids=live, nstep=FRAME_SKIP)
+
+
+class _Loop:
+    """One MjData per robot, stepped by a pool of threads; MuJoCo releases the interpreter while it works."""
+
+    def __init__(self, model, batch: int, threads: int):
+        import mujoco
+
+        self._mujoco, self._model = mujoco, model
+        self._data = [mujoco.MjData(model) for _ in range(batch)]
+        self._threads, self._pool = threads, ThreadPoolExecutor(threads) if threads > 1 else None
+        self.qpos, self.qvel = np.zeros((batch, model.nq)), np.zeros((batch, model.nv))
+        self.torso = np.zeros((batch, 2))
+
+    def place(self, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
+        for k, d in enumerate(self._data):
+            self._mujoco.mj_resetData(self._model, d)
+            d.qpos[:], d.qvel[:] = qpos[k], qvel[k]
+            self._mujoco.mj_forward(self._model, d)
+            d.qacc_warmstart[:] = warmstart[k]
+            self._read(k)
+
+    def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
+        def run(chunk: np.ndarray) -> None:
+            for k in chunk:
+                self._data[k].ctrl[:] = ctrl[k]
+                self._mujoco.mj_step(self._model, self._data[k], FRAME_SKIP)
+                self._read(k)
+
+        if self._pool is None:
+            run(live)
+        else:
+            list(self._pool.map(run, np.array_split(live, self._threads)))
+
+    def _read(self, k: int) -> None:
+        d = self._data[k]
+        self.qpos[k], self.qvel[k], self.torso[k] = d.qpos, d.qvel, d.xpos[1, :2]
