@@ -104,7 +104,7 @@ def ranks(rows: list[dict]) -> dict[tuple, list[tuple[float, dict]]]:
         found.setdefault((r["algorithm"], r["preset"]), {}).setdefault(int(r["setting"]), {})[r["task"]] = r
     out = {}
     for key, settings in found.items():
-        whole = {k: v for k, v in settings.items() if len(v) == len(TIERS)}
+        whole = {k: v for k, v in settings.items() if all(f"simple_spread-{t}" in v for t in TIERS)}
 
         def merit(row: dict, safe: bool = key[0] in SAFE) -> tuple:
             gain, cost = float(row["return"]), float(row["cost"])

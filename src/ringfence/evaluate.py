@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import algos, features, hazards, stats, tasks, training
+from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError, unknown
 from ringfence.files import whole
 from ringfence.hazards import BoundHazard
@@ -23,7 +24,7 @@ from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
-from ringfence.types import Policy, Spec
+from ringfence.types import Key, Policy, Spec
 
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
@@ -45,6 +46,8 @@ def rollout(
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
+    if isinstance(env, SafeMuJoCo):
+        return _rollout_native(policy, env, episodes, RESETS[split], act_root, record, label, quiet)
 
     def play(policy, index, batch, keep):
         state = env.reset(jax.random.fold_in(reset_root, index), batch)
@@ -77,6 +80,42 @@ def rollout(
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks])[:episodes] for k in chunks[0]}
     return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | recorded
+
+
+def _rollout_native(
+    policy: Policy, env: SafeMuJoCo, episodes: int, root: int, key: Key, record: int, label: str, quiet: bool
+) -> dict[str, np.ndarray]:
+    """`rollout` on a simulator that steps outside JAX: all episodes side by side. After an episode's end its rewards
+    and costs are 0 and its state stays."""
+    sim = env.simulate(episodes)
+    sim.reset([(root, k) for k in range(episodes)])
+    act = jax.jit(lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key))
+    memory = policy.start(episodes)
+    states = [sim.state().astype(np.float32)]
+    steps, info = [], []
+    with Progress(label or "evaluating", env.episode_length, 0, quiet) as bar:
+        for t in range(env.episode_length):
+            if not sim.running.any():
+                break
+            seen = sim.observe(states[-1])
+            memory, decided = act(policy, memory, seen, states[-1], jax.random.fold_in(key, t))
+            steps.append(sim.step(np.asarray(decided.action)))
+            states.append(sim.state().astype(np.float32))
+            if record:
+                info.append({k: np.asarray(v[:record]) for k, v in decided.info.items()})
+            bar.advance(1)
+    kept = {"rewards": np.stack([s.reward for s in steps], 1), "costs": np.stack([s.cost for s in steps], 1)}
+    kept = {k: _padded(v, env.episode_length) for k, v in kept.items()}
+    kept["states"] = np.stack(states, 1)
+    kept["states"] = np.concatenate(
+        [kept["states"], np.repeat(kept["states"][:, -1:], env.episode_length + 1 - len(states), 1)], 1
+    )
+    return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
+
+
+def _padded(x: np.ndarray, length: int) -> np.ndarray:
+    """(E, length) from (E, T): nothing happens after the end."""
+    return np.pad(x, ((0, 0), (0, length - x.shape[1])))
 
 
 def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.ndarray) -> dict:

@@ -90,6 +90,55 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
     return FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), OWN, agree)
 
 
+def robot(
+    view: str, state_names: tuple[str, ...], joints: tuple[str, ...], own_joints: np.ndarray, observed: np.ndarray
+) -> FeatureMap:
+    """The views of one robot whose joints are shared out: torso, own joints, others' joints.
+
+    own_joints (N, A) index `joints`; observed (N, O) are the entries of the state in everybody's observation.
+    """
+    n, a = own_joints.shape
+    torso = [name for name in state_names if name.startswith("torso.")]
+    if view == "centralized":
+        table = np.tile(np.arange(len(state_names)), (n, 1))
+        return FeatureMap(view, tuple(state_names), "state", table, np.full_like(table, -1))
+    if view == "decentralized":
+        own = {f"{joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(own_joints[0]) for c in "qv"}
+        seen = [state_names[k] for k in observed[0]]
+        near = {name: f"near{m}.q" for m, name in enumerate(x for x in seen if x not in own and x not in torso)}
+        table = np.tile(np.arange(len(seen)), (n, 1))
+        names = tuple((own | near).get(x, x) for x in seen)
+        return FeatureMap(view, names, "observations", table, np.full_like(table, -1))
+    if view != "pruned":
+        raise unknown("view", view, VIEWS)
+    at = {name: k for k, name in enumerate(state_names)}
+    whose = ["own", *(f"other{j}" for j in range(n - 1))]
+    names = [*torso, *(f"{w}.joint{k}.{c}" for w in whose for k in range(a) for c in "qv")]
+    rows = []
+    for i in range(n):
+        order = [i, *(j for j in range(n) if j != i)]
+        rows.append([at[f"{joints[k]}.{c}"] for j in order for k in own_joints[j] for c in "qv"])
+    table = np.array([[at[t] for t in torso] + row for row in rows])
+    own = tuple(range(len(torso) + 2 * a))
+    agree = _reconcile_shared(len(torso), 2 * a, n)
+    return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), own, agree)
+
+
+def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:
+    """A function on plans (..., H, N, D), row 0 the present: everybody's torso is the mean of the planned ones, and
+    others' joints are where their owners plan to have them."""
+    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int)
+
+    def agree(x: Array) -> Array:
+        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        body = jnp.broadcast_to(later[..., :torso].mean(-2, keepdims=True), later[..., :torso].shape)
+        own = later[..., torso : torso + joints]
+        rest = own[..., others, :].reshape(*own.shape[:-1], (n - 1) * joints)
+        return jnp.concatenate([start, jnp.concatenate([body, own, rest], -1)], -3)
+
+    return agree
+
+
 def _reconcile_relative(names: tuple[str, ...], n: int) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that makes the agents agree: what agent i plans to see of
     landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged.

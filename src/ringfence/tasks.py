@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import SimpleSpread
+from ringfence.envs import SafeMuJoCo, SimpleSpread
 from ringfence.errors import UserError, unknown
 from ringfence.types import Env, Spec
 
@@ -41,6 +41,9 @@ class Task:
         """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
         if isinstance(self.env, SimpleSpread):
             return features.simple_spread(view, self.env.n_agents)
+        if isinstance(self.env, SafeMuJoCo):
+            e = self.env
+            return features.robot(view, e.state_names, e.joints, e.own_joints, e.observed)
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
         rows = slice(0, 20_000)

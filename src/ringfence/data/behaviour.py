@@ -1,8 +1,4 @@
-"""The policies that make the data: a MATD3 learner, its snapshots, its replay, and the collection of episodes.
-
-MATD3 (Ackermann et al. 2019) is MADDPG with TD3's three repairs: twin critics, delayed actors, smoothed targets.
-Every agent has its own actor on its own observation and its own pair of critics on everyone's observations and
-actions. The parameters of all agents are stacked on a leading axis, so one program trains any number of agents.
+"""The policies that make the data: snapshots of a MATD3 learner, its replay, and the collection of episodes.
 
 The public Simple Spread data (OMAR, Pan et al. 2022) are four tiers of one such learner; here they are
 
@@ -22,7 +18,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -31,10 +27,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from ringfence.data import matd3
+from ringfence.data.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.types import Array, Env, Key, PyTree
@@ -46,48 +43,6 @@ REPLAY_TRANSITIONS = 97_500  # size of the public medium-replay set
 FORMAT = 1  # version of the policy file
 
 
-@dataclass(frozen=True)
-class MATD3Config:
-    """Hyper-parameters of the behaviour learner; the defaults are those of the shipped tiers."""
-
-    hidden: int = 64  # width of both hidden layers of every actor and critic (OMAR's)
-    envs: int = 30  # environments stepped side by side; a round is one episode of each
-    random_rounds: int = 20  # rounds of uniform actions before the actors take over
-    updates: int = 29  # critic updates after every round
-    batch: int = 256  # transitions per update
-    actor_rate: float = 1e-3  # Adam's step size of the actors
-    critic_rate: float = 3e-3  # Adam's step size of the critics
-    delay: int = 2  # critic updates per actor update
-    discount: float = 0.95  # per step of 0.1 s (OMAR's)
-    polyak: float = 0.02  # share of the online parameters that enters the targets per actor update
-    noise: float = 0.2  # std of the exploration noise, in units of action
-    target_noise: float = 0.2  # std of the noise on the target actors' actions
-    target_clip: float = 0.5  # bound on that noise
-    reward_scale: float = 0.1  # multiplies the reward before learning, for values of order 10
-    logit_penalty: float = 3e-2  # weight of the actors' mean squared output before tanh, which must not saturate
-    snapshot_every: int = 5  # rounds between two snapshots of the actors
-
-    def __post_init__(self):
-        for field in ("hidden", "envs", "batch", "delay", "snapshot_every"):
-            if getattr(self, field) < 1:
-                raise UserError(f"MATD3Config {field}={getattr(self, field)} must be at least 1; pass a larger one.")
-
-
-class Mlp(NamedTuple):
-    """Stacked multi-layer perceptrons: layer k is (..., in, out) and (..., 1, out), with any leading axes."""
-
-    weights: tuple[Array, ...]
-    biases: tuple[Array, ...]
-
-    def __call__(self, x: Array) -> Array:
-        """(..., B, in) -> (..., B, out); the leading axes are those of the parameters."""
-        last = len(self.weights) - 1
-        for k, (w, b) in enumerate(zip(self.weights, self.biases)):
-            x = x @ w + b
-            x = x if k == last else jax.nn.relu(x)
-        return x
-
-
 class BehaviourPolicy(eqx.Module):
     """One deterministic actor per agent, plus Gaussian exploration noise."""
 
@@ -97,7 +52,7 @@ class BehaviourPolicy(eqx.Module):
 
     def act(self, observations: Array, key: Key) -> Array:
         """(B, N, O) -> (B, N, A) in [-1, 1]."""
-        return _noisy(_act(self.actors, observations), self.noise, key)
+        return matd3.noisy(matd3.act(self.actors, observations), self.noise, key)
 
 
 class BehaviourRun(NamedTuple):
@@ -117,15 +72,6 @@ class _Memory(NamedTuple):
     actions: Array  # (E, L, N, A)
     rewards: Array  # (E, L, N)
     terminated: Array  # (E, L)
-
-
-class _Learner(NamedTuple):
-    actors: Mlp  # (N, ...)
-    critics: Mlp  # (2, N, ...)
-    actors_target: Mlp
-    critics_target: Mlp
-    actors_opt: PyTree
-    critics_opt: PyTree
 
 
 def train_behaviour(
@@ -369,36 +315,12 @@ def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
 # ---------------------------------------------------------------------------------------------------- the learner
 
 
-def _init_mlp(key: Key, lead: tuple[int, ...], sizes: tuple[int, ...], last: float | None = None) -> Mlp:
-    """Uniform in +-1/sqrt(in); `last` bounds the last layer instead, so that actors start near zero action."""
-    layers = list(zip(sizes[:-1], sizes[1:]))
-    # One draw for all layers: each call of the generator costs more than a second of compilation.
-    draw = jax.random.uniform(key, (*lead, sum((n_in + 1) * n_out for n_in, n_out in layers)), minval=-1.0, maxval=1.0)
-    weights, biases, at = [], [], 0
-    for k, (n_in, n_out) in enumerate(layers):
-        bound = last if last is not None and k == len(layers) - 1 else n_in**-0.5
-        part = bound * draw[..., at : at + (n_in + 1) * n_out].reshape(*lead, n_in + 1, n_out)
-        weights.append(part[..., :-1, :])
-        biases.append(part[..., -1:, :])
-        at += (n_in + 1) * n_out
-    return Mlp(tuple(weights), tuple(biases))
-
-
-def _optimisers(config: MATD3Config):
-    return optax.adam(config.actor_rate), optax.adam(config.critic_rate)
-
-
 @partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
-def _init_learner(env: Env, config: MATD3Config, key: Key) -> _Learner:
+def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
     state = jax.eval_shape(partial(env.reset, batch=1), key)
     n_obs = jax.eval_shape(env.observe, state).shape[-1]
-    n, a, h = env.n_agents, env.action_dim, config.hidden
-    ka, kc = jax.random.split(key)
-    actors = _init_mlp(ka, (n,), (n_obs, h, h, a), last=3e-3)
-    critics = _init_mlp(kc, (2, n), (n * (n_obs + a), h, h, 1))
-    actor_opt, critic_opt = _optimisers(config)
-    copy = partial(jax.tree.map, jnp.copy)  # the training loop donates its buffers, so targets need their own
-    return _Learner(actors, critics, copy(actors), copy(critics), actor_opt.init(actors), critic_opt.init(critics))
+    n = env.n_agents
+    return matd3.init(config, key, n, n_obs, n * n_obs, env.action_dim)
 
 
 def _empty_memory(env: Env, episodes: int) -> _Memory:
@@ -412,19 +334,10 @@ def _empty_memory(env: Env, episodes: int) -> _Memory:
     )
 
 
-def _act(actors: Mlp, observations: Array) -> Array:
-    """(B, N, O) -> (B, N, A)."""
-    return jnp.swapaxes(jnp.tanh(actors(jnp.swapaxes(observations, 0, 1))), 0, 1)
-
-
-def _noisy(action: Array, noise: float | Array, key: Key) -> Array:
-    return jnp.clip(action + noise * jax.random.normal(key, action.shape), -1.0, 1.0)
-
-
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
 def _train_rounds(
-    env: Env, config: MATD3Config, learner: _Learner, memory: _Memory, rounds: Array, keys: Array
-) -> tuple[_Learner, _Memory, Array]:
+    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
+) -> tuple[Learner, _Memory, Array]:
     """For every round: one episode in each environment, then the updates. Returns the rounds' mean returns too."""
 
     def one_round(carry, xs):
@@ -462,7 +375,7 @@ def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Ke
 
     def step(state, key):
         k_noise, k_uniform = jax.random.split(key)
-        action = _noisy(_act(actors, env.observe(state)), config.noise, k_noise)
+        action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, k_noise)
         action = jnp.where(uniform, jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0), action)
         # Executed at half precision, so that a replay file of half the size repeats the run exactly.
         action = action.astype(jnp.float16).astype(jnp.float32)
@@ -475,8 +388,8 @@ def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Ke
 
 
 def _update(
-    env: Env, config: MATD3Config, learner: _Learner, memory: _Memory, stored: Array, act: Array, key: Key
-) -> _Learner:
+    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
+) -> Learner:
     """One critic update and, if `act`, one update of actors and targets."""
     k_rows, k_noise = jax.random.split(key)
     e, t = jnp.divmod(jax.random.randint(k_rows, (config.batch,), 0, stored * env.episode_length), env.episode_length)
@@ -484,52 +397,9 @@ def _update(
     after = jax.tree.map(lambda x: x[e, t + 1], memory.states)
     actions, rewards, terminated = memory.actions[e, t], memory.rewards[e, t], memory.terminated[e, t]
     observations, next_observations = env.observe(before), env.observe(after)
-    actor_opt, critic_opt = _optimisers(config)
-
-    smoothing = config.target_noise * jax.random.normal(k_noise, actions.shape)
-    smoothing = jnp.clip(smoothing, -config.target_clip, config.target_clip)
-    next_actions = jnp.clip(_act(learner.actors_target, next_observations) + smoothing, -1.0, 1.0)
-    next_value = _value(learner.critics_target, next_observations, next_actions).min(0)  # (N, B)
-    # The time limit is not an end of the task, so only true terminations stop the bootstrap.
-    target = config.reward_scale * rewards.T + config.discount * jnp.where(terminated, 0.0, next_value)
-
-    def critic_loss(critics: Mlp) -> Array:
-        return ((_value(critics, observations, actions) - target) ** 2).mean(-1).sum()
-
-    grads = jax.grad(critic_loss)(learner.critics)
-    steps, critics_opt = critic_opt.update(grads, learner.critics_opt)
-    critics = optax.apply_updates(learner.critics, steps)
-    learner = learner._replace(critics=critics, critics_opt=critics_opt)
-
-    def actor_loss(actors: Mlp) -> Array:
-        logits = jnp.swapaxes(actors(jnp.swapaxes(observations, 0, 1)), 0, 1)
-        own = jnp.tanh(logits)  # (B, N, A)
-        mine = jnp.eye(env.n_agents, dtype=bool)[:, None, :, None]
-        joint = jnp.where(mine, own, actions)  # (N, B, N, A): row i has agent i's own action, the others' as stored
-        first = jax.tree.map(lambda x: x[0], critics)
-        # A sum over agents: the gradient of each agent's parameters is that of its own loss.
-        return (config.logit_penalty * (logits**2).mean((0, 2)) - _value(first, observations, joint).mean(-1)).sum()
-
-    def improve(learner: _Learner) -> _Learner:
-        steps, actors_opt = actor_opt.update(jax.grad(actor_loss)(learner.actors), learner.actors_opt)
-        actors = optax.apply_updates(learner.actors, steps)
-        follow = partial(optax.incremental_update, step_size=config.polyak)
-        return learner._replace(
-            actors=actors,
-            actors_opt=actors_opt,
-            actors_target=follow(actors, learner.actors_target),
-            critics_target=follow(learner.critics, learner.critics_target),
-        )
-
-    return jax.lax.cond(act, improve, lambda learner: learner, learner)
-
-
-def _value(critics: Mlp, observations: Array, actions: Array) -> Array:
-    """Joint observations (B, N, O) and actions (B, N, A), or (N, B, N, A) with one per critic -> (..., N, B)."""
-    flat = actions.reshape(*actions.shape[:-2], -1)
-    seen = observations.reshape(len(observations), -1)
-    inputs = jnp.concatenate([jnp.broadcast_to(seen, (*flat.shape[:-1], seen.shape[-1])), flat], -1)
-    return critics(inputs)[..., 0]
+    joint = (x.reshape(config.batch, -1) for x in (observations, next_observations))
+    batch = Transitions(observations, next(joint), actions, rewards, terminated, next_observations, next(joint))
+    return matd3.update(config, learner, batch, act, k_noise)
 
 
 # ------------------------------------------------------------------------------------------------------- rollouts
@@ -542,7 +412,7 @@ def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch:
     def choose(state, key):
         if actors is None:
             return jax.random.uniform(key, (batch, env.n_agents, env.action_dim), minval=-1.0, maxval=1.0)
-        return _noisy(_act(actors, env.observe(state)), noise, key)
+        return matd3.noisy(matd3.act(actors, env.observe(state)), noise, key)
 
     return _rollout(env, env.reset(k_reset, batch), choose, jax.random.split(key, env.episode_length))
 

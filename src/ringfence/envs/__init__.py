@@ -1,5 +1,6 @@
 """Simulators, batched and deterministic given their key."""
 
+from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 
-__all__ = ["SimpleSpread", "SpreadState"]
+__all__ = ["SafeMuJoCo", "SimpleSpread", "SpreadState"]
