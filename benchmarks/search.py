@@ -48,7 +48,7 @@ SETTINGS: dict[tuple[str, str], list[dict]] = {
     ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"centralised_critic": True}],
     ("ma-td3bc-lag", ""): [{"multiplier_rate": 0.1}, {"alpha": 10.0}, {"alpha": 10.0, "multiplier_rate": 0.1}],
     ("fisor", ""): [{"temperature_reward": 1.0}, {"expectile_danger": 0.7}, {"discount": 0.95}],
-    ("ma-cql", ""): [{"cql_weight": 1.0}, {"cql_weight": 20.0}, {"lr": 3e-3}],
+    ("ma-cql", ""): [{"cql_weight": 1.0}, {"logit_penalty": 0.001}, {"lr": 3e-3}],
     ("omar", ""): [{"cql_weight": 1.0}, {"coefficient": 0.7}, {"lr": 3e-3}],
     ("madiff", "default"): [{"lr": 1e-3}, {"discount": 0.95}, {"diffusion_steps": 50}],
     ("icbf", "split"): [{"lr": 1e-3}, {"discount": 0.95}, {"barrier_weight": 10.0}],

@@ -10,6 +10,7 @@ import pytest
 
 import ringfence.envs.mujoco as simulator
 from ringfence.envs.mujoco import DT, SafeMuJoCo
+from ringfence.envs.pettingzoo import SafeMuJoCoParallel
 from ringfence.errors import UserError
 
 ROBOTS = {"2x3": "HalfCheetah_2x3", "2x4": "Ant_2x4", "4x2": "Ant_4x2"}
@@ -146,6 +147,25 @@ def test_actions_are_clipped_and_bad_input_is_refused(monkeypatch):
     assert env.model().nu == 6
     with pytest.raises(UserError, match="MuJoCo 4.0.0 integrates free joints differently"):
         SafeMuJoCo("2x4").model()
+
+
+def test_pettingzoo_face():
+    from pettingzoo.test import parallel_api_test
+
+    env = SafeMuJoCoParallel(parts="4x2", episode_length=30)
+    parallel_api_test(env, num_cycles=40)
+    first = env.reset(seed=4)[0]["agent_2"]
+    second = env.reset()[0]["agent_2"]
+    assert not np.array_equal(first, second)
+    np.testing.assert_array_equal(env.reset(seed=4)[0]["agent_2"], first)
+    np.testing.assert_array_equal(env.reset()[0]["agent_2"], second)
+    actions = dict.fromkeys(env.agents, np.zeros(2, np.float32))
+    for _ in range(30):
+        *_, over, infos = env.step(actions)
+    assert over["agent_0"] and env.agents == []
+    assert infos["agent_3"]["clearance"] == pytest.approx(2.418 - infos["agent_3"]["speed"])
+    with pytest.raises(UserError, match="call reset"):
+        env.step(actions)
 
 
 @pytest.mark.parametrize("parts", ROBOTS)

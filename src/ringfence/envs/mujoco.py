@@ -172,20 +172,21 @@ class Simulation:
             self._robots = _Loop(model, batch, threads)
         self._rest = model.qpos0.copy()
         self._ctrl = np.zeros((batch, model.nu))
-        self._place = np.zeros((batch, 1))  # where speeds are measured from
+        self._place = np.zeros((batch, 2 if env.ant else 1))  # where speeds are measured from
         self.running = np.zeros(batch, bool)
 
-    def reset(self, seeds: Sequence[int | Sequence[int]]) -> None:
-        """Start an episode of every robot; a seed fixes its start, whatever the batch."""
-        if len(seeds) != self.batch:
-            raise UserError(f"reset() got {len(seeds)} seeds for {self.batch} robots; pass one for each.")
+    def reset(self, seeds: Sequence[int | Sequence[int]], ids: Sequence[int] | None = None) -> None:
+        """Start an episode of every robot, or of those in `ids`; a seed fixes its start, whatever the batch."""
+        ids = np.arange(self.batch) if ids is None else np.asarray(ids)
+        if len(seeds) != len(ids):
+            raise UserError(f"reset() got {len(seeds)} seeds for {len(ids)} robots; pass one for each.")
         draws = [np.random.Generator(np.random.PCG64(np.random.SeedSequence(s))) for s in seeds]
         nq, nv = self._rest.size, self._robots.qvel.shape[1]
         qpos = np.stack([self._rest + d.uniform(-RESET_SPREAD, RESET_SPREAD, nq) for d in draws])
         qvel = np.stack([RESET_SPREAD * d.standard_normal(nv) for d in draws])
         if self.env.ant:
             qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-        self.restore(qpos, qvel)
+        self.restore(qpos, qvel, ids=ids)
 
     def restore(
         self,
@@ -193,11 +194,14 @@ class Simulation:
         qvel: np.ndarray,
         warmstart: np.ndarray | None = None,
         place: np.ndarray | None = None,
+        ids: Sequence[int] | None = None,
     ) -> None:
-        """Put every robot into a state. `place` (B, 2): the Ant's lagged position, if it is not that of `qpos`."""
-        self._robots.place(qpos, qvel, np.zeros_like(qvel) if warmstart is None else warmstart)
-        self._place = self._measured() if place is None else np.array(place, np.float64)
-        self.running[:] = True
+        """Put robots (those in `ids`, or all) into states. `place` (B, 2): the Ant's lagged position, if it is not that
+        of `qpos`."""
+        ids = np.arange(self.batch) if ids is None else np.asarray(ids)
+        self._robots.place(ids, qpos, qvel, np.zeros_like(qvel) if warmstart is None else warmstart)
+        self._place[ids] = self._measured()[ids] if place is None else place
+        self.running[ids] = True
 
     def _measured(self) -> np.ndarray:
         """(B, 1 or 2) positions whose displacement is the speed."""
@@ -250,11 +254,11 @@ class _Batch:
     def torso(self) -> np.ndarray:
         return self._xpos[:, 1, :2]
 
-    def place(self, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
-        self._batch.reset(stage=0)
-        self.qpos[:], self.qvel[:] = qpos, qvel
-        self._batch.forward()
-        self._warm[:] = warmstart
+    def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
+        self._batch.reset(ids=ids, stage=0)
+        self.qpos[ids], self.qvel[ids] = qpos, qvel
+        self._batch.forward(ids=ids)
+        self._warm[ids] = warmstart
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
         if len(live):
@@ -274,12 +278,13 @@ class _Loop:
         self.qpos, self.qvel = np.zeros((batch, model.nq)), np.zeros((batch, model.nv))
         self.torso = np.zeros((batch, 2))
 
-    def place(self, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
-        for k, d in enumerate(self._data):
+    def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
+        for row, k in enumerate(ids):
+            d = self._data[k]
             self._mujoco.mj_resetData(self._model, d)
-            d.qpos[:], d.qvel[:] = qpos[k], qvel[k]
+            d.qpos[:], d.qvel[:] = qpos[row], qvel[row]
             self._mujoco.mj_forward(self._model, d)
-            d.qacc_warmstart[:] = warmstart[k]
+            d.qacc_warmstart[:] = warmstart[row]
             self._read(k)
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:

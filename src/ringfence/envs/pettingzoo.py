@@ -1,7 +1,7 @@
-"""Simple Spread behind PettingZoo's parallel API, over the same core as the vectorised simulator.
+"""The simulators behind PettingZoo's parallel API, over the same cores as the vectorised ones.
 
 For tools that expect one environment and dictionaries of agents. Rollouts of many episodes should use
-`ringfence.envs.SimpleSpread` directly: it is orders of magnitude faster.
+`ringfence.envs.SimpleSpread` and `SafeMuJoCo` directly: they are orders of magnitude faster.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadState
 from ringfence.errors import UserError
 
@@ -75,12 +76,7 @@ class SimpleSpreadParallel(ParallelEnv):
 
     def step(self, actions: dict[str, Any]) -> Dicts:
         """Advance by 0.1 s with one action (2,) per agent."""
-        if not self.agents:
-            raise UserError("The episode is over or was never started; call reset() before step().")
-        missing = [a for a in self.agents if a not in actions]
-        if missing:
-            raise UserError(f"step() got no action for {', '.join(missing)}; pass one entry per live agent.")
-        joint = np.stack([np.asarray(actions[a], np.float32) for a in self.agents])[None]
+        joint = _joint(self.agents, actions)
         self._state, transition = self._step(self._state, joint)
         self._steps += 1
         agents, over = self.agents, self._steps >= self.core.episode_length
@@ -137,3 +133,86 @@ class SimpleSpreadParallel(ParallelEnv):
         distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
         np.fill_diagonal(distance, np.inf)
         return distance.min(1) - CONTACT_DISTANCE
+
+
+class SafeMuJoCoParallel(ParallelEnv):
+    """A robot of `SafeMuJoCo` as `agent_0` .. `agent_{N-1}`.
+
+    Observations are float64 (O,), actions torques in [-1, 1]^A (clipped), rewards shared. Every agent's info carries
+    `cost` (1 where the step's speed exceeded the limit), `speed` and `clearance` (limit minus speed, m/s).
+    """
+
+    metadata = {"render_modes": [], "name": "ringfence_safe_mujoco"}
+
+    def __init__(self, **options: Any):
+        self.core = SafeMuJoCo(**options)
+        self.possible_agents = names = [f"agent_{i}" for i in range(self.core.n_agents)]
+        self.agents: list[str] = []
+        observation, state = (self.core.observed.shape[1],), (len(self.core.state_names),)
+        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, observation, np.float64) for a in names}
+        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (self.core.action_dim,), np.float32) for a in names}
+        self.state_space = spaces.Box(-np.inf, np.inf, state, np.float64)
+        self._sim = self.core.simulate(1, threads=1)
+        self._seeds: np.random.SeedSequence | None = None
+        self._steps = 0
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        return self.action_spaces[agent]
+
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
+        """Start an episode; a seed fixes this one, as in safety-gymnasium, and all later ones."""
+        if seed is not None or self._seeds is None:
+            self._seeds = np.random.SeedSequence(seed)
+            start = self._seeds.entropy
+        else:
+            start = self._seeds.spawn(1)[0].generate_state(4).tolist()
+        self._sim.reset([start])
+        self._steps, self.agents = 0, self.possible_agents[:]
+        return self._observations(), {a: {"cost": 0.0, "speed": 0.0, "clearance": self.core.limit} for a in self.agents}
+
+    def step(self, actions: dict[str, Any]) -> Dicts:
+        """Advance by 0.05 s with one action (A,) per agent."""
+        out = self._sim.step(_joint(self.agents, actions))
+        self._steps += 1
+        agents, fallen = self.agents, bool(out.terminated[0])
+        over = self._steps >= self.core.episode_length
+        speed = float(out.speed[0])
+        told = {"cost": float(out.cost[0]), "speed": speed, "clearance": self.core.limit - speed}
+        result = (
+            self._observations(),
+            dict.fromkeys(agents, float(out.reward[0])),
+            dict.fromkeys(agents, fallen),
+            dict.fromkeys(agents, over),
+            {a: dict(told) for a in agents},
+        )
+        if over or fallen:
+            self.agents = []
+        return result
+
+    def state(self) -> np.ndarray:
+        """(S,) see `SafeMuJoCo.state_names`."""
+        if self._seeds is None:
+            raise UserError("There is no state before the first episode; call reset() first.")
+        return self._sim.state()[0]
+
+    def render(self) -> None:
+        """Draws nothing; videos come from the report."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        return dict(zip(self.possible_agents, self._sim.observe()[0]))
+
+
+def _joint(agents: list[str], actions: dict[str, Any]) -> np.ndarray:
+    """(1, N, A) from one action per live agent."""
+    if not agents:
+        raise UserError("The episode is over or was never started; call reset() before step().")
+    missing = [a for a in agents if a not in actions]
+    if missing:
+        raise UserError(f"step() got no action for {', '.join(missing)}; pass one entry per live agent.")
+    return np.stack([np.asarray(actions[a], np.float32) for a in agents])[None]

@@ -1,0 +1,193 @@
+"""Behaviour policies for the robots: MATD3 on the native simulator, its snapshots, and the collection of episodes.
+
+OG-MARL's sets (Formanek et al. 2023) were made by training MATD3 to a level, rolling the policy out with Gaussian
+noise of 0.2 on the actions, and mixing four such policies. The learner here reads the global state in its critic,
+which one team needs once, since everybody has the same reward.
+
+    python -m ringfence.data.robots 2x3 --seed 0 --out runs/behaviour
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.data import matd3
+from ringfence.data.matd3 import Learner, MATD3Config, Mlp, Transitions
+from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.types import Array, Key
+
+COMMAND = "python -m ringfence.data.robots"
+
+
+@dataclass(frozen=True)
+class RobotsConfig:
+    """How long a behaviour policy is trained, and on what."""
+
+    learner: MATD3Config = MATD3Config(
+        hidden=256,
+        batch=256,
+        actor_rate=1e-3,
+        critic_rate=1e-3,
+        discount=0.99,
+        polyak=0.005,
+        noise=0.1,
+        reward_scale=1.0,
+        logit_penalty=1e-3,
+    )
+    robots: int = 16  # stepped side by side
+    stretch: int = 16  # steps of each between two bouts of learning
+    updates: int = 64  # critic updates per bout
+    random_steps: int = 10_000  # transitions with uniform actions at the start
+    transitions: int = 1_000_000
+    score_every: int = 50  # bouts between two scores
+    score_episodes: int = 8
+
+
+class Memory(NamedTuple):
+    """Everything the learner has seen, in a ring of M transitions."""
+
+    state: Array  # (M, S)
+    action: Array  # (M, N, A)
+    reward: Array  # (M,)
+    terminated: Array  # (M,)
+    after: Array  # (M, S)
+
+
+class Snapshot(NamedTuple):
+    """An actor and what it earns."""
+
+    actors: Mlp
+    seen: int  # transitions
+    score: float  # mean return with noise 0.2
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
+def learn(
+    config: RobotsConfig, env: SafeMuJoCo, learner: Learner, memory: Memory, fresh: Memory, at: Array, key: Key
+) -> tuple[Learner, Memory]:
+    """Put fresh transitions into the memory at row `at` and make a bout of updates."""
+    memory = jax.tree.map(lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, at, 0), memory, fresh)
+    stored = at + len(fresh.reward)
+
+    def one(learner: Learner, xs) -> tuple[Learner, None]:
+        index, key = xs
+        k_rows, k_noise = jax.random.split(key)
+        rows = jax.random.randint(k_rows, (config.learner.batch,), 0, stored)
+        m = Memory(*(x[rows] for x in memory))
+        seen, later = m.state[:, env.observed], m.after[:, env.observed]
+        batch = Transitions(seen, m.state, m.action, m.reward[:, None], m.terminated, later, m.after)
+        return matd3.update(config.learner, learner, batch, index % config.learner.delay == 0, k_noise), None
+
+    steps = jnp.arange(config.updates), jax.random.split(key, config.updates)
+    return jax.lax.scan(one, learner, steps)[0], memory
+
+
+@jax.jit
+def choose(actors: Mlp, observations: Array, noise: Array, key: Key) -> Array:
+    """(B, N, O) -> (B, N, A) with exploration noise."""
+    return matd3.noisy(matd3.act(actors, observations), noise, key)
+
+
+def train(
+    env: SafeMuJoCo,
+    config: RobotsConfig,
+    seed: int,
+    progress: Callable[[Snapshot], None] | None = None,
+) -> list[Snapshot]:
+    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2."""
+    b, n = config.robots, env.n_agents
+    sim, judge = env.simulate(b), env.simulate(config.score_episodes)
+    rng = np.random.default_rng(seed)
+    key = jax.random.key(seed)
+    s = len(env.state_names)
+    bouts = config.transitions // (b * config.stretch)
+    size = bouts * b * config.stretch
+    memory = Memory(
+        jnp.zeros((size, s)),
+        jnp.zeros((size, n, env.action_dim)),
+        jnp.zeros(size),
+        jnp.zeros(size, bool),
+        jnp.zeros((size, s)),
+    )
+    key, k = jax.random.split(key)
+    learner = matd3.init(config.learner, k, n, env.observed.shape[1], s, env.action_dim, team=True)
+    episode, age = b, np.zeros(b, int)
+    sim.reset([(seed, e) for e in range(b)])
+    found = []
+    for bout in range(bouts):
+        rows = []
+        for _ in range(config.stretch):
+            state = sim.state().astype(np.float32)
+            if bout * b * config.stretch < config.random_steps:
+                action = rng.uniform(-1, 1, (b, n, env.action_dim)).astype(np.float32)
+            else:
+                key, k = jax.random.split(key)
+                action = np.asarray(choose(learner.actors, sim.observe(state), config.learner.noise, k))
+            out = sim.step(action)
+            age += 1
+            rows.append((state, action, out.reward.astype(np.float32), out.terminated, sim.state().astype(np.float32)))
+            over = np.flatnonzero(out.terminated | (age >= env.episode_length))
+            if len(over):
+                sim.reset([(seed, episode + e) for e in range(len(over))], over)
+                episode, age[over] = episode + len(over), 0
+        fresh = Memory(*(np.concatenate(x) for x in zip(*rows)))
+        key, k = jax.random.split(key)
+        learner, memory = learn(config, env, learner, memory, fresh, bout * b * config.stretch, k)
+        if (bout + 1) % config.score_every == 0 or bout + 1 == bouts:
+            score = float(returns(env, learner.actors, judge, seed).mean())
+            found.append(Snapshot(jax.tree.map(np.asarray, learner.actors), (bout + 1) * b * config.stretch, score))
+            if progress is not None:
+                progress(found[-1])
+    return found
+
+
+def returns(env: SafeMuJoCo, actors: Mlp, sim, seed: int, noise: float = 0.2) -> np.ndarray:
+    """(B,) returns of an episode of every robot."""
+    key, total = jax.random.key(seed + 1), np.zeros(sim.batch)
+    sim.reset([(seed, 10**6 + e) for e in range(sim.batch)])
+    for _ in range(env.episode_length):
+        if not sim.running.any():
+            break
+        key, k = jax.random.split(key)
+        total += sim.step(np.asarray(choose(actors, sim.observe().astype(np.float32), noise, k))).reward
+    return total
+
+
+def main() -> None:
+    """Train one behaviour learner and keep its snapshots."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("parts", choices=("2x3", "2x4", "4x2"))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--transitions", type=int, default=1_000_000)
+    parser.add_argument("--out", type=Path, default=Path("runs/behaviour"))
+    a = parser.parse_args()
+    env = SafeMuJoCo(a.parts)
+    folder = a.out / f"{a.parts}-{a.seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    begun = time.perf_counter()
+
+    def keep(s: Snapshot) -> None:
+        arrays = {f"w{k}": w for k, w in enumerate(s.actors.weights)}
+        arrays |= {f"b{k}": b for k, b in enumerate(s.actors.biases)}
+        np.savez(folder / f"{s.seen:07d}.npz", **arrays)
+        line = {"seen": s.seen, "score": round(s.score, 1), "seconds": round(time.perf_counter() - begun, 1)}
+        print(json.dumps(line), flush=True)
+        with open(folder / "scores.jsonl", "a") as f:
+            f.write(json.dumps(line) + "\n")
+
+    train(env, RobotsConfig(transitions=a.transitions), a.seed, keep)
+
+
+if __name__ == "__main__":
+    main()
