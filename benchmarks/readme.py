@@ -60,6 +60,7 @@ def main() -> None:
         groups[row["task"], row["algorithm"], row["variant"]].append(row)
     put("README.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
+    put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv"))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
@@ -67,6 +68,18 @@ def main() -> None:
     lines = ["| what | measured | command |", "|---|---|---|"]
     lines += [f"| {name} | {value:.4g} {unit} | `{command}` |" for name, value, unit, command in speed]
     put("docs/performance.md", "performance", "\n".join(lines))
+
+
+def searched(file: Path) -> str:
+    """One line per setting tried on the medium tier."""
+    lines = ["| algorithm | setting | changes | norm. return | cost |", "|---|---|---|---|---|"]
+    with open(file) as f:
+        rows = [r for r in csv.DictReader(f) if r["task"].endswith("-medium")]
+    for r in rows:
+        told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
+        name = f"{r['algorithm']} {r['preset']}".strip()
+        lines.append(f"| `{name}` | {r['setting']} | {told} | {float(r['return_norm']):.3f} | {float(r['cost']):.2f} |")
+    return "\n".join(lines)
 
 
 def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:
