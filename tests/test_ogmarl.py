@@ -35,6 +35,7 @@ def recorded(parts: str, episodes: int = 3, length: int = 20) -> dict[str, np.nd
 def write_vault(folder, log, reverse=False, states=None, pad=False):
     """A Vault as OG-MARL writes it, by flashbax."""
     fbx = pytest.importorskip("flashbax", reason="flashbax writes the Vaults of this test")
+    import jax
     import jax.numpy as jnp
     from flashbax.vault import Vault
 
@@ -55,13 +56,9 @@ def write_vault(folder, log, reverse=False, states=None, pad=False):
     buffer = fbx.make_flat_buffer(
         max_length=steps + 1, min_length=1, sample_batch_size=1, add_sequences=True, add_batch_size=None
     )
-    first = {k: (v[0] if k != "infos" else {"state": v["state"][0]}) for k, v in tree.items()}
-    kept = buffer.init(
-        {k: (jnp.asarray(v) if k != "infos" else {"state": jnp.asarray(v["state"])}) for k, v in first.items()}
-    )
-    kept = buffer.add(
-        kept, {k: (jnp.asarray(v) if k != "infos" else {"state": jnp.asarray(v["state"])}) for k, v in tree.items()}
-    )
+    tree = jax.tree.map(jnp.asarray, tree)
+    kept = buffer.init(jax.tree.map(lambda x: x[0], tree))
+    kept = buffer.add(kept, tree)
     vault = Vault(vault_name="robot.vlt", experience_structure=kept.experience, rel_dir=str(folder), vault_uid="Good")
     assert vault.write(kept) == steps
     return folder / "robot.vlt" / "Good"

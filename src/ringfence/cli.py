@@ -66,8 +66,47 @@ def import_omar(directory: Positional[Path], out_file: Annotated[Path, tyro.conf
     """
     from ringfence.data.omar import import_omar
 
-    store = import_omar(directory)
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(out_file)}", soft_wrap=True)
+    _imported(import_omar(directory), out_file)
+
+
+def import_ogmarl(
+    vault: Positional[Path],
+    task: Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+) -> None:
+    """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
+
+    Args:
+        vault: e.g. 2halfcheetah.vlt/Good.
+        task: whose robot it is.
+        out_file: the store to write.
+    """
+    from ringfence.data.ogmarl import import_vault
+
+    _imported(import_vault(vault, task), out_file)
+
+
+def import_madiff(
+    directory: Positional[Path],
+    task: Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+) -> None:
+    """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
+
+    Args:
+        directory: the one that holds the arrays.
+        task: whose robot it is.
+        out_file: the store to write.
+    """
+    from ringfence.data.ogmarl import import_madiff
+
+    _imported(import_madiff(directory, task), out_file)
+
+
+def _imported(store, file: Path) -> None:
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True)
+    for note in store.card["warnings"]:
+        out.print(f"[yellow]note[/] {note}", soft_wrap=True)
 
 
 def info(file: Positional[Path]) -> None:
@@ -367,7 +406,14 @@ def bench_export(
     print(export_board(folder, format, out_file or folder / f"ranked.{kind}"))
 
 
-DATA = {"make": make, "import-omar": import_omar, "info": info, "train-behaviour": train_behaviour}
+DATA = {
+    "make": make,
+    "import-omar": import_omar,
+    "import-ogmarl": import_ogmarl,
+    "import-madiff": import_madiff,
+    "info": info,
+    "train-behaviour": train_behaviour,
+}
 BENCH = {"status": bench_status, "results": bench_results, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,

@@ -3,8 +3,7 @@
 Both were recorded with the old multi-agent MuJoCo, whose observations are not those of Safe Multi-Agent MuJoCo; its
 *states* are, up to what follows them. So everything is rebuilt from states:
 
-* a Vault holds states; MADIFF's arrays hold none, but HalfCheetah's follows from its observations (both halves see all);
-  the Ant's does not: z, orientation and vy are in no observation, so its arrays keep their own observations, no
+* a Vault holds states; MADIFF's arrays hold none, but HalfCheetah's follows from its observations; the Ant's does not: z, orientation and vy are in no observation, so its arrays keep their own observations, no
   simulator can evaluate what is learned from them, and speed means |vx|;
 * the order of HalfCheetah's actions differs between versions of the old code. One step is replayed in the simulator
   with each order; the one that reproduces the next state is taken, and a data set that neither reproduces is refused;
@@ -67,7 +66,7 @@ def import_vault(vault: str | os.PathLike, task: str) -> EpisodeStore:
     if state.shape[-1] not in known:
         raise StoreError(
             f"{where} has states of {state.shape[-1]} entries; known layouts of {task} have "
-            f"{', '.join(str(k) for k in sorted(known))} (positions without the planar place, velocities, contact forces)."
+            f"{', '.join(str(k) for k in sorted(known))} (positions but the planar place, velocities, contact forces)."
         )
     flags = (arrays["terminals"] > 0) | (arrays["truncations"] > 0)
     last = flags.reshape(sequences, steps, -1).any(-1)
@@ -116,7 +115,7 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str) -> 
         if x is not None and not np.isfinite(x).all():
             row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
             raise StoreError(
-                f"{log.where}: {name} of step {row} is not finite (some recordings pad with -inf); cut those rows first."
+                f"{log.where}: {name} of step {row} is not finite (some pad with -inf); cut those rows first."
             )
     if not log.last.any():
         raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
@@ -150,8 +149,8 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str) -> 
         speed, seen = np.hypot(vx, vy), ("torso.vx", "torso.vy")
     elif env.ant:
         notes.append(
-            "vy, height and orientation are in no observation and cannot be recovered: costs and hazard read |vx| alone, "
-            "and the simulator cannot evaluate what is learned from this data"
+            "vy, height and orientation are in no observation and cannot be recovered: costs and hazard read |vx| "
+            "alone, and the simulator cannot evaluate what is learned from this data"
         )
     x = log.state[:total].astype(np.float32) if log.state is not None else log.observations[:total].astype(np.float32)
     name = f"{task}-{tier}" if log.state is not None else f"{task}-{tier}-observations"
@@ -198,8 +197,8 @@ def _action_order(log: Log, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndar
     best = min(errors, key=errors.get)
     if errors[best] > AGREES:
         raise StoreError(
-            f"{log.where} is not this robot's: one step in the simulator misses the recorded state by {errors[best]:.3g} in "
-            f"the median ({AGREES} is allowed), whichever the order of actions; check task and version."
+            f"{log.where} is not this robot's: one step in the simulator misses the recorded state by {errors[best]:.3g} "
+            f"in the median ({AGREES} is allowed), whichever the order of actions; check task and version."
         )
     order = forward if best == "as recorded" else forward[::-1]
     other = max(errors.values())
