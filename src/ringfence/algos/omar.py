@@ -228,5 +228,5 @@ OMAR = Algorithm(
     },
 )
 # Without the penalty the policy gradient can saturate the actors, for good; at the study's rate it always did.
-_CQL = {"coefficient": 0.0, "logit_penalty": 0.01}
-MA_CQL = replace(OMAR, name="ma-cql", presets={name: {**_CQL, **p} for name, p in {"default": {}, **_TIERS}.items()})
+_CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "steps": 2_000}
+MA_CQL = replace(OMAR, name="ma-cql", presets={name: {**p, **_CQL} for name, p in {"default": {}, **_TIERS}.items()})

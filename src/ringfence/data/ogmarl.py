@@ -3,8 +3,9 @@
 Both were recorded with the old multi-agent MuJoCo, whose observations are not those of Safe Multi-Agent MuJoCo; its
 *states* are, up to what follows them. So everything is rebuilt from states:
 
-* a Vault holds states; MADIFF's arrays hold none, but HalfCheetah's follows from its observations; the Ant's does not: z, orientation and vy are in no observation, so its arrays keep their own observations, no
-  simulator can evaluate what is learned from them, and speed means |vx|;
+* a Vault holds states; MADIFF's arrays hold none, but HalfCheetah's follows from its observations. The Ant's does not:
+  z, orientation and vy are in no observation, so its arrays keep their own observations, no simulator can evaluate what
+  is learned from them, and speed means |vx|;
 * the order of HalfCheetah's actions differs between versions of the old code. One step is replayed in the simulator
   with each order; the one that reproduces the next state is taken, and a data set that neither reproduces is refused;
 * what an episode's last action led to is not recorded, so that step is dropped; an episode that ended at the time
@@ -197,8 +198,8 @@ def _action_order(log: Log, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndar
     best = min(errors, key=errors.get)
     if errors[best] > AGREES:
         raise StoreError(
-            f"{log.where} is not this robot's: one step in the simulator misses the recorded state by {errors[best]:.3g} "
-            f"in the median ({AGREES} is allowed), whichever the order of actions; check task and version."
+            f"{log.where} is not this robot's: one step in the simulator misses the recorded state by "
+            f"{errors[best]:.3g} in the median ({AGREES} is allowed) in either order of actions; check the task."
         )
     order = forward if best == "as recorded" else forward[::-1]
     other = max(errors.values())
