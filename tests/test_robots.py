@@ -1,0 +1,102 @@
+"""Features, rollouts and behaviour learning on the robots; what the simulator does is in test_mujoco.py."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import evaluate, features, hazards
+from ringfence.data import robots
+from ringfence.data.matd3 import MATD3Config
+from ringfence.envs import SafeMuJoCo
+from ringfence.policies import PolicyStep
+
+PARTS = ("2x3", "2x4", "4x2")
+
+
+def view_of(env: SafeMuJoCo, view: str = "pruned") -> features.FeatureMap:
+    return features.robot(view, env.state_names, env.joints, env.own_joints, env.observed)
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_views_show_every_agent_its_own_joints_first(parts):
+    env = SafeMuJoCo(parts)
+    state = np.random.default_rng(0).normal(size=(5, len(env.state_names)))
+    seen, view = state[:, env.observed], view_of(env)
+    x = view(seen, state)
+    at = {name: k for k, name in enumerate(env.state_names)}
+    for i in range(env.n_agents):
+        for k, joint in enumerate(env.own_joints[i]):
+            name = env.joints[joint]
+            np.testing.assert_array_equal(x[:, i, view.names.index(f"own.joint{k}.q")], state[:, at[f"{name}.q"]])
+            np.testing.assert_array_equal(x[:, i, view.names.index(f"own.joint{k}.v")], state[:, at[f"{name}.v"]])
+    np.testing.assert_array_equal(x[:, -1, view.names.index("torso.vx")], state[:, at["torso.vx"]])
+    assert sorted(x[0, 0]) == pytest.approx(sorted(state[0])), "nothing is lost"
+    own = view_of(env, "decentralized")
+    assert own(seen, None).shape == seen.shape and len(set(own.names)) == len(own.names)
+    assert view_of(env, "centralized")(None, state).shape == (5, env.n_agents, len(env.state_names))
+    limit = hazards.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",))
+    clear = hazards.bind(limit, view.names, env.n_agents).clearance(x)
+    assert clear.shape == (5, env.n_agents) and np.allclose(clear, clear[:, :1])
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_plans_agree_on_the_body(parts):
+    """Row 0 stays; later torsos are the mean of everybody's; others' joints are where their owners plan them."""
+    env = SafeMuJoCo(parts)
+    view = view_of(env)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(2, 4, env.n_agents, len(view.names))))
+    y = view.agreed(x)
+    np.testing.assert_array_equal(y[:, 0], x[:, 0])
+    torso = [k for k, name in enumerate(view.names) if name.startswith("torso.")]
+    np.testing.assert_allclose(y[:, 1:, :, torso], x[:, 1:, :, torso].mean(2, keepdims=True) + 0 * y[:, 1:, :, torso])
+    own = [k for k, name in enumerate(view.names) if name.startswith("own.")]
+    first = [k for k, name in enumerate(view.names) if name.startswith("other0.")]
+    np.testing.assert_array_equal(y[..., own], x[..., own])
+    np.testing.assert_allclose(y[:, 1:, 0, first], x[:, 1:, 1, own])
+    np.testing.assert_allclose(view.agreed(y), y, atol=1e-6)
+    # a true state is its own agreement
+    state = np.random.default_rng(2).normal(size=(1, 3, len(env.state_names)))
+    np.testing.assert_allclose(view.agreed(jnp.asarray(view(None, state))), view(None, state), atol=1e-6)
+
+
+class Push(eqx.Module):
+    """Every joint with full torque."""
+
+    def start(self, batch):
+        return {}
+
+    def act(self, memory, observations, state, key):
+        return memory, PolicyStep(jnp.ones((*observations.shape[:2], 2)), {})
+
+
+def test_rollouts_stop_where_the_robot_falls():
+    env = SafeMuJoCo("4x2", episode_length=150)
+    played = evaluate.rollout(Push(), env, 6)
+    assert played["rewards"].shape == played["costs"].shape == (6, 150)
+    assert played["states"].shape == (6, 151, len(env.state_names))
+    again = evaluate.rollout(Push(), env, 3)
+    np.testing.assert_array_equal(again["rewards"], played["rewards"][:3])  # a reset is the same in any batch
+    other = evaluate.rollout(Push(), env, 3, split="validation")
+    assert not np.array_equal(other["states"][:, 0], played["states"][:3, 0])
+    for rewards, states in zip(played["rewards"], played["states"]):
+        end = len(rewards) if rewards[-1] else int(np.flatnonzero(rewards)[-1]) + 1
+        assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
+
+
+def test_behaviour_learning_is_reproducible():
+    env = SafeMuJoCo("2x3", episode_length=40)
+    learner = MATD3Config(hidden=8, batch=16, discount=0.9, reward_scale=1.0)
+    config = robots.RobotsConfig(
+        learner, robots=4, stretch=8, updates=4, random_steps=64, transitions=320, score_every=5, score_episodes=2
+    )
+    seen = []
+    one = robots.train(env, config, 0, seen.append)
+    two = robots.train(env, config, 0)
+    assert [s.seen for s in one] == [160, 320] == [s.seen for s in seen]
+    assert [s.score for s in one] == [s.score for s in two] and np.isfinite([s.score for s in one]).all()
+    assert one[0].actors.weights[0].shape == (2, 12, 8)
+    other = robots.train(env, config, 1)
+    assert other[-1].score != one[-1].score
