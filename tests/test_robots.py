@@ -11,7 +11,9 @@ from ringfence import evaluate, features, hazards
 from ringfence.data import robots
 from ringfence.data.matd3 import MATD3Config
 from ringfence.envs import SafeMuJoCo
-from ringfence.policies import PolicyStep
+from ringfence.errors import UserError
+from ringfence.report.video import animate
+from ringfence.types import PolicyStep
 
 PARTS = ("2x3", "2x4", "4x2")
 
@@ -63,13 +65,18 @@ def test_plans_agree_on_the_body(parts):
 
 
 class Push(eqx.Module):
-    """Every joint with full torque."""
+    """Every joint of the 4x2 Ant with full torque."""
 
     def start(self, batch):
         return {}
 
     def act(self, memory, observations, state, key):
         return memory, PolicyStep(jnp.ones((*observations.shape[:2], 2)), {})
+
+
+class Wait(Push):
+    def act(self, memory, observations, state, key):
+        return memory, PolicyStep(jnp.zeros((*observations.shape[:2], 4)), {})
 
 
 def test_rollouts_stop_where_the_robot_falls():
@@ -100,3 +107,24 @@ def test_behaviour_learning_is_reproducible():
     assert one[0].actors.weights[0].shape == (2, 12, 8)
     other = robots.train(env, config, 1)
     assert other[-1].score != one[-1].score
+
+
+def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
+    from PIL import Image
+
+    env = SafeMuJoCo("2x4", episode_length=10)
+    played = evaluate.rollout(Wait(), env, 1)
+    try:
+        file = animate(env, played["states"][0], played["costs"][0], tmp_path / "ant.gif")
+    except UserError as error:  # no way to draw on this machine
+        assert "install EGL" in str(error) and not list(tmp_path.iterdir())
+        return
+    with Image.open(file) as picture:
+        assert picture.size == (320, 240) and picture.n_frames == 6
+
+
+def test_without_a_way_to_draw_the_reason_is_said(tmp_path, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "glass")
+    with pytest.raises(UserError, match="cannot be drawn here .*install EGL"):
+        animate(SafeMuJoCo("2x3"), np.zeros((3, 17)), np.zeros(2), tmp_path / "x.gif")
+    assert not list(tmp_path.iterdir())

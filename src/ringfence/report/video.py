@@ -1,0 +1,99 @@
+"""Robots as small animated pictures, drawn without a display: EGL, or OSMesa where there is no EGL.
+
+MuJoCo decides how to draw when it is imported, so drawing happens in a process of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from ringfence.envs.mujoco import DT, SafeMuJoCo
+from ringfence.errors import UserError
+from ringfence.files import whole
+
+WIDTH, HEIGHT = 320, 240  # pixels
+EVERY = 2  # steps per frame, at least
+LONGEST = 200  # frames
+BACKENDS = ("egl", "osmesa")
+
+
+def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
+    """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
+
+    `UserError` where neither EGL nor OSMesa can draw.
+    """
+    out = Path(out)
+    wanted = os.environ.get("MUJOCO_GL")
+    reasons = []
+    with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
+        file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
+        np.savez(file, states=states, costs=costs, env=json.dumps(dataclasses.asdict(env)))
+        for backend in (wanted,) if wanted else BACKENDS:
+            command = [sys.executable, "-m", "ringfence.report.video", str(file), str(picture)]
+            made = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": backend})
+            if made.returncode == 0:
+                temporary.write_bytes(picture.read_bytes())
+                return out
+            reasons.append(f"{backend}: {(made.stderr.strip().splitlines() or ['no reason given'])[-1]}")
+        raise UserError(
+            f"Robots cannot be drawn here ({'; '.join(reasons)}); install EGL (Debian: libegl1 libgl1-mesa-dri) or "
+            "OSMesa (libosmesa6)."
+        )
+
+
+def stride(states: np.ndarray) -> int:
+    """Steps per frame; long episodes are thinned out."""
+    return max(EVERY, -(-len(states) // LONGEST))
+
+
+def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
+    """Pictures of an episode. The planar position is not in the state, so it is summed up from the velocity."""
+    import mujoco
+    from PIL import Image, ImageDraw
+
+    model = env.model()
+    model.light_castshadow[:] = 0
+    data, planar = mujoco.MjData(model), 2 if env.ant else 1
+    moving = [env.state_names.index(f"torso.v{c}") for c in "xy"[:planar]]
+    place = np.cumsum(states[:, moving], 0) * DT
+    speed = np.linalg.norm(states[:, moving], axis=1)
+    renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
+    nq = model.nq
+    for t in range(0, len(states), stride(states)):
+        data.qpos[:] = np.concatenate([place[t], states[t, : nq - planar]])
+        mujoco.mj_forward(model, data)
+        renderer.update_scene(data, camera="track")
+        picture = Image.fromarray(renderer.render())
+        over = bool(costs[max(t - 1, 0)])
+        draw = ImageDraw.Draw(picture)
+        scale = (WIDTH - 20) / (2 * env.limit)
+        draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=(225, 225, 225))
+        end = 10 + min(speed[t], 2 * env.limit) * scale
+        draw.rectangle((10, HEIGHT - 16, end, HEIGHT - 8), fill=(200, 60, 50) if over else (70, 100, 200))
+        draw.line((10 + env.limit * scale, HEIGHT - 20, 10 + env.limit * scale, HEIGHT - 4), fill=(20, 20, 20), width=2)
+        text = f"{t * DT:4.1f} s   {speed[t]:.2f} m/s, limit {env.limit:g}" + ("   over" if over else "")
+        draw.rectangle((0, 0, WIDTH, 16), fill=(250, 250, 250))
+        draw.text((10, 3), text, fill=(160, 30, 20) if over else (20, 20, 20))
+        yield picture
+
+
+def main() -> None:
+    """Draw the episode in a file that `animate` wrote."""
+    with np.load(sys.argv[1]) as file:
+        env = SafeMuJoCo(**json.loads(str(file["env"])))
+        states, costs = file["states"], file["costs"]
+    pictures = [p.quantize(64) for p in frames(env, states, costs)]
+    shown = round(1000 * DT * stride(states))  # ms
+    pictures[0].save(sys.argv[2], save_all=True, append_images=pictures[1:], duration=shown, loop=0)
+
+
+if __name__ == "__main__":
+    main()
