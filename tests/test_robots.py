@@ -64,6 +64,24 @@ def test_plans_agree_on_the_body(parts):
     np.testing.assert_allclose(view.agreed(jnp.asarray(view(None, state))), view(None, state), atol=1e-6)
 
 
+def test_collected_episodes_are_whole_and_replay():
+    """Twice the same; every row is a step of the simulator from the row's state."""
+    env = SafeMuJoCo("2x4", episode_length=60)
+    first, again = (robots.collect(env, [None, None], 300, seed=7, batch=4) for _ in range(2))
+    for name, x in first.items():
+        np.testing.assert_array_equal(x, again[name])
+    lengths = np.diff(first["episode_ends"], prepend=0)
+    assert first["episode_ends"][-1] == len(first["rewards"]) >= 300 and lengths.max() <= 60
+    assert (first["terminated"] == (lengths < 60)).all() and set(first["policy"]) == {0, 1}
+    starts = first["episode_ends"] - lengths
+    sim = env.simulate(len(starts))
+    state = first["state"][starts].astype(np.float64)
+    sim.restore(np.concatenate([np.zeros((len(starts), 2)), state[:, :13]], 1), state[:, 13:])
+    out = sim.step(first["actions"][starts])
+    np.testing.assert_allclose(out.reward, first["rewards"][starts], atol=1e-3)
+    np.testing.assert_allclose(sim.state(), first["state"][starts + 1], atol=1e-2)
+
+
 class Push(eqx.Module):
     """Every joint of the 4x2 Ant with full torque."""
 

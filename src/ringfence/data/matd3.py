@@ -24,6 +24,7 @@ class MATD3Config:
     """Hyper-parameters of the behaviour learner; the defaults are those of the shipped tiers."""
 
     hidden: int = 64  # width of both hidden layers of every actor and critic (OMAR's)
+    critic_hidden: int | None = None  # of critics, if it is another
     envs: int = 30  # environments stepped side by side; a round is one episode of each
     random_rounds: int = 20  # rounds of uniform actions before the actors take over
     updates: int = 29  # critic updates after every round
@@ -108,6 +109,7 @@ def init(config: MATD3Config, key: Key, n: int, observed: int, seen: int, a: int
     ka, kc = jax.random.split(key)
     h, actor_opt, critic_opt = config.hidden, *_optimisers(config)
     actors = _init_mlp(ka, (n,), (observed, h, h, a), last=3e-3)
+    h = config.critic_hidden or h
     critics = _init_mlp(kc, (2, 1 if team else n), (seen + n * a, h, h, 1))
     copy = partial(jax.tree.map, jnp.copy)  # the training loop donates its buffers, so targets need their own
     return Learner(actors, critics, copy(actors), copy(critics), actor_opt.init(actors), critic_opt.init(critics))

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.data import matd3
+from ringfence.data.behaviour import BehaviourPolicy
 from ringfence.data.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.types import Array, Key
@@ -35,7 +36,8 @@ class RobotsConfig:
     """How long a behaviour policy is trained, and on what."""
 
     learner: MATD3Config = MATD3Config(
-        hidden=256,
+        hidden=128,  # small actors, since they are shipped
+        critic_hidden=256,
         batch=256,
         actor_rate=1e-3,
         critic_rate=1e-3,
@@ -162,6 +164,53 @@ def returns(env: SafeMuJoCo, actors: Mlp, sim, seed: int, noise: float = 0.2) ->
         key, k = jax.random.split(key)
         total += sim.step(np.asarray(choose(actors, sim.observe().astype(np.float32), noise, k))).reward
     return total
+
+
+def collect(
+    env: SafeMuJoCo, policies: list[BehaviourPolicy | None], transitions: int, seed: int, batch: int = 256
+) -> dict[str, np.ndarray]:
+    """At least `transitions` steps in whole episodes, the same number from every policy (None: uniform actions).
+
+    Flat arrays as `EpisodeStore.from_steps` takes them: state (T, S), actions, rewards, costs, speed (T,),
+    episode_ends (E,), final_state (E, S), terminated (E,), policy (E,).
+    """
+    parts = []
+    for number, policy in enumerate(policies):
+        wanted, got = -(-transitions // len(policies)), 0
+        while got < wanted:
+            need = -(-(wanted - got) // env.episode_length)
+            part = _episodes(env, policy, min(batch, max(need, 1)), (seed, number, got))
+            got += len(part["rewards"])
+            part["policy"] = np.full(len(part["lengths"]), number)
+            parts.append(part)
+    out = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+    return {**out, "episode_ends": np.cumsum(out.pop("lengths"))}
+
+
+def _episodes(env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed: tuple[int, ...]) -> dict:
+    """One episode of every robot of a batch, cut to their lengths."""
+    sim, rng = env.simulate(batch), np.random.default_rng(seed)
+    key = jax.random.key(int(rng.integers(2**31)))
+    sim.reset([(*seed, k) for k in range(batch)])
+    rows, running = [], []
+    for _ in range(env.episode_length):
+        if not sim.running.any():
+            break
+        state = sim.state().astype(np.float32)
+        if policy is None:
+            action = rng.uniform(-1, 1, (batch, env.n_agents, env.action_dim)).astype(np.float32)
+        else:
+            key, k = jax.random.split(key)
+            action = np.asarray(choose(policy.actors, sim.observe(state), policy.noise, k))
+        running.append(sim.running.copy())
+        out = sim.step(action)
+        rows.append((state, action, *(x.astype(np.float32) for x in (out.reward, out.cost, out.speed)), out.terminated))
+    alive = np.stack(running, 1)  # (B, T)
+    lengths = alive.sum(1)
+    names = ("state", "actions", "rewards", "costs", "speed", "ended")
+    flat = {k: np.stack(x, 1)[alive] for k, x in zip(names, zip(*rows))}
+    terminated = flat.pop("ended")[np.cumsum(lengths) - 1]
+    return {**flat, "lengths": lengths, "final_state": sim.state().astype(np.float32), "terminated": terminated}
 
 
 def main() -> None:
