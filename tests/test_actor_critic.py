@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ringfence import tasks, training
 from ringfence.algos import actor_critic as ac
 from ringfence.algos import fisor, omar, td3bc
 from ringfence.errors import UserError
@@ -124,3 +125,10 @@ def test_threshold_of_the_multiplier():
 def test_bad_settings_are_refused(check, config, word):
     with pytest.raises(UserError, match=word):
         check(config, None)
+
+
+def test_a_run_takes_the_preset_of_its_data(small_store):
+    task = tasks.from_store(small_store)
+    assert training.make_job("omar", task, None, {}).preset == task.tier
+    assert training.make_job("omar", task, "default", {}).preset == "default"
+    assert training.make_job("bc", task, None, {}).preset == "default"

@@ -147,11 +147,11 @@ def train(
     """Train an algorithm on a task or on a store of your own; an interrupted run is resumed by the same command.
 
     Args:
-        algorithm: icbf, madiff, bc or bc-safe.
+        algorithm: icbf, madiff, bc, bc-safe, ma-td3bc, ma-td3bc-lag, omar, ma-cql or fisor.
         data: a task (its data set is regenerated if need be) or a store's file.
         seeds: how many, starting with first_seed.
         first_seed: the first one.
-        preset: named differences from the defaults, e.g. split or paper.
+        preset: named differences from the defaults, e.g. split or paper; by default that of the data tier, if any.
         set: config fields, e.g. --set barrier_weight=0.5 steps=8000.
         out: folder of runs.
         together: train all seeds in one program.

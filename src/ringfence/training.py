@@ -59,9 +59,10 @@ class Job:
 
 
 def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, store: EpisodeStore | None = None) -> Job:
-    """Resolve names to values; every bad name or value is refused here, before work starts."""
+    """Resolve names to values; every bad name or value is refused here, before work starts. Without a preset, that of
+    the task's data tier is taken where there is one."""
     a = algos.get(algorithm)
-    preset = preset or next(iter(a.presets))
+    preset = preset or a.preset_for(task.tier)
     if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
     config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)

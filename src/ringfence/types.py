@@ -105,3 +105,7 @@ class Algorithm:
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
+
+    def preset_for(self, tier: str) -> str:
+        """The preset named after the data tier where there is one, else the first."""
+        return tier if tier in self.presets else next(iter(self.presets))

@@ -29,8 +29,7 @@ class Entry:
         return f"{self.algorithm}:{self.preset}" if self.preset else self.algorithm
 
     def preset_for(self, task: Task) -> str:
-        presets = algos.get(self.algorithm).presets
-        return self.preset or (task.tier if task.tier in presets else next(iter(presets)))
+        return self.preset or algos.get(self.algorithm).preset_for(task.tier)
 
     def variant(self, task: Task, evaluation: str) -> str:
         """The name of an evaluation in results.json."""
