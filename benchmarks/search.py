@@ -40,6 +40,8 @@ FIELDS = (
     "avoidable_cost",
     "train_seconds",
 )
+# OMAR's coefficients are per tier, in its study too; so its learning rate was tried on every tier (settings 0 and 1).
+FURTHER = {"omar": ("expert", "medium-replay", "random")}
 SAFE = ("bc-safe", "ma-td3bc-lag", "fisor", "icbf")
 
 # Algorithm and preset ("": the tier's) -> changes of settings 1 to 3.
@@ -138,7 +140,7 @@ def main() -> None:
             for (name, preset), others in SETTINGS.items()
             if not a.algorithms or name in a.algorithms
             for number, changes in enumerate([{}, *others])
-            for tier in TIERS
+            for tier in (*TIERS, *(FURTHER.get(name, ()) if number < 2 else ()))
             if (name, preset, number, f"simple_spread-{tier}") not in done
         ]
         spawn = multiprocessing.get_context("spawn")
