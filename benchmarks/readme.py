@@ -61,6 +61,7 @@ def main() -> None:
     put("README.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
     put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv"))
+    put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
@@ -79,6 +80,20 @@ def searched(file: Path) -> str:
         told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
         name = f"{r['algorithm']} {r['preset']}".strip()
         lines.append(f"| `{name}` | {r['setting']} | {told} | {float(r['return_norm']):.3f} | {float(r['cost']):.2f} |")
+    return "\n".join(lines)
+
+
+def spent(folder: Path) -> str:
+    """Seconds of training and playing a cell, by algorithm and preset; all cells together."""
+    seconds = defaultdict(list)
+    for file in sorted((folder / "cells").glob("*/*/*/status.json")):
+        told = json.loads(file.read_text())
+        seconds[file.parent.parent.name].append(told.get("train_seconds", 0.0) + told.get("eval_seconds", 0.0))
+    lines = ["| cells | number | mean s | longest s |", "|---|---:|---:|---:|"]
+    lines += [f"| `{k}` | {len(v)} | {np.mean(v):.0f} | {max(v):.0f} |" for k, v in sorted(seconds.items())]
+    total = sum(map(sum, seconds.values())) / 3600
+    cells = sum(map(len, seconds.values()))
+    lines.append(f"\nTogether {cells} cells and {total:.1f} hours of one core, {total / 2:.1f} hours on two.")
     return "\n".join(lines)
 
 
