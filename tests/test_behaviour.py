@@ -71,7 +71,8 @@ def test_updates_move_the_critics_towards_the_reward():
 
     learner, memory, _ = behaviour._train_rounds(ENV, config, learner, memory, rounds, key[None])
     states = jax.tree.map(lambda x: x[:, :-1].reshape(-1, *x.shape[2:]), memory.states)
-    value = matd3.value(learner.critics, ENV.observe(states), memory.actions.reshape(-1, 3, 2))
+    seen = ENV.observe(states)
+    value = matd3.value(learner.critics, seen.reshape(len(seen), -1), memory.actions.reshape(-1, 3, 2))
     target = config.reward_scale * memory.rewards.reshape(-1, 3).T
     error = jnp.abs(value - target).mean()
     assert error < 0.5 * jnp.abs(target - target.mean()).mean()
