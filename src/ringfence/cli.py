@@ -26,7 +26,7 @@ def tasks() -> None:
         table.add_row(
             t.name,
             f"{t.about}, {t.transitions:,} steps",
-            f"{mean:.1f} ± {deviation:.1f}",
+            f"{mean:.1f}" + ("" if deviation is None else f" ± {deviation:.1f}"),
             str(t.hazard),
             f"{t.cost_limit:g}",
             f"{t.cost_offset:g}",
@@ -192,6 +192,7 @@ def evaluate(
     prefix: int | None = None,
     replan: int | None = None,
     execution: str | None = None,
+    video: bool = False,
     set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
 ) -> None:
     """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
@@ -213,6 +214,7 @@ def evaluate(
         prefix: rows of a plan that are judged.
         replan: steps for which a plan is followed.
         execution: centralized or decentralized.
+        video: make a GIF of the first episode (robots).
         set: any other planner option, e.g. --set ascent=10 repair=100; docs/evaluation.md lists them.
     """
     from ringfence.evaluate import evaluate as run_evaluation
@@ -222,8 +224,18 @@ def evaluate(
     table = Table(
         "run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm"
     )
-    for run in _runs(runs):
+    found = _runs(runs)
+    if video:
+        from ringfence import tasks
+        from ringfence.report.video import check, film
+
+        for name in {run.config["task"] for run in found}:
+            check(tasks.get(name))
+        record = max(record, 1)
+    for run in found:
         r = run_evaluation(run, episodes=episodes, split=split, planner=planner, record=record, quiet=False, **given)
+        if video:
+            print(film(run, r["variant"]))
         table.add_row(
             str(run.path),
             r["variant"],
