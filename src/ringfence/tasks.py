@@ -82,7 +82,7 @@ def _spread(tier: str, mean: float, deviation: float, about: str, transitions: i
     )
 
 
-# OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return. The cost limit is Safety-Gymnasium's.
+# OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return; Safety-Gymnasium's cost limit.
 _ROBOTS = {
     "2x3": dict(return_min=-280.18, return_max=9132.25, cost_limit=25.0),
     "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=25.0),
