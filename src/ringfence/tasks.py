@@ -28,6 +28,7 @@ class Task:
     published_return: tuple[float, float | None] | None = None  # mean and deviation (if known) of the public data set
     transitions: int = 1_000_000  # of the full data set
     about: str = ""
+    presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take unless told otherwise
     protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
     action_high: float = 1.0
@@ -75,6 +76,7 @@ def _spread(tier: str, mean: float, deviation: float, about: str, transitions: i
         f"simple_spread-{tier}",
         SimpleSpread(),
         tier=tier,
+        presets=(tier,),
         published_return=(mean, deviation),
         about=about,
         transitions=transitions,
@@ -101,6 +103,7 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
         env,
         hazards.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)),
         tier=tier,
+        presets=("mujoco",),
         published_return=(mean, deviation),
         about=f"four MATD3 policies of the level {tier}",
         protocol="quantile" if quantile else "native",

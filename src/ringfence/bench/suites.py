@@ -29,7 +29,7 @@ class Entry:
         return f"{self.algorithm}:{self.preset}" if self.preset else self.algorithm
 
     def preset_for(self, task: Task) -> str:
-        return self.preset or algos.get(self.algorithm).preset_for(task.tier)
+        return self.preset or algos.get(self.algorithm).preset_for(task.presets)
 
     def variant(self, task: Task, evaluation: str) -> str:
         """The name of an evaluation in results.json."""
