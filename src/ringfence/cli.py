@@ -321,7 +321,7 @@ def demo(
 def bench(
     suite: Positional[str],
     seeds: int = 5,
-    episodes: int = 200,
+    episodes: int | None = None,
     out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     tasks: list[str] = [],  # noqa: B006
     algorithms: list[str] = [],  # noqa: B006
@@ -337,7 +337,7 @@ def bench(
     Args:
         suite: simple_spread.
         seeds: per algorithm and task.
-        episodes: test episodes per run.
+        episodes: test episodes per run; the suite's number by default.
         out_dir: folder of results, results/SUITE by default.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.

@@ -20,7 +20,7 @@ class Entry:
     """An algorithm in the table, and how its runs are played."""
 
     algorithm: str
-    preset: str = ""  # empty: the preset named after the data tier where there is one, else the default
+    preset: str = ""  # empty: the one made for the task where there is one, else the default
     evaluations: tuple[str, ...] = ("plain",)
     tiers: tuple[str, ...] = ()  # empty: all
 
@@ -43,6 +43,7 @@ class Suite:
 
     tasks: tuple[str, ...]
     entries: tuple[Entry, ...]
+    episodes: int = 200  # per run, unless told otherwise
 
 
 SUITES = {
