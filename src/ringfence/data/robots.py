@@ -49,7 +49,7 @@ class RobotsConfig:
     learner: MATD3Config = MATD3Config(
         hidden=128,  # small actors, since they are shipped
         critic_hidden=256,
-        batch=256,
+        batch=128,
         actor_rate=1e-3,
         critic_rate=1e-3,
         discount=0.99,
