@@ -63,7 +63,7 @@ class RobotsConfig:
     updates: int = 64  # critic updates per bout
     random_steps: int = 10_000  # transitions with uniform actions at the start
     transitions: int = 2_000_000  # at most
-    score_every: int = 50  # bouts between two scores
+    score_every: int = 20  # bouts between two scores
     score_episodes: int = 8
 
 
@@ -242,33 +242,52 @@ def shipped_policies(env: SafeMuJoCo, tier: str, folder: Path = POLICIES) -> lis
 def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES) -> dict[str, dict]:
     """Choose the policies of every tier among the snapshots of `runs` and write their files; returns their cards.
 
-    Of every run, the snapshots whose return is nearest to the tier's level: first by the score that training wrote
-    down, then by 32 episodes of the policy as it is stored, in half precision.
+    The runs take turns: of each, the snapshot whose return is nearest to the tier's level, then the next nearest, as
+    long as it is within a tenth of it. Returns are of 32 episodes of the policy as it is stored, in half precision.
     """
-    each = MIXED // len(runs)
-    if each * len(runs) != MIXED:
-        raise CheckpointError(f"{len(runs)} runs cannot share {MIXED} policies evenly; give 1, 2 or 4 run folders.")
     judge, cards = env.simulate(32), {}
     for tier, level in LEVELS[env.parts].items():
-        chosen = []
-        for run in runs:
-            rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: 4 * each]
-            found = []
-            for s in rough:
-                actors = _halved(_load_snapshot(run / f"{s['seen']:07d}.npz"))
-                earned = returns(env, actors, judge, 1)
-                found.append((abs(earned.mean() - level), s["seen"], float(earned.mean()), actors, run.name))
-            chosen += sorted(found, key=lambda f: f[:2])[:each]
-        actors = jax.tree.map(lambda *x: jnp.stack(x), *(f[3] for f in chosen))
+        found = [_nearest(env, judge, run, level) for run in runs]
+        turns = sorted(
+            (c for f in found for c in f),
+            key=lambda c: (abs(c.earned - level) > 0.1 * level, c.rank, abs(c.earned - level)),
+        )
+        chosen = turns[:MIXED]
+        if len(chosen) < MIXED:
+            raise CheckpointError(
+                f"The runs hold {len(chosen)} snapshots for '{tier}', {MIXED} are needed; train more."
+            )
         cards[tier] = {
-            "task": env.parts,
+            "task": env.name,
             "level": tier,
             "published_level": level,
-            "policies": [{"run": f[4], "transitions": f[1], "return": round(f[2], 1)} for f in chosen],
+            "policies": [{"run": c.run, "transitions": c.seen, "return": round(c.earned, 1)} for c in chosen],
             "command": f"{COMMAND} pack {env.parts}",
         }
+        actors = jax.tree.map(lambda *x: jnp.stack(x), *(c.actors for c in chosen))
         save_behaviour(BehaviourPolicy(actors, NOISE, cards[tier]), folder / _file(env, tier), np.float16)
     return cards
+
+
+class Candidate(NamedTuple):
+    """A snapshot as it would be stored."""
+
+    rank: int  # among those of its run, 0 is nearest to the level
+    run: str
+    seen: int
+    earned: float
+    actors: Mlp
+
+
+def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]:
+    """The snapshots of a run that come nearest to a level: picked by the scores of training, then judged again."""
+    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: 3 * MIXED]
+    judged = []
+    for s in rough:
+        actors = _halved(_load_snapshot(run / f"{s['seen']:07d}.npz"))
+        judged.append((float(returns(env, actors, judge, 1).mean()), s["seen"], actors))
+    judged.sort(key=lambda x: (abs(x[0] - level), x[1]))
+    return [Candidate(k, run.name, seen, earned, actors) for k, (earned, seen, actors) in enumerate(judged)]
 
 
 def keep(snapshot: Snapshot, run: Path, seconds: float) -> None:
@@ -311,6 +330,7 @@ def main() -> None:
     trained.add_argument("parts", choices=tuple(LEVELS))
     trained.add_argument("--seed", type=int, default=0)
     trained.add_argument("--transitions", type=int, default=RobotsConfig.transitions)
+    trained.add_argument("--level", choices=TIERS, default="good", help="end when this tier's level is passed")
     trained.add_argument("--out", type=Path, default=Path("runs/behaviour"))
     packed = what.add_parser("pack")
     packed.add_argument("parts", choices=tuple(LEVELS))
@@ -322,12 +342,12 @@ def main() -> None:
         for tier, card in pack(env, a.runs, a.out).items():
             print(tier, json.dumps(card["policies"]))
     else:
-        _train_and_keep(env, a.seed, a.transitions, a.out)
+        _train_and_keep(env, a.seed, a.transitions, a.level, a.out)
 
 
-def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, out: Path) -> None:
+def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, out: Path) -> None:
     folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
-    enough = 1.03 * LEVELS[env.parts]["good"]
+    enough = 1.03 * LEVELS[env.parts][level]
 
     def progress(snapshot: Snapshot) -> None:
         keep(snapshot, folder, time.perf_counter() - begun)
