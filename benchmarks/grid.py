@@ -27,7 +27,7 @@ from ringfence.bench import make_grid
 
 ROOT = Path(__file__).resolve().parent.parent / "results"
 WORK = {"tasks": ["simple_spread-expert"], "algorithms": ["bc", "ma-td3bc"], "seeds": 3, "episodes": 200}
-BRIEF = {"tasks": ["simple_spread-medium-replay"], "algorithms": ["bc", "bc-safe"], "seeds": 6, "episodes": 64}
+BRIEF = {"tasks": ["simple_spread-medium-replay"], "algorithms": ["bc", "bc-safe"], "seeds": 6, "episodes": 200}
 
 
 def grid_of(out: Path, tasks, algorithms, seeds, episodes, steps=None):

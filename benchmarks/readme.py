@@ -61,6 +61,7 @@ def main() -> None:
     put("README.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
     put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv"))
+    put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
@@ -79,6 +80,20 @@ def searched(file: Path) -> str:
         told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
         name = f"{r['algorithm']} {r['preset']}".strip()
         lines.append(f"| `{name}` | {r['setting']} | {told} | {float(r['return_norm']):.3f} | {float(r['cost']):.2f} |")
+    return "\n".join(lines)
+
+
+def spent(folder: Path) -> str:
+    """Seconds of training and playing a cell, by algorithm and preset; all cells together."""
+    seconds = defaultdict(list)
+    for file in sorted((folder / "cells").glob("*/*/*/status.json")):
+        told = json.loads(file.read_text())
+        seconds[file.parent.parent.name].append(told.get("train_seconds", 0.0) + told.get("eval_seconds", 0.0))
+    lines = ["| cells | number | mean s | longest s |", "|---|---:|---:|---:|"]
+    lines += [f"| `{k}` | {len(v)} | {np.mean(v):.0f} | {max(v):.0f} |" for k, v in sorted(seconds.items())]
+    total = sum(map(sum, seconds.values())) / 3600
+    cells = sum(map(len, seconds.values()))
+    lines.append(f"\nTogether {cells} cells and {total:.1f} hours of one core, {total / 2:.1f} hours on two.")
     return "\n".join(lines)
 
 
@@ -107,6 +122,7 @@ MARKS = {  # colour-blind-safe, and told apart by shape as well
     "BC": ("v", "#999933"),
     "MA-TD3+BC": ("<", "#AA3377"),
     "OMAR": (">", "#DDAA33"),
+    "MA-TD3+BC, Lagrange": ("p", "#EE3377"),
     "FISOR per agent": ("X", "#004488"),
     "MADIFF (no barrier)": ("^", "#0077BB"),
     "ICBF-Diffuser `paper`": ("D", "#CC3311"),
@@ -118,7 +134,7 @@ MARKS = {  # colour-blind-safe, and told apart by shape as well
 
 def draw(groups: dict, path: Path) -> None:
     """Normalised return against avoidable cost, one panel per tier, means over seeds with their spread."""
-    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.3), sharey=True, layout="constrained")
+    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.6), sharey=True, layout="constrained")
     for panel, tier in zip(panels, TIERS):
         for algorithm, variant, name in ROWS:
             rows = of(groups, tier, algorithm, variant)
@@ -139,14 +155,14 @@ def draw(groups: dict, path: Path) -> None:
                 elinewidth=1,
             )
         panel.set_xscale("symlog", linthresh=0.01)
-        panel.set_xlim(-0.003, 10)
+        panel.set_xlim(-0.003, 20)
         panel.axvline(0.02, color="#bbbbbb", lw=0.8, ls=":")
         panel.set_title(f"simple_spread-{tier}", fontsize=10)
         panel.grid(alpha=0.25)
         panel.set_xlabel("avoidable collision steps per episode")
     panels[0].set_ylabel("normalised return")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=(len(labels) + 1) // 2, fontsize=8, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     print(path)
