@@ -172,7 +172,7 @@ def test_tasks_and_their_limits(name):
 
 def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
-    task = tasks.get("ant_2x4-poor-quantile")
+    task = tasks.get("halfcheetah_2x3-poor-quantile")
     task = replace(task, env=replace(task.env, episode_length=60))
     store, path = make(task, 300)
     again, _ = make(task, 300, fresh=True)
