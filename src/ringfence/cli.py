@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from ringfence.errors import UserError
 
@@ -18,21 +19,18 @@ Positional = tyro.conf.Positional
 
 def tasks() -> None:
     """List the tasks with their hazards, limits and constants."""
-    from ringfence import tasks
+    from ringfence import hazards, tasks
 
-    table = Table("task", "data", "public return", "hazard", "cost limit l", "offset k", "r_min", "r_max")
+    def danger(h: hazards.Hazard) -> str:
+        if isinstance(h, hazards.SpeedLimit):
+            return f"> {h.limit:g} m/s"
+        return f"< {h.radius:g} m apart" if isinstance(h, hazards.Separation) else type(h).__name__
+
+    names = ("task", "danger", "limit l", "r_min to r_max")
+    table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE)
     for t in tasks.TASKS.values():
-        mean, deviation = t.published_return
-        table.add_row(
-            t.name,
-            f"{t.about}, {t.transitions:,} steps",
-            f"{mean:.1f}" + ("" if deviation is None else f" ± {deviation:.1f}"),
-            str(t.hazard),
-            f"{t.cost_limit:g}",
-            f"{t.cost_offset:g}",
-            f"{t.return_min:g}",
-            f"{t.return_max:g}",
-        )
+        constants = f"{t.return_min:g} to {t.return_max:g}"
+        table.add_row(t.name, danger(t.hazard), f"{t.cost_limit:g}", constants)
     out.print(table)
 
 
