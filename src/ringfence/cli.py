@@ -24,7 +24,7 @@ def tasks() -> None:
     def danger(h: hazards.Hazard) -> str:
         if isinstance(h, hazards.SpeedLimit):
             return f"> {h.limit:g} m/s"
-        return f"< {h.radius:g} m apart" if isinstance(h, hazards.Separation) else type(h).__name__
+        return f"< {h.radius:g} m" if isinstance(h, hazards.Separation) else type(h).__name__
 
     names = ("task", "danger", "limit l", "r_min to r_max")
     table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE)
