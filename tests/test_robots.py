@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import shutil
+from dataclasses import replace
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import evaluate, features, hazards
-from ringfence.data import robots
+from ringfence import evaluate, features, hazards, tasks
+from ringfence.data import matd3, robots
+from ringfence.data.make import make
 from ringfence.data.matd3 import MATD3Config
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
@@ -125,6 +130,71 @@ def test_behaviour_learning_is_reproducible():
     assert one[0].actors.weights[0].shape == (2, 12, 8)
     other = robots.train(env, config, 1)
     assert other[-1].score != one[-1].score
+
+
+def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
+    """Runs take turns with their nearest snapshots, in half precision, with what they earn."""
+    env = SafeMuJoCo("4x2", episode_length=20)
+    for k in range(4):
+        for run in ("one", "two"):
+            key = jax.random.fold_in(jax.random.key(k), len(run) + (run == "two"))
+            actors = matd3.init(MATD3Config(hidden=4), key, 4, env.observed.shape[1], 27, 2).actors
+            robots.keep(robots.Snapshot(actors, 100 * (k + 1), 10.0 * k), tmp_path / run, 0.1)
+    cards = robots.pack(env, [tmp_path / "one", tmp_path / "two"], tmp_path / "out")
+    assert set(cards) == {"good", "medium", "poor"}
+    assert sorted(p["run"] for p in cards["good"]["policies"]) == ["one", "one", "two", "two"]
+    policies = robots.shipped_policies(env, "good", tmp_path / "out")
+    assert len(policies) == 4 and policies[0].noise == 0.2 and policies[0].info["published_level"] == 2770.0
+    first = cards["good"]["policies"][0]
+    earned = robots.returns(env, policies[0].actors, env.simulate(32), 1).mean()
+    assert earned == pytest.approx(first["return"], abs=0.051), "the card tells what the stored policy earns"
+    (tmp_path / "few").mkdir()
+    line = (tmp_path / "one" / "scores.jsonl").read_text().splitlines()[0]
+    (tmp_path / "few" / "scores.jsonl").write_text(line)
+    shutil.copy(tmp_path / "one" / "0000100.npz", tmp_path / "few")
+    with pytest.raises(UserError, match="1 snapshots for 'good', 4 are needed"):
+        robots.pack(env, [tmp_path / "few"], tmp_path)
+    with pytest.raises(UserError, match="scores.jsonl' does not exist"):
+        robots.pack(env, [tmp_path / "none"], tmp_path)
+
+
+@pytest.mark.parametrize("name", [t for t in tasks.TASKS if not t.startswith("simple_spread")])
+def test_tasks_and_their_limits(name):
+    task = tasks.get(name)
+    policies = robots.shipped_policies(task.env, task.tier)
+    assert len(policies) == robots.MIXED and policies[0].info["level"] == task.tier
+    earned = np.mean([p["return"] for p in policies[0].info["policies"]])
+    assert earned == pytest.approx(task.published_return[0], rel=0.1), "the levels of the public sets"
+    assert task.hazard.limit == task.env.limit
+    if task.protocol == "quantile":
+        assert task.env.limit == tasks.QUANTILE_LIMITS[name.removesuffix("-quantile")]
+
+
+def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
+    task = tasks.get("halfcheetah_2x3-poor-quantile")
+    task = replace(task, env=replace(task.env, episode_length=60))
+    store, path = make(task, 300)
+    again, _ = make(task, 300, fresh=True)
+    np.testing.assert_array_equal(store.actions, again.actions)
+    assert store.steps >= 300 and path.parent == tmp_path / "data" and store.lengths.max() <= 60
+    card = store.card
+    assert (
+        card["speed_limit"] == task.env.limit
+        and card["protocol"] == "quantile"
+        and "not the public" in card["provenance"]
+    )
+    assert sum(card["episodes_of_policy"]) == store.episodes and len(card["policies"]) == 4
+    native, _ = make(replace(task, name="x", env=replace(task.env, speed_limit=0.01)), 300)
+    np.testing.assert_array_equal(native.actions, store.actions)  # limits change labels alone
+    assert native.costs.mean() > store.costs.mean()
+    assert card["return_ceiling"] >= 60
+
+
+def test_what_the_limit_allows_to_earn():
+    assert SafeMuJoCo("2x3").return_ceiling(0, 9.0) == pytest.approx(3227)
+    assert SafeMuJoCo("2x3").return_ceiling(25, 9.0) == pytest.approx(975 * 3.227 + 25 * 9)
+    assert SafeMuJoCo("4x2", 1.0).return_ceiling(0, 0.5) == pytest.approx(2000)
 
 
 def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):

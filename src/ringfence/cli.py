@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich import box
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from ringfence.errors import UserError
 
@@ -18,21 +19,18 @@ Positional = tyro.conf.Positional
 
 def tasks() -> None:
     """List the tasks with their hazards, limits and constants."""
-    from ringfence import tasks
+    from ringfence import hazards, tasks
 
-    table = Table("task", "data", "public return", "hazard", "cost limit l", "offset k", "r_min", "r_max")
+    def danger(h: hazards.Hazard) -> str:
+        if isinstance(h, hazards.SpeedLimit):
+            return f"> {h.limit:g} m/s"
+        return f"< {h.radius:g} m" if isinstance(h, hazards.Separation) else type(h).__name__
+
+    names = ("task", "danger", "limit l", "r_min to r_max")
+    table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE)
     for t in tasks.TASKS.values():
-        mean, deviation = t.published_return
-        table.add_row(
-            t.name,
-            f"{t.about}, {t.transitions:,} steps",
-            f"{mean:.1f} ± {deviation:.1f}",
-            str(t.hazard),
-            f"{t.cost_limit:g}",
-            f"{t.cost_offset:g}",
-            f"{t.return_min:g}",
-            f"{t.return_max:g}",
-        )
+        constants = f"{t.return_min:g} to {t.return_max:g}"
+        table.add_row(t.name, danger(t.hazard), f"{t.cost_limit:g}", constants)
     out.print(table)
 
 
@@ -192,6 +190,7 @@ def evaluate(
     prefix: int | None = None,
     replan: int | None = None,
     execution: str | None = None,
+    video: bool = False,
     set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
 ) -> None:
     """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
@@ -213,6 +212,7 @@ def evaluate(
         prefix: rows of a plan that are judged.
         replan: steps for which a plan is followed.
         execution: centralized or decentralized.
+        video: make a GIF of the first episode (robots).
         set: any other planner option, e.g. --set ascent=10 repair=100; docs/evaluation.md lists them.
     """
     from ringfence.evaluate import evaluate as run_evaluation
@@ -222,8 +222,18 @@ def evaluate(
     table = Table(
         "run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm"
     )
-    for run in _runs(runs):
+    found = _runs(runs)
+    if video:
+        from ringfence import tasks
+        from ringfence.report.video import check, film
+
+        for name in {run.config["task"] for run in found}:
+            check(tasks.get(name))
+        record = max(record, 1)
+    for run in found:
         r = run_evaluation(run, episodes=episodes, split=split, planner=planner, record=record, quiet=False, **given)
+        if video:
+            print(film(run, r["variant"]))
         table.add_row(
             str(run.path),
             r["variant"],
@@ -309,7 +319,7 @@ def demo(
 def bench(
     suite: Positional[str],
     seeds: int = 5,
-    episodes: int = 200,
+    episodes: int | None = None,
     out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     tasks: list[str] = [],  # noqa: B006
     algorithms: list[str] = [],  # noqa: B006
@@ -325,7 +335,7 @@ def bench(
     Args:
         suite: simple_spread.
         seeds: per algorithm and task.
-        episodes: test episodes per run.
+        episodes: test episodes per run; the suite's number by default.
         out_dir: folder of results, results/SUITE by default.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.

@@ -24,7 +24,7 @@ from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
-from ringfence.types import Key, Policy, Spec
+from ringfence.types import Array, Key, Policy, Spec
 
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
@@ -270,6 +270,7 @@ def evaluate(
     run.add_result(variant, result)
     if record:
         keep = {k: v[:record] for k, v in played.items()}
+        (run.path / f"rollout-{variant}.gif").unlink(missing_ok=True)  # it would show another recording
         with whole(run.path / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, **keep)
     return result
@@ -279,11 +280,19 @@ def _parameters(policy: Policy) -> int:
     return int(sum(np.size(x) for x in jax.tree.leaves(policy)))
 
 
+def _first(env) -> tuple[Array, Array]:
+    """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
+    if isinstance(env, SafeMuJoCo):
+        sim = env.simulate(1)
+        sim.reset([0])
+        return jnp.asarray(sim.observe(), jnp.float32), jnp.asarray(sim.state(), jnp.float32)
+    state = env.reset(jax.random.key(0), 1)
+    return env.observe(state), env.global_state(state)
+
+
 def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
     """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
-    env = task.env
-    state = env.reset(jax.random.key(0), 1)
-    seen = env.observe(state), env.global_state(state)
+    seen = _first(task.env)
     act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, *seen, key)[1].action)
     memory, keys = policy.start(1), jax.random.split(jax.random.key(1), calls + 10)
     took = []

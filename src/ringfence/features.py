@@ -36,6 +36,7 @@ class FeatureMap:
     minus: np.ndarray  # (N, D) int
     own: tuple[int, ...] | None = None  # entries that only the agent itself can change; the rest follows from them
     reconcile: Callable[[Array], Array] | None = None  # (..., H, N, D): rows after the first follow from own entries
+    joint: bool = False  # the agents move one body: what comes next depends on everybody's action
 
     def __call__(self, observations: Array, state: Array | None) -> Array:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
@@ -101,14 +102,14 @@ def robot(
     torso = [name for name in state_names if name.startswith("torso.")]
     if view == "centralized":
         table = np.tile(np.arange(len(state_names)), (n, 1))
-        return FeatureMap(view, tuple(state_names), "state", table, np.full_like(table, -1))
+        return FeatureMap(view, tuple(state_names), "state", table, np.full_like(table, -1), joint=True)
     if view == "decentralized":
         own = {f"{joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(own_joints[0]) for c in "qv"}
         seen = [state_names[k] for k in observed[0]]
         near = {name: f"near{m}.q" for m, name in enumerate(x for x in seen if x not in own and x not in torso)}
         table = np.tile(np.arange(len(seen)), (n, 1))
         names = tuple((own | near).get(x, x) for x in seen)
-        return FeatureMap(view, names, "observations", table, np.full_like(table, -1))
+        return FeatureMap(view, names, "observations", table, np.full_like(table, -1), joint=True)
     if view != "pruned":
         raise unknown("view", view, VIEWS)
     at = {name: k for k, name in enumerate(state_names)}
@@ -121,7 +122,7 @@ def robot(
     table = np.array([[at[t] for t in torso] + row for row in rows])
     own = tuple(range(len(torso) + 2 * a))
     agree = _reconcile_shared(len(torso), 2 * a, n)
-    return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), own, agree)
+    return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), own, agree, joint=True)
 
 
 def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:

@@ -256,7 +256,7 @@ class Planner(eqx.Module):
 
     def foreseen_step(self, known: Array, state: Array, action: Array) -> Array:
         """Where actions (B, N, A) lead from states (B, N, D), all agents agreeing; `known` (B, now+1, N, D) before."""
-        state = foresee(self.networks["forward"], self.normaliser, state, action)
+        state = foresee(self.networks["forward"], self.normaliser, state, action, self.feature_map.joint)
         return self.agreed(jnp.concatenate([known, state[:, None]], 1))[:, -1]
 
     def shielded(self, plan: Array) -> Array:

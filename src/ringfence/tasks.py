@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, SimpleSpread
+from ringfence.envs.mujoco import Parts
 from ringfence.errors import UserError, unknown
 from ringfence.types import Env, Spec
 
@@ -24,9 +25,11 @@ class Task:
     return_max: float = 1.0
     cost_limit: float = 1.0  # l
     cost_offset: float = 0.0  # k
-    published_return: tuple[float, float] | None = None  # mean and deviation of the public data set
+    published_return: tuple[float, float | None] | None = None  # mean and deviation (if known) of the public data set
     transitions: int = 1_000_000  # of the full data set
     about: str = ""
+    presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take unless told otherwise
+    protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
     action_high: float = 1.0
     extra: dict = field(default_factory=dict, hash=False, compare=False)
@@ -73,12 +76,47 @@ def _spread(tier: str, mean: float, deviation: float, about: str, transitions: i
         f"simple_spread-{tier}",
         SimpleSpread(),
         tier=tier,
+        presets=(tier,),
         published_return=(mean, deviation),
         about=about,
         transitions=transitions,
         **_SPREAD,
     )
 
+
+# OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return; Safety-Gymnasium's cost limit.
+_ROBOTS = {
+    "2x3": dict(return_min=-280.18, return_max=9132.25, cost_limit=25.0),
+    "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=25.0),
+    "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=25.0),
+}
+# m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
+QUANTILE_LIMITS = {"halfcheetah_2x3-good": 7.903, "halfcheetah_2x3-medium": 2.197, "halfcheetah_2x3-poor": 1.026}
+
+
+def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None, quantile: bool = False) -> Task:
+    """`native`: safety-gymnasium's speed limit. `quantile`: one that the tier's data exceeds on 40 % of its steps."""
+    name = f"{SafeMuJoCo(parts).name}-{tier}"
+    env = SafeMuJoCo(parts, QUANTILE_LIMITS[name] if quantile else None)
+    return Task(
+        name + "-quantile" * quantile,
+        env,
+        hazards.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)),
+        tier=tier,
+        presets=("mujoco",),
+        published_return=(mean, deviation),
+        about=f"four MATD3 policies of the level {tier}",
+        protocol="quantile" if quantile else "native",
+        **_ROBOTS[parts],
+    )
+
+
+# The Ant's tiers (2x4: 2621.5, 1099.98, 437.67; 4x2: 2769.29, 1546.05, 542.73) follow with their behaviour policies.
+_ROBOT_TIERS: tuple[tuple[Parts, str, float, float | None], ...] = (
+    ("2x3", "good", 6924.11, 1270.0),
+    ("2x3", "medium", 1485.0, 469.0),
+    ("2x3", "poor", 400.45, 334.0),
+)
 
 TASKS = {
     t.name: t
@@ -87,6 +125,8 @@ TASKS = {
         _spread("medium", 273.39, 92.06, "a partially trained MATD3 policy"),
         _spread("medium-replay", 203.74, 80.49, "a learner's experience up to the medium level", 97_500),
         _spread("random", 159.57, 60.46, "uniformly random actions"),
+        *(_robot(*facts) for facts in _ROBOT_TIERS),
+        *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
     )
 }
 

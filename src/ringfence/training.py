@@ -62,7 +62,7 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     """Resolve names to values; every bad name or value is refused here, before work starts. Without a preset, that of
     the task's data tier is taken where there is one."""
     a = algos.get(algorithm)
-    preset = preset or a.preset_for(task.tier)
+    preset = preset or a.preset_for(task.presets)
     if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
     config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)

@@ -106,6 +106,6 @@ class Algorithm:
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
 
-    def preset_for(self, tier: str) -> str:
-        """The preset named after the data tier where there is one, else the first."""
-        return tier if tier in self.presets else next(iter(self.presets))
+    def preset_for(self, wanted: tuple[str, ...]) -> str:
+        """The first of the wanted presets that exists, else the algorithm's first one."""
+        return next((name for name in wanted if name in self.presets), next(iter(self.presets)))

@@ -148,12 +148,13 @@ def init(
     kd, kb, ki, kf, ks = jax.random.split(key, 5)
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
+    acting = n if feature_map.joint else 1
 
     def networks() -> dict:
         params = {
             "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth, carried),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True),
-            "forward": MLP(kf, (d + spec.action_dim, *[config.inverse_width] * 2, d), groups=n, linear=True),
+            "forward": MLP(kf, (d + acting * spec.action_dim, *[config.inverse_width] * 2, d), groups=n, linear=True),
         }
         if config.barrier:
             groups = n if config.scope == "individual" else 1
@@ -286,13 +287,13 @@ def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, k
     return (error * valid).sum() / (valid.sum() * error.shape[-1])
 
 
-def forward_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, config: Config) -> Array:
+def forward_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, config: Config, joint: bool) -> Array:
     """L^F = E huber(Δs̃_i − g_i(s̃_i, a_i)) on data pairs, in standard deviations of the step: what an action will do.
 
     The Huber loss keeps the kicks of contacts, which dwarf everything else, from owning the model.
     """
     before, after, action, valid = steps_of(batch, config.history)
-    predicted = norm.step(before, foresee(params["forward"], norm, before, action))
+    predicted = norm.step(before, foresee(params["forward"], norm, before, action, joint))
     error = optax.losses.huber_loss(predicted, norm.step(before, after), delta=1.0).mean(-1)
     return (error * valid).sum() / (valid.sum() * error.shape[-1])
 
@@ -440,7 +441,7 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
             params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried
         )
         inverse = inverse_dynamics(params, batch, norm, kp, config)
-        forward = forward_dynamics(params, batch, norm, config)
+        forward = forward_dynamics(params, batch, norm, config, feature_map.joint)
         metrics = {"loss/denoising": denoise, "loss/inverse": inverse, "loss/forward": forward}
         total = parts[0] * denoise + inverse + forward
         if config.barrier:

@@ -164,7 +164,7 @@ def make_grid(
     out: str | Path,
     *,
     seeds: int = 5,
-    episodes: int = 200,
+    episodes: int | None = None,
     only_tasks: Iterable[str] = (),
     only: Iterable[str] = (),
     steps: int | None = None,
@@ -173,9 +173,10 @@ def make_grid(
     """The grid of a suite, or of the named tasks and entries (`algorithm` or `algorithm:preset`) of it."""
     if suite not in SUITES:
         raise unknown("suite", suite, SUITES)
+    chosen = SUITES[suite]
+    episodes = chosen.episodes if episodes is None else episodes
     if seeds < 1 or episodes < 1:
         raise UserError(f"seeds={seeds} and episodes={episodes} must be at least 1.")
-    chosen = SUITES[suite]
     entries = _chosen_entries(chosen, tuple(only))
     names = tuple(only_tasks) or chosen.tasks
     for name in names:

@@ -20,7 +20,7 @@ class Entry:
     """An algorithm in the table, and how its runs are played."""
 
     algorithm: str
-    preset: str = ""  # empty: the preset named after the data tier where there is one, else the default
+    preset: str = ""  # empty: the one made for the task where there is one, else the default
     evaluations: tuple[str, ...] = ("plain",)
     tiers: tuple[str, ...] = ()  # empty: all
 
@@ -29,7 +29,7 @@ class Entry:
         return f"{self.algorithm}:{self.preset}" if self.preset else self.algorithm
 
     def preset_for(self, task: Task) -> str:
-        return self.preset or algos.get(self.algorithm).preset_for(task.tier)
+        return self.preset or algos.get(self.algorithm).preset_for(task.presets)
 
     def variant(self, task: Task, evaluation: str) -> str:
         """The name of an evaluation in results.json."""
@@ -43,6 +43,7 @@ class Suite:
 
     tasks: tuple[str, ...]
     entries: tuple[Entry, ...]
+    episodes: int = 200  # per run, unless told otherwise
 
 
 SUITES = {

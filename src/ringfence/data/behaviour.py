@@ -119,12 +119,12 @@ def snapshot(run: BehaviourRun, k: int, noise: float) -> BehaviourPolicy:
     return BehaviourPolicy(jax.tree.map(lambda x: jnp.asarray(x[k]), run.actors), noise)
 
 
-def save_behaviour(policy: BehaviourPolicy, path: str | Path) -> None:
+def save_behaviour(policy: BehaviourPolicy, path: str | Path, dtype: type = np.float32) -> None:
     """Write the policy as safetensors; the file appears whole or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {f"weights.{k}": np.ascontiguousarray(w, np.float32) for k, w in enumerate(policy.actors.weights)}
-    tensors |= {f"biases.{k}": np.ascontiguousarray(b, np.float32) for k, b in enumerate(policy.actors.biases)}
+    tensors = {f"weights.{k}": np.ascontiguousarray(w, dtype) for k, w in enumerate(policy.actors.weights)}
+    tensors |= {f"biases.{k}": np.ascontiguousarray(b, dtype) for k, b in enumerate(policy.actors.biases)}
     card = {**policy.info, "format": FORMAT, "noise": policy.noise}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -144,8 +144,8 @@ def load_behaviour(path: str | Path) -> BehaviourPolicy:
             card = json.loads((file.metadata() or {})["ringfence"])
             layers = sum(name.startswith("weights.") for name in file.keys())
             actors = Mlp(
-                tuple(jnp.asarray(file.get_tensor(f"weights.{k}")) for k in range(layers)),
-                tuple(jnp.asarray(file.get_tensor(f"biases.{k}")) for k in range(layers)),
+                tuple(jnp.asarray(file.get_tensor(f"weights.{k}"), jnp.float32) for k in range(layers)),
+                tuple(jnp.asarray(file.get_tensor(f"biases.{k}"), jnp.float32) for k in range(layers)),
             )
             noise = float(card["noise"])
     except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:

@@ -4,7 +4,8 @@ OG-MARL's sets (Formanek et al. 2023) were made by training MATD3 to a level, ro
 noise of 0.2 on the actions, and mixing four such policies. The learner here reads the global state in its critic,
 which one team needs once, since everybody has the same reward.
 
-    python -m ringfence.data.robots 2x3 --seed 0 --out runs/behaviour
+    python -m ringfence.data.robots train 2x3 --seed 0 --out runs/behaviour      # hours, for the snapshots
+    python -m ringfence.data.robots pack 2x3 runs/behaviour/2x3-0                # the files that are shipped
 """
 
 from __future__ import annotations
@@ -23,12 +24,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.data import matd3
-from ringfence.data.behaviour import BehaviourPolicy
+from ringfence.data.behaviour import POLICIES, BehaviourPolicy, load_behaviour, save_behaviour
 from ringfence.data.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.errors import CheckpointError
 from ringfence.types import Array, Key
 
 COMMAND = "python -m ringfence.data.robots"
+# Mean returns of OG-MARL's sets (Formanek et al. 2023).
+LEVELS = {
+    "2x3": {"good": 6924.0, "medium": 1485.0, "poor": 400.0},
+    "2x4": {"good": 2620.0, "medium": 1100.0, "poor": 440.0},
+    "4x2": {"good": 2770.0, "medium": 1550.0, "poor": 540.0},
+}
+TIERS = ("good", "medium", "poor")
+MIXED = 4  # policies per tier
+NOISE = 0.2  # std of the Gaussian noise on their actions
 
 
 @dataclass(frozen=True)
@@ -38,7 +49,7 @@ class RobotsConfig:
     learner: MATD3Config = MATD3Config(
         hidden=128,  # small actors, since they are shipped
         critic_hidden=256,
-        batch=256,
+        batch=128,
         actor_rate=1e-3,
         critic_rate=1e-3,
         discount=0.99,
@@ -51,8 +62,8 @@ class RobotsConfig:
     stretch: int = 16  # steps of each between two bouts of learning
     updates: int = 64  # critic updates per bout
     random_steps: int = 10_000  # transitions with uniform actions at the start
-    transitions: int = 1_000_000
-    score_every: int = 50  # bouts between two scores
+    transitions: int = 2_000_000  # at most
+    score_every: int = 20  # bouts between two scores
     score_episodes: int = 8
 
 
@@ -71,7 +82,7 @@ class Snapshot(NamedTuple):
 
     actors: Mlp
     seen: int  # transitions
-    score: float  # mean return with noise 0.2
+    score: float  # mean return with the noise of collection
 
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
@@ -106,8 +117,10 @@ def train(
     config: RobotsConfig,
     seed: int,
     progress: Callable[[Snapshot], None] | None = None,
+    enough: float = np.inf,
 ) -> list[Snapshot]:
-    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2."""
+    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2. Ends early
+    when the last four earn `enough` on average."""
     b, n = config.robots, env.n_agents
     sim, judge = env.simulate(b), env.simulate(config.score_episodes)
     rng = np.random.default_rng(seed)
@@ -151,10 +164,12 @@ def train(
             found.append(Snapshot(jax.tree.map(np.asarray, learner.actors), (bout + 1) * b * config.stretch, score))
             if progress is not None:
                 progress(found[-1])
+            if len(found) >= MIXED and np.mean([s.score for s in found[-MIXED:]]) > enough:
+                break
     return found
 
 
-def returns(env: SafeMuJoCo, actors: Mlp, sim, seed: int, noise: float = 0.2) -> np.ndarray:
+def returns(env: SafeMuJoCo, actors: Mlp, sim, seed: int, noise: float = NOISE) -> np.ndarray:
     """(B,) returns of an episode of every robot."""
     key, total = jax.random.key(seed + 1), np.zeros(sim.batch)
     sim.reset([(seed, 10**6 + e) for e in range(sim.batch)])
@@ -213,29 +228,132 @@ def _episodes(env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed:
     return {**flat, "lengths": lengths, "final_state": sim.state().astype(np.float32), "terminated": terminated}
 
 
+# ------------------------------------------------------------------------------------------------ the shipped tiers
+
+
+def shipped_policies(env: SafeMuJoCo, tier: str, folder: Path = POLICIES) -> list[BehaviourPolicy]:
+    """The policies whose episodes a tier mixes."""
+    packed = load_behaviour(folder / _file(env, tier))
+    count = packed.actors.weights[0].shape[0]
+    one = lambda k: jax.tree.map(lambda x: x[k], packed.actors)  # noqa: E731
+    return [BehaviourPolicy(one(k), packed.noise, packed.info) for k in range(count)]
+
+
+def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES) -> dict[str, dict]:
+    """Choose the policies of every tier among the snapshots of `runs` and write their files; returns their cards.
+
+    The runs take turns: of each, the snapshot whose return is nearest to the tier's level, then the next nearest, as
+    long as it is within a tenth of it. Returns are of 32 episodes of the policy as it is stored, in half precision.
+    """
+    judge, cards = env.simulate(32), {}
+    for tier, level in LEVELS[env.parts].items():
+        found = [_nearest(env, judge, run, level) for run in runs]
+        turns = sorted(
+            (c for f in found for c in f),
+            key=lambda c: (abs(c.earned - level) > 0.1 * level, c.rank, abs(c.earned - level)),
+        )
+        chosen = turns[:MIXED]
+        if len(chosen) < MIXED:
+            raise CheckpointError(
+                f"The runs hold {len(chosen)} snapshots for '{tier}', {MIXED} are needed; train more."
+            )
+        cards[tier] = {
+            "task": env.name,
+            "level": tier,
+            "published_level": level,
+            "policies": [{"run": c.run, "transitions": c.seen, "return": round(c.earned, 1)} for c in chosen],
+            "command": f"{COMMAND} pack {env.parts}",
+        }
+        actors = jax.tree.map(lambda *x: jnp.stack(x), *(c.actors for c in chosen))
+        save_behaviour(BehaviourPolicy(actors, NOISE, cards[tier]), folder / _file(env, tier), np.float16)
+    return cards
+
+
+class Candidate(NamedTuple):
+    """A snapshot as it would be stored."""
+
+    rank: int  # among those of its run, 0 is nearest to the level
+    run: str
+    seen: int
+    earned: float
+    actors: Mlp
+
+
+def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]:
+    """The snapshots of a run that come nearest to a level: picked by the scores of training, then judged again."""
+    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: 3 * MIXED]
+    judged = []
+    for s in rough:
+        actors = _halved(_load_snapshot(run / f"{s['seen']:07d}.npz"))
+        judged.append((float(returns(env, actors, judge, 1).mean()), s["seen"], actors))
+    judged.sort(key=lambda x: (abs(x[0] - level), x[1]))
+    return [Candidate(k, run.name, seen, earned, actors) for k, (earned, seen, actors) in enumerate(judged)]
+
+
+def keep(snapshot: Snapshot, run: Path, seconds: float) -> None:
+    """Add a snapshot to a run folder: its actors, and a line of scores.jsonl."""
+    run.mkdir(parents=True, exist_ok=True)
+    arrays = {f"w{k}": w for k, w in enumerate(snapshot.actors.weights)}
+    arrays |= {f"b{k}": b for k, b in enumerate(snapshot.actors.biases)}
+    np.savez(run / f"{snapshot.seen:07d}.npz", **arrays)
+    line = {"seen": snapshot.seen, "score": round(snapshot.score, 1), "seconds": round(seconds, 1)}
+    with open(run / "scores.jsonl", "a") as f:
+        f.write(json.dumps(line) + "\n")
+
+
+def _file(env: SafeMuJoCo, tier: str) -> str:
+    return f"{env.name}-{tier}.safetensors"
+
+
+def _scores(run: Path) -> list[dict]:
+    file = run / "scores.jsonl"
+    if not file.exists():
+        raise CheckpointError(f"'{file}' does not exist; give a folder that `{COMMAND} train` made.")
+    return [json.loads(line) for line in file.read_text().splitlines()]
+
+
+def _load_snapshot(file: Path) -> Mlp:
+    with np.load(file) as f:
+        layers = sum(k.startswith("w") for k in f)
+        return Mlp(*(tuple(jnp.asarray(f[f"{c}{k}"]) for k in range(layers)) for c in "wb"))
+
+
+def _halved(actors: Mlp) -> Mlp:
+    return jax.tree.map(lambda x: x.astype(jnp.float16).astype(jnp.float32), actors)
+
+
 def main() -> None:
-    """Train one behaviour learner and keep its snapshots."""
+    """Train a behaviour learner and keep its snapshots, or choose those that are shipped."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("parts", choices=("2x3", "2x4", "4x2"))
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--transitions", type=int, default=1_000_000)
-    parser.add_argument("--out", type=Path, default=Path("runs/behaviour"))
+    what = parser.add_subparsers(dest="what", required=True)
+    trained = what.add_parser("train")
+    trained.add_argument("parts", choices=tuple(LEVELS))
+    trained.add_argument("--seed", type=int, default=0)
+    trained.add_argument("--transitions", type=int, default=RobotsConfig.transitions)
+    trained.add_argument("--level", choices=TIERS, default="good", help="end when this tier's level is passed")
+    trained.add_argument("--out", type=Path, default=Path("runs/behaviour"))
+    packed = what.add_parser("pack")
+    packed.add_argument("parts", choices=tuple(LEVELS))
+    packed.add_argument("runs", type=Path, nargs="+")
+    packed.add_argument("--out", type=Path, default=POLICIES)
     a = parser.parse_args()
     env = SafeMuJoCo(a.parts)
-    folder = a.out / f"{a.parts}-{a.seed}"
-    folder.mkdir(parents=True, exist_ok=True)
-    begun = time.perf_counter()
+    if a.what == "pack":
+        for tier, card in pack(env, a.runs, a.out).items():
+            print(tier, json.dumps(card["policies"]))
+    else:
+        _train_and_keep(env, a.seed, a.transitions, a.level, a.out)
 
-    def keep(s: Snapshot) -> None:
-        arrays = {f"w{k}": w for k, w in enumerate(s.actors.weights)}
-        arrays |= {f"b{k}": b for k, b in enumerate(s.actors.biases)}
-        np.savez(folder / f"{s.seen:07d}.npz", **arrays)
-        line = {"seen": s.seen, "score": round(s.score, 1), "seconds": round(time.perf_counter() - begun, 1)}
-        print(json.dumps(line), flush=True)
-        with open(folder / "scores.jsonl", "a") as f:
-            f.write(json.dumps(line) + "\n")
 
-    train(env, RobotsConfig(transitions=a.transitions), a.seed, keep)
+def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, out: Path) -> None:
+    folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
+    enough = 1.03 * LEVELS[env.parts][level]
+
+    def progress(snapshot: Snapshot) -> None:
+        keep(snapshot, folder, time.perf_counter() - begun)
+        print(f"{snapshot.seen:,} transitions, {snapshot.score:.0f}", flush=True)
+
+    train(env, RobotsConfig(transitions=transitions), seed, progress, enough)
 
 
 if __name__ == "__main__":

@@ -65,6 +65,11 @@ class SafeMuJoCo:
         return ROBOTS[self.parts]
 
     @property
+    def name(self) -> str:
+        """`halfcheetah_2x3`, `ant_2x4` or `ant_4x2`"""
+        return f"{self.robot.replace('_', '')}_{self.parts}"
+
+    @property
     def ant(self) -> bool:
         return self.robot == "ant"
 
@@ -72,6 +77,14 @@ class SafeMuJoCo:
     def limit(self) -> float:
         """m/s"""
         return LIMITS[self.parts] if self.speed_limit is None else self.speed_limit
+
+    def return_ceiling(self, cost_limit: float, fastest: float) -> float:
+        """No episode with at most `cost_limit` steps above the limit, none of them faster than `fastest` (m/s), can
+        earn more: the reward of a step is at most the forward speed, and for the Ant 1 more."""
+        over = min(cost_limit, self.episode_length)
+        return (
+            (self.episode_length - over) * self.limit + over * max(fastest, self.limit) + self.ant * self.episode_length
+        )
 
     @property
     def n_agents(self) -> int:

@@ -66,6 +66,19 @@ def players(section: Section) -> list[dict]:
     return made
 
 
+def films(section: Section) -> list[dict]:
+    """GIFs of robots that lie beside recordings, at most two: {label, seed, gif (base64)}."""
+    found = []
+    for row in section.rows:
+        for run, result in sorted(row.members, key=lambda m: m[0].config["seed"]):
+            file = run.path / f"rollout-{result['variant']}.gif"
+            if row.split == "test" and file.exists():
+                gif = base64.b64encode(file.read_bytes()).decode()
+                found.append({"label": row.label, "seed": run.config["seed"], "gif": gif})
+                break
+    return found[-VARIANTS:]
+
+
 def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) -> dict | None:
     """One variant's episodes, or None where the states are not those of agents on a plane with landmarks."""
     spec, n = run.config["spec"], run.config["spec"]["n_agents"]

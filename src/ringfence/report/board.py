@@ -5,7 +5,8 @@ reference/<task>/reference.json         summaries of the logged data and of triv
                                         (or reference/<task>.json)
 cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   run folders; results.json holds one summary per variant
 
-A preset named after the task's data tier is that algorithm's default there: one method over all tasks.
+A preset made for the task (its data tier's, or its simulator's) is that algorithm's default there: one method over all
+tasks.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Method:
 
     algorithm: str
     preset: str
-    variant: str  # as in results.json, `default` in place of a preset that is the tier's own
+    variant: str  # as in results.json, `default` in place of a preset that is the task's own
     apart: str = ""  # config fields in which cells of the same algorithm and preset differ
 
     @property
@@ -194,8 +195,14 @@ def _tier(task: str) -> str:
 
 
 def _job(task: str, job: str) -> str:
-    """A folder's name without the preset of the tier: the same job on every task."""
-    return job.removesuffix(f"-{_tier(task)}") if _tier(task) else job
+    """A folder's name without the preset made for the task: the same job on every task."""
+    for name in _presets(task):
+        job = job.removesuffix(f"-{name}")
+    return job
+
+
+def _presets(task: str) -> tuple[str, ...]:
+    return tasks.TASKS[task].presets if task in tasks.TASKS else ()
 
 
 def _suite(name: str) -> tuple[suites.Entry, ...]:
@@ -273,8 +280,8 @@ def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[st
 
 
 def _preset(task: str, told: dict) -> str:
-    """A run's preset, where the one named after the tier counts as the default."""
-    return "default" if told["preset"] == _tier(task) else told["preset"]
+    """A run's preset, where one made for the task counts as the default."""
+    return "default" if told["preset"] in _presets(task) else told["preset"]
 
 
 def _config(told: dict) -> dict:

@@ -89,6 +89,8 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "families": _families(section.rows),
         "fields": _fields(section, k),
         "players": recorded,
+        "films": animation.films(section),
+        "hazard_kind": section.hazard.get("kind"),
         "players_json": Markup(json.dumps(recorded).replace("<", "\\u003c")),
         "commands": commands(section, out),
         "differences": differences(section),

@@ -15,9 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ringfence import tasks
 from ringfence.envs.mujoco import DT, SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.files import whole
+from ringfence.report.animation import recording
+from ringfence.runs import Run
+from ringfence.tasks import Task
 
 WIDTH, HEIGHT = 320, 240  # pixels
 EVERY = 2  # steps per frame, at least
@@ -25,28 +29,56 @@ LONGEST = 200  # frames
 BACKENDS = ("egl", "osmesa")
 
 
+def backend() -> str:
+    """The value of MUJOCO_GL that works here; `UserError` where nothing can draw."""
+    wanted, reasons = os.environ.get("MUJOCO_GL"), []
+    trial = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
+    for name in (wanted,) if wanted else BACKENDS:
+        made = _run([sys.executable, "-c", trial], name)
+        if made.returncode == 0:
+            return name
+        reasons.append(f"{name}: {(made.stderr.strip().splitlines() or ['no reason given'])[-1]}")
+    raise UserError(
+        f"Robots cannot be drawn here ({'; '.join(reasons)}); install EGL (Debian: libegl1 libgl1-mesa-dri) or "
+        "OSMesa (libosmesa6)."
+    )
+
+
+def check(task: Task) -> None:
+    """`UserError` where no film of a task's episodes can be made."""
+    if not isinstance(task.env, SafeMuJoCo):
+        raise UserError(f"Films show robots, and '{task.name}' has none; `ringfence report` animates its episodes.")
+    backend()
+
+
+def film(run: Run, variant: str) -> Path:
+    """Make the GIF of the first episode that an evaluation recorded, beside its recording."""
+    task = tasks.get(run.config["task"])
+    check(task)
+    kept = recording(run, variant)
+    if kept is None:
+        raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
+    return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
+
+
 def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
     """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
 
     `UserError` where neither EGL nor OSMesa can draw.
     """
-    out = Path(out)
-    wanted = os.environ.get("MUJOCO_GL")
-    reasons = []
+    out, name = Path(out), backend()
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
         file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
         np.savez(file, states=states, costs=costs, env=json.dumps(dataclasses.asdict(env)))
-        for backend in (wanted,) if wanted else BACKENDS:
-            command = [sys.executable, "-m", "ringfence.report.video", str(file), str(picture)]
-            made = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": backend})
-            if made.returncode == 0:
-                temporary.write_bytes(picture.read_bytes())
-                return out
-            reasons.append(f"{backend}: {(made.stderr.strip().splitlines() or ['no reason given'])[-1]}")
-        raise UserError(
-            f"Robots cannot be drawn here ({'; '.join(reasons)}); install EGL (Debian: libegl1 libgl1-mesa-dri) or "
-            "OSMesa (libosmesa6)."
-        )
+        made = _run([sys.executable, "-m", "ringfence.report.video", str(file), str(picture)], name)
+        if made.returncode:
+            raise RuntimeError(made.stderr)
+        temporary.write_bytes(picture.read_bytes())
+    return out
+
+
+def _run(command: list[str], name: str) -> subprocess.CompletedProcess:
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": name})
 
 
 def stride(states: np.ndarray) -> int:
