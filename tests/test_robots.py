@@ -211,6 +211,23 @@ def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
         assert picture.size == (320, 240) and picture.n_frames == 6
 
 
+def test_the_floor_goes_on_where_the_robot_runs_far(tmp_path):
+    from PIL import Image
+
+    env = SafeMuJoCo("2x3", episode_length=40)
+    states = np.zeros((41, 17), np.float32)
+    states[:, env.state_names.index("torso.vx")] = 100.0  # 200 m in all; the model's floor ends after 40
+    try:
+        file = animate(env, states, np.zeros(40), tmp_path / "far.gif")
+    except UserError as error:
+        assert "install EGL" in str(error)
+        return
+    with Image.open(file) as picture:
+        picture.seek(picture.n_frames - 1)
+        beside = np.asarray(picture.convert("L")).astype(int)[180:215, :60]
+    assert beside.max() - beside.min() > 100, "light and dark tiles"
+
+
 def test_without_a_way_to_draw_the_reason_is_said(tmp_path, monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "glass")
     with pytest.raises(UserError, match="cannot be drawn here .*install EGL"):

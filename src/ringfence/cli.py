@@ -15,6 +15,7 @@ from ringfence.errors import UserError
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
+Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
 
 
 def tasks() -> None:
@@ -69,7 +70,7 @@ def import_omar(directory: Positional[Path], out_file: Annotated[Path, tyro.conf
 
 def import_ogmarl(
     vault: Positional[Path],
-    task: Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"],
+    task: Robot,
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
 ) -> None:
     """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
@@ -86,7 +87,7 @@ def import_ogmarl(
 
 def import_madiff(
     directory: Positional[Path],
-    task: Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"],
+    task: Robot,
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
 ) -> None:
     """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).

@@ -2,6 +2,7 @@
 
     L_Q = Σ_heads E (Q_i(s̃, a) − (r_i + γ min_heads Q̄_i(s̃', π̄_i(s̃'))))²  +  α_CQL E [ lse_a Q_i(s̃, a) − Q_i(s̃, a_data) ]
     L_π = c E ‖π_i(s̃) − â_i‖² − (1 − c) E Q_i(s̃, π_i(s̃)) + 10⁻³ E π²
+          + κ (c + (1 − c) E|Q_i|) E z_i²,   π_i = tanh z_i, which the study has not
 
 â_i is the best action, by Q_i, that a search over samples finds, or the actor's own one where that is better. `ma-cql`
 is c = 0. Coefficients are per data set; presets carry those of the study.

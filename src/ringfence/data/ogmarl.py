@@ -26,10 +26,10 @@ import numpy as np
 
 from ringfence import hazards
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import SafeMuJoCo
+from ringfence.envs import SafeMuJoCo, mujoco
 from ringfence.errors import StoreError, unknown
 
-ROBOTS = {"halfcheetah_2x3": "2x3", "ant_2x4": "2x4", "ant_4x2": "4x2"}
+ROBOTS = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
 TIER = re.compile(r"(?<![a-z])(good|medium|poor|expert|replay)(?![a-z])", re.IGNORECASE)
 REPLAYED = 256  # steps that are replayed to find the order of actions

@@ -95,7 +95,10 @@ def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
     model.light_castshadow[:] = 0
     data, planar = mujoco.MjData(model), 2 if env.ant else 1
     moving = [env.state_names.index(f"torso.v{c}") for c in "xy"[:planar]]
-    place = np.cumsum(states[:, moving], 0) * DT
+    # Robots run off the floor, so they are drawn in the same place of its pattern near the middle.
+    floor = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0]
+    tile = 2 * model.geom_size[floor, :planar] / model.mat_texrepeat[model.geom_matid[floor], :planar]
+    place = (np.cumsum(states[:, moving], 0) * DT) % tile
     speed = np.linalg.norm(states[:, moving], axis=1)
     renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
     nq = model.nq
