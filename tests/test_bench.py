@@ -12,7 +12,7 @@ import pytest
 
 from ringfence import evaluate
 from ringfence.bench import cells as grid
-from ringfence.bench import local, make_grid, rows, run_local, suites, write_csv
+from ringfence.bench import local, make_grid, paper, rows, run_local, suites, write_csv
 from ringfence.errors import UserError
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run
@@ -233,3 +233,36 @@ def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
         assert mine.name == other.name
         same = [json.loads((f / "results.json").read_text())["default"]["per_episode"] for f in (mine, other)]
         assert same[0] == same[1]
+
+
+def test_what_reads_no_danger_is_trained_once(tmp_path):
+    names = ["halfcheetah_2x3-poor", "halfcheetah_2x3-poor-quantile"]
+    few = dict(seeds=1, episodes=1, only_tasks=names, only=["bc"], steps=20, transitions=1000)
+    g = make_grid("mujoco", tmp_path / "out", **few)
+    native, other = g.cells
+    assert other.twin() == native and native.twin() is None
+    assert grid.Cell(names[1], "bc-safe", "mujoco", 0).twin() is None
+    g.open()
+    grid.run_group([native], g.out, 1, lambda event, cell: None)
+    grid.adopt(other, g.out)
+    weights = {c.task: Run(c.folder(g.out)).checkpoints()[-1][1].read_bytes() for c in g.cells}
+    assert weights[names[0]] == weights[names[1]]
+    grid.run_group([other], g.out, 1, lambda event, cell: None)
+    found = {r["task"]: r for r in rows(g.out)}
+    assert len(found) == 2 and found[names[0]]["return_mean"] == found[names[1]]["return_mean"]
+    assert found[names[0]]["cost_mean"] < found[names[1]]["cost_mean"]  # the same episode, a lower limit
+    assert Run(other.folder(g.out)).config["task"] == names[1]
+
+
+def test_the_table_of_the_paper_keeps_others_data_apart(made, tmp_path):
+    table = paper.lines([made.out, tmp_path / "nothing"])
+    assert len(table) == 13 * 3
+    ours = [x for x in table if x.ours]
+    assert [(x.task, x.method, x.seeds) for x in ours] == [("simple_spread-random", "MA-TD3BC", 2)]
+    assert ours[0].printed == (0.23, 0.01, 0.00, 0.00)
+    measured = [r["return_norm"] for r in rows(made.out) if r["algorithm"] == "ma-td3bc"]
+    assert ours[0].ours[0] == pytest.approx(sum(measured) / 2)
+    text = paper.markdown(table).splitlines()
+    assert len(text) == 2 + 13 and "[2]" in next(line for line in text if "spread-random" in line)
+    lines = paper.write(table, tmp_path / "paper.csv").read_text().splitlines()
+    assert len(lines) == 1 + 13 * 3

@@ -334,10 +334,10 @@ def bench(
     """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
 
     Args:
-        suite: simple_spread.
+        suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites.
         seeds: per algorithm and task.
         episodes: test episodes per run; the suite's number by default.
-        out_dir: folder of results, results/SUITE by default.
+        out_dir: folder of results, results/SUITE by default; of paper, the folder that holds both, results.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.
         steps: updates of every algorithm, for a quick trial.
@@ -347,21 +347,39 @@ def bench(
         memory: GiB that a worker may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
-    from ringfence.bench import make_grid, run_local
+    from ringfence.bench import SUITES, make_grid, paper, run_local
+    from ringfence.errors import unknown
 
-    out_dir = out_dir or Path("results") / suite
-    grid = make_grid(suite, out_dir, seeds=seeds, episodes=episodes, only_tasks=tasks, only=algorithms, steps=steps)
-    if engine == "ray":
-        from ringfence.bench.cluster import run_ray
+    def run(suite: str, folder: Path, only: list[str], of: list[str]) -> bool:
+        grid = make_grid(suite, folder, seeds=seeds, episodes=episodes, only_tasks=of, only=only, steps=steps)
+        if engine == "ray":
+            from ringfence.bench.cluster import run_ray
 
-        counts = run_ray(grid, address=address, threads=threads)
-    else:
-        counts = run_local(grid, workers=workers, threads=threads, memory=memory)
-    out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
-    if counts["done"]:
-        bench_results(out_dir)
-    if counts["failed"] or counts["to do"]:
-        bench_status(out_dir)
+            counts = run_ray(grid, address=address, threads=threads)
+        else:
+            counts = run_local(grid, workers=workers, threads=threads, memory=memory)
+        out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
+        if counts["done"] and suite == wanted:
+            bench_results(folder)
+        if counts["failed"] or counts["to do"]:
+            bench_status(folder)
+        return counts["failed"] + counts["to do"] == 0
+
+    wanted = suite
+    if suite != "paper":
+        if not run(suite, out_dir or Path("results") / suite, algorithms, tasks):
+            sys.exit(1)
+        return
+    root, whole = out_dir or Path("results"), True
+    for name in tasks:
+        if name not in paper.PRINTED:
+            raise unknown("task of the paper", name, paper.PRINTED)
+    for part in paper.SUITES:
+        mine = [t for t in SUITES[part].tasks if t in (tasks or paper.PRINTED)]
+        if mine:
+            whole &= run(part, root / part, algorithms or list(paper.METHODS), mine)
+    bench_paper(root)
+    if not whole:
         sys.exit(1)
 
 
@@ -399,6 +417,27 @@ def bench_results(folder: Positional[Path]) -> None:
     print(write_csv(folder))
 
 
+def bench_paper(folder: Positional[Path] = Path("results")) -> None:
+    """The paper's 13 tasks, printed values beside ours, from FOLDER/simple_spread and FOLDER/mujoco.
+
+    Writes FOLDER/paper.csv. The printed values are on other data.
+    """
+    from ringfence.bench import paper
+
+    lines = paper.lines(folder / name for name in paper.SUITES)
+    table = Table(Column("reward/cost", no_wrap=True), box=box.SIMPLE, padding=(0, 0, 0, 1))
+    for method in paper.OURS:
+        for whose in (f"{method}\npaper", "\nours"):
+            table.add_column(whose, justify="right", no_wrap=True)
+    for task, (name, _) in paper.PRINTED.items():
+        cells = []
+        for x in (x for x in lines if x.task == task):
+            cells += [f"{v[0]:.2f}/{v[2]:.2f}" if v else "–" for v in (x.printed, x.ours)]
+        table.add_row(name, *cells)
+    Console(highlight=False, width=max(out.width, 90)).print(table)
+    print(paper.write(lines, folder / "paper.csv"))
+
+
 def bench_export(
     folder: Positional[Path],
     format: Literal["csv", "markdown", "markdown-short", "latex"] = "markdown",
@@ -425,7 +464,7 @@ DATA = {
     "info": info,
     "train-behaviour": train_behaviour,
 }
-BENCH = {"status": bench_status, "results": bench_results, "export": bench_export}
+BENCH = {"status": bench_status, "results": bench_results, "paper-table": bench_paper, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,
     "train": train,

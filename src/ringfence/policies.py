@@ -82,6 +82,8 @@ PLANNERS: dict[str, dict] = {
         "shield": 10,
         "margin": 0.03,
     },
+    # For robots, whose value rises with the very speed that is limited: a gradient on it only costs return.
+    "shielded": {"plans": 8, "shield": 10, "margin": 0.2},
 }
 
 

@@ -27,7 +27,6 @@ class Task:
     cost_offset: float = 0.0  # k
     published_return: tuple[float, float | None] | None = None  # mean and deviation (if known) of the public data set
     transitions: int = 1_000_000  # of the full data set
-    about: str = ""
     presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take unless told otherwise
     protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
@@ -71,14 +70,13 @@ class Task:
 _SPREAD = dict(hazard=hazards.Separation(0.30), return_min=159.8, return_max=516.8, cost_limit=1.0)
 
 
-def _spread(tier: str, mean: float, deviation: float, about: str, transitions: int = 1_000_000) -> Task:
+def _spread(tier: str, mean: float, deviation: float, transitions: int = 1_000_000) -> Task:
     return Task(
         f"simple_spread-{tier}",
         SimpleSpread(),
         tier=tier,
         presets=(tier,),
         published_return=(mean, deviation),
-        about=about,
         transitions=transitions,
         **_SPREAD,
     )
@@ -105,7 +103,6 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
         tier=tier,
         presets=("mujoco",),
         published_return=(mean, deviation),
-        about=f"four MATD3 policies of the level {tier}",
         protocol="quantile" if quantile else "native",
         **_ROBOTS[parts],
     )
@@ -121,10 +118,10 @@ _ROBOT_TIERS: tuple[tuple[Parts, str, float, float | None], ...] = (
 TASKS = {
     t.name: t
     for t in (
-        _spread("expert", 530.95, 71.41, "a fully trained MATD3 policy"),
-        _spread("medium", 273.39, 92.06, "a partially trained MATD3 policy"),
-        _spread("medium-replay", 203.74, 80.49, "a learner's experience up to the medium level", 97_500),
-        _spread("random", 159.57, 60.46, "uniformly random actions"),
+        _spread("expert", 530.95, 71.41),
+        _spread("medium", 273.39, 92.06),
+        _spread("medium-replay", 203.74, 80.49, 97_500),
+        _spread("random", 159.57, 60.46),
         *(_robot(*facts) for facts in _ROBOT_TIERS),
         *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
     )
@@ -136,6 +133,12 @@ def get(name: str) -> Task:
     if name not in TASKS:
         raise unknown("task", name, TASKS)
     return TASKS[name]
+
+
+def twin(name: str) -> str | None:
+    """The task with the same data under safety-gymnasium's limit, of a task with a limit of its own."""
+    other = name.removesuffix("-quantile")
+    return other if other != name else None
 
 
 def from_store(store: EpisodeStore) -> Task:
@@ -153,7 +156,6 @@ def from_store(store: EpisodeStore) -> Task:
         return_max=high if high > low else low + 1.0,
         cost_limit=1.0,
         transitions=store.steps,
-        about=str(store.card.get("provenance", "")),
         action_low=float(store.card["action_low"]),
         action_high=float(store.card["action_high"]),
     )

@@ -140,7 +140,7 @@ def windows_of(
     updates: int,
 ) -> WindowData:
     """Device data of a job; the last one is kept, since tables train several algorithms on one store."""
-    used = data if cost_limit is None else data.select(data.episode_costs <= cost_limit)
+    used = data if cost_limit is None else data.select(within(data.episode_costs, cost_limit))
     about = (data, task.name, view, cost_limit, discount, updates)
     critic = _last_critic.get(about)
     windows = WindowData(used, task.feature_map(view, data), discount, condition, horizon, updates, critic)
@@ -148,6 +148,12 @@ def windows_of(
         _last_critic.clear()
         _last_critic[about] = windows.critic
     return windows
+
+
+def within(costs: np.ndarray, limit: float, least: float = 0.01) -> np.ndarray:
+    """(E,) bool: the episodes whose cost is within the limit; if they are too few to learn from, the `least` share of
+    all with the lowest cost."""
+    return costs <= max(limit, np.quantile(costs, least, method="higher"))
 
 
 # Fitting a critic takes longer than the rest of the preparation; algorithms that differ in their condition share it.

@@ -105,6 +105,7 @@ class Algorithm:
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
+    heeds_danger: bool = True  # False: training reads neither costs nor the hazard
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:
         """The first of the wanted presets that exists, else the algorithm's first one."""

@@ -98,5 +98,21 @@ def _optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
 
 
-BC = Algorithm("bc", Config, check, init, make_update, make_diagnose, make_policy, {"default": {}})
-BC_SAFE = replace(BC, name="bc-safe", presets={"default": {"cost_limit": 0.0}})
+_MUJOCO = {"steps": 8_000}
+BC = Algorithm(
+    "bc",
+    Config,
+    check,
+    init,
+    make_update,
+    make_diagnose,
+    make_policy,
+    {"default": {}, "mujoco": _MUJOCO},
+    heeds_danger=False,
+)
+BC_SAFE = replace(
+    BC,
+    name="bc-safe",
+    presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, **_MUJOCO}},
+    heeds_danger=True,
+)

@@ -212,4 +212,5 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, 
     return Proposer(target["actor"], target["danger"], norm, spec, feature_map, tuple(bar.tolist()), config.candidates)
 
 
-FISOR = Algorithm("fisor", Config, check, init, make_update, ac.no_diagnosis, make_policy, {"default": {}})
+_MUJOCO = {"width": 128, "batch": 256, "steps": 10_000}
+FISOR = Algorithm("fisor", Config, check, init, make_update, ac.no_diagnosis, make_policy, {"default": {}, "mujoco": _MUJOCO})

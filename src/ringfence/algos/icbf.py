@@ -94,20 +94,24 @@ class Config:
 DYNAMICS_STEPS = 3  # steps of every window that inverse and forward dynamics learn from
 
 
+_PAPER = {
+    "condition": "return",
+    "routing": "paper",
+    "barrier_weight": 0.1,
+    "barrier_start": 0.0,
+    "barrier_full": 0.0,
+    "delta": 0.02,
+    "two_sided": False,
+    "scaled_margin": False,
+    "weigh_by_signal": False,
+}
+_MUJOCO = {"steps": 3000}
 PRESETS: dict[str, dict] = {
     "split": {},
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
-    "paper": {
-        "condition": "return",
-        "routing": "paper",
-        "barrier_weight": 0.1,
-        "barrier_start": 0.0,
-        "barrier_full": 0.0,
-        "delta": 0.02,
-        "two_sided": False,
-        "scaled_margin": False,
-        "weigh_by_signal": False,
-    },
+    "mujoco": _MUJOCO,
+    "paper": _PAPER,
+    "mujoco-paper": _PAPER | _MUJOCO,
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
     "madiff-unet": {
         "net": "unet",
@@ -152,7 +156,9 @@ def init(
 
     def networks() -> dict:
         params = {
-            "denoiser": build_denoiser(kd, config.net, rows, d, config.width, config.depth, carried),
+            "denoiser": build_denoiser(
+                kd, config.net, rows, d, config.width, config.depth, carried, n if feature_map.joint else 0
+            ),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True),
             "forward": MLP(kf, (d + acting * spec.action_dim, *[config.inverse_width] * 2, d), groups=n, linear=True),
         }
@@ -548,6 +554,8 @@ MADIFF = Algorithm(
     make_policy,
     {
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
+        "mujoco": {"barrier": False, "barrier_weight": 0.0, "condition": "return", **_MUJOCO},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
+    heeds_danger=False,
 )

@@ -206,6 +206,21 @@ _TIERS = {
     "medium-replay": {"cql_weight": 1.0},
     "random": {"cql_weight": 0.5, "steps": 6_000},
 }
+# The study's HalfCheetah settings (elites, samples around the policy, its coefficients of the expert tier), with fewer
+# samples, smaller layers and fewer updates, for a CPU.
+_MUJOCO = {
+    "search": "elites",
+    "search_iterations": 2,
+    "search_samples": 20,
+    "cql_actions": "policy",
+    "cql_samples": 4,
+    "width": 128,
+    "batch": 128,
+    "lr": 1e-3,
+    "discount": 0.99,
+    "target_rate": 0.005,
+    "steps": 8_000,
+}
 OMAR = Algorithm(
     "omar",
     Config,
@@ -217,18 +232,16 @@ OMAR = Algorithm(
     {
         "default": {},
         **_TIERS,
-        "mujoco": {
-            "search": "elites",
-            "search_iterations": 2,
-            "search_samples": 20,
-            "cql_actions": "policy",
-            "width": 256,
-            "batch": 256,
-            "lr": 3e-4,
-            "target_rate": 0.005,
-            "steps": 100_000,
-        },
+        "mujoco": _MUJOCO,
     },
+    heeds_danger=False,
 )
 _CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "steps": 2_000}
-MA_CQL = replace(OMAR, name="ma-cql", presets={name: {**p, **_CQL} for name, p in {"default": {}, **_TIERS}.items()})
+MA_CQL = replace(
+    OMAR,
+    name="ma-cql",
+    presets={
+        **{name: {**p, **_CQL} for name, p in {"default": {}, **_TIERS}.items()},
+        "mujoco": {**_MUJOCO, "coefficient": 0.0},
+    },
+)

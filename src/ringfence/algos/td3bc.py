@@ -166,6 +166,19 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     return update
 
 
+# TD3+BC's own values (Fujimoto & Gu 2021) at sizes for a CPU; Safety-Gymnasium's cost limit.
+_MUJOCO = {
+    "width": 128,
+    "batch": 256,
+    "lr": 1e-3,
+    "discount": 0.99,
+    "target_rate": 0.005,
+    "delay": 2,
+    "target_noise": 0.2,
+    "action_penalty": 0.0,
+    "limit": 25.0,
+    "steps": 10_000,
+}
 MA_TD3BC = Algorithm(
     "ma-td3bc",
     Config,
@@ -174,8 +187,14 @@ MA_TD3BC = Algorithm(
     make_update,
     ac.no_diagnosis,
     ac.make_policy,
-    {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}},
+    {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}, "mujoco": _MUJOCO},
+    heeds_danger=False,
 )
 MA_TD3BC_LAG = replace(
-    MA_TD3BC, name="ma-td3bc-lag", presets={"default": {"lagrange": True}, "random": {"lagrange": True, "steps": 6_000}}
+    MA_TD3BC,
+    name="ma-td3bc-lag",
+    presets={
+        name: {"lagrange": True, **p} for name, p in MA_TD3BC.presets.items() if name in ("default", "random", "mujoco")
+    },
+    heeds_danger=True,
 )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -20,6 +21,7 @@ from ringfence import __version__, algos, evaluate, hazards, reference, tasks, t
 from ringfence.bench.suites import EVALUATIONS, SUITES, Entry, Suite
 from ringfence.data.make import make
 from ringfence.errors import UserError, unknown
+from ringfence.files import whole
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run, build_config, read_json, write_json
 
@@ -63,6 +65,14 @@ class Cell:
     def folder(self, out: Path) -> Path:
         name = self.algorithm if self.preset == "default" else f"{self.algorithm}-{self.preset}"
         return out / "cells" / self.task / name / f"seed-{self.seed}-{self.id}"
+
+    def twin(self) -> Cell | None:
+        """The same cell on the task that shares this one's data under another definition of danger, if the algorithm
+        reads none: it learned the same there."""
+        if algos.get(self.algorithm).heeds_danger:
+            return None
+        other = tasks.twin(self.task)
+        return None if other is None else dataclasses.replace(self, task=other)
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
         """Evaluations that the folder does not hold yet."""
@@ -232,6 +242,8 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
         tell("start", current)
         try:
             store, _ = make(tasks.get(current.task), current.transitions)
+            for cell in left:
+                adopt(cell, out)
             training.train(
                 current.algorithm,
                 store,
@@ -245,6 +257,17 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
         except Exception as error:
             record_failure(current, out, f"{type(error).__name__}: {error}", traceback.format_exc())
             tell("failed", left.pop(0))
+
+
+def adopt(cell: Cell, out: Path) -> None:
+    """Begin a cell with what its twin has learned, where that is there; its training is then over at once."""
+    twin = cell.twin()
+    if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
+        return
+    there, here = Run(twin.folder(out)), Run(cell.folder(out))
+    for file in (there.path / "metrics.jsonl", *(f for _, f in there.checkpoints()[-1:])):
+        with whole(here.path / file.relative_to(there.path)) as temporary:
+            shutil.copyfile(file, temporary)
 
 
 def _record(cell: Cell, out: Path, state: str, more: dict) -> None:

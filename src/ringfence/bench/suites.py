@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ringfence import algos
-from ringfence.tasks import Task
+from ringfence.tasks import TASKS, Task
 
 # Named sets of evaluation-time choices; keyword arguments of evaluate.evaluate.
 EVALUATIONS: dict[str, dict] = {
     "plain": {},
     "plans8": {"plans": 8},
     "guarded": {"planner": "guarded"},
+    "shielded": {"planner": "shielded"},
 }
 
 
@@ -62,5 +63,22 @@ SUITES = {
             Entry("icbf", "split", ("plain", "plans8", "guarded")),
             Entry("icbf", "long", ("plain", "guarded"), ("expert", "medium")),
         ),
+    ),
+    "mujoco": Suite(
+        # Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
+        tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol),
+        (
+            Entry("bc"),
+            Entry("bc-safe"),
+            Entry("ma-td3bc"),
+            Entry("ma-td3bc-lag"),
+            Entry("fisor"),
+            Entry("omar"),
+            Entry("ma-cql"),
+            Entry("madiff", evaluations=("plain", "shielded")),
+            Entry("icbf", "mujoco-paper"),
+            Entry("icbf", evaluations=("plain", "shielded")),
+        ),
+        episodes=20,
     ),
 }

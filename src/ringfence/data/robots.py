@@ -63,7 +63,7 @@ class RobotsConfig:
     updates: int = 64  # critic updates per bout
     random_steps: int = 10_000  # transitions with uniform actions at the start
     transitions: int = 2_000_000  # at most
-    score_every: int = 20  # bouts between two scores
+    score_every: int = 40  # bouts between two scores
     score_episodes: int = 8
 
 

@@ -11,11 +11,19 @@ __all__ = ["MLP", "AgentAttention", "build_denoiser"]
 
 
 def build_denoiser(
-    key: Key, kind: str, rows: int, features: int, width: int, depth: int, carried: tuple[int, ...] | None = None
+    key: Key,
+    kind: str,
+    rows: int,
+    features: int,
+    width: int,
+    depth: int,
+    carried: tuple[int, ...] | None = None,
+    agents: int = 0,
 ):
-    """A denoiser F(x (B, H, N, D), k (B,), y (B,), keep (B,)) -> (B, H, N, D) by name."""
+    """A denoiser F(x (B, H, N, D), k (B,), y (B,), keep (B,)) -> (B, H, N, D) by name. `agents`: their number where
+    attention is to tell them apart."""
     if kind == "attention":
-        return AgentAttention(key, rows, features, width, depth, carried)
+        return AgentAttention(key, rows, features, width, depth, carried, agents)
     if kind == "unet":
         from ringfence.nets.unet import TemporalUNet
 

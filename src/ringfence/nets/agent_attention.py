@@ -1,7 +1,8 @@
 """The default denoiser: one token per agent holds its whole window, attention runs across agents.
 
 Flattening the window into the token turns the work into a few wide matrix products, which is what a CPU is good at;
-`benchmarks/denoisers.py` puts it beside MADIFF's temporal U-Net. The number of agents appears in no weight.
+`benchmarks/denoisers.py` puts it beside MADIFF's temporal U-Net. The number of agents appears in no weight unless
+they are told apart.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ class AgentAttention(eqx.Module):
     inlet: Array  # (carried entries, W)
     outlet: Array  # (W, carried entries)
     blocks: list[dict[str, Array]]
+    which: Array | None  # (N, W), where agents are told apart
     carried: tuple[int, ...] = eqx.field(static=True)  # entries of a flattened window (H·D) that are read and written
 
     def __init__(
@@ -37,7 +39,9 @@ class AgentAttention(eqx.Module):
         width: int = 128,
         depth: int = 3,
         carried: tuple[int, ...] | None = None,
+        agents: int = 0,
     ):
+        """`agents`: their number if they are to be told apart, as limbs of one body are; 0: they are alike."""
         keys = jax.random.split(key, depth + 3)
         self.carried = tuple(range(rows * features)) if carried is None else carried
         flat = len(self.carried)
@@ -45,6 +49,7 @@ class AgentAttention(eqx.Module):
         self.inlet = _normal(keys[1], flat, width)
         self.outlet = _normal(keys[2], width, flat, 0.1)
         self.blocks = [_block(k, width) for k in keys[3:]]
+        self.which = jnp.zeros((agents, width)) if agents else None
 
     def __call__(self, x: Array, k: Array, y: Array, keep: Array) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool -> (B, H, N, D)."""
@@ -52,6 +57,8 @@ class AgentAttention(eqx.Module):
         c = self.condition(k, y, keep)
         carried = np.array(self.carried)
         token = jnp.moveaxis(x, 1, 2).reshape(b * n, h * d)[:, carried] @ self.inlet
+        if self.which is not None:
+            token = token + jnp.tile(self.which, (b, 1))
         for p in self.blocks:
             token = token + _attend(_norm(token), p, n)
             told = jnp.repeat(c @ p["tell"] + p["bias"], n, axis=0)
