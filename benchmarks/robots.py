@@ -22,6 +22,7 @@ import numpy as np
 from _common import record
 
 from ringfence.envs import SafeMuJoCo
+from ringfence.envs.mujoco import FRAME_SKIP
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "robots.json"
 COLLECT = """
@@ -55,6 +56,23 @@ def rate(parts: str, batch: int, repeats: int) -> float:
     return median(rates)
 
 
+def alone(parts: str, repeats: int, steps: int = 1000) -> float:
+    """Median env-steps per second of one thread that calls MuJoCo's own `mj_step` and nothing else."""
+    import mujoco
+
+    model = SafeMuJoCo(parts).model()
+    data, controls = mujoco.MjData(model), np.random.default_rng(0).uniform(-1, 1, (steps, model.nu))
+    rates = []
+    for _ in range(repeats):
+        mujoco.mj_resetData(model, data)
+        begun = time.perf_counter()
+        for control in controls:
+            data.ctrl[:] = control
+            mujoco.mj_step(model, data, FRAME_SKIP)
+        rates.append(steps / (time.perf_counter() - begun))
+    return median(rates)
+
+
 def collected(task: str, transitions: int) -> tuple[float, float, int]:
     """(seconds, peak GiB, steps)"""
     with tempfile.TemporaryDirectory() as folder:
@@ -70,6 +88,8 @@ def main() -> None:
     a = parser.parse_args()
     rows = []
     for parts in ("2x3", "2x4", "4x2"):
+        name = f"{SafeMuJoCo(parts).name} mj_step alone, one thread"
+        rows.append({"name": name, "value": alone(parts, a.repeats), "unit": "env-steps/s"})
         for batch in (16, 256):
             name = f"{SafeMuJoCo(parts).name} batch={batch}"
             rows.append({"name": name, "value": rate(parts, batch, a.repeats), "unit": "env-steps/s"})

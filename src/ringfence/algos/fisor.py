@@ -213,4 +213,6 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, 
 
 
 _MUJOCO = {"width": 128, "batch": 256, "steps": 10_000}
-FISOR = Algorithm("fisor", Config, check, init, make_update, ac.no_diagnosis, make_policy, {"default": {}, "mujoco": _MUJOCO})
+FISOR = Algorithm(
+    "fisor", Config, check, init, make_update, ac.no_diagnosis, make_policy, {"default": {}, "mujoco": _MUJOCO}
+)

@@ -219,7 +219,7 @@ _MUJOCO = {
     "lr": 1e-3,
     "discount": 0.99,
     "target_rate": 0.005,
-    "steps": 8_000,
+    "steps": 6_000,
 }
 OMAR = Algorithm(
     "omar",

@@ -12,6 +12,7 @@ EVALUATIONS: dict[str, dict] = {
     "plain": {},
     "plans8": {"plans": 8},
     "guarded": {"planner": "guarded"},
+    "steady": {"planner": "steady"},
     "shielded": {"planner": "shielded"},
 }
 
@@ -75,9 +76,9 @@ SUITES = {
             Entry("fisor"),
             Entry("omar"),
             Entry("ma-cql"),
-            Entry("madiff", evaluations=("plain", "shielded")),
+            Entry("madiff", evaluations=("plain", "steady", "shielded")),
             Entry("icbf", "mujoco-paper"),
-            Entry("icbf", evaluations=("plain", "shielded")),
+            Entry("icbf", evaluations=("plain", "steady", "shielded")),
         ),
         episodes=20,
     ),

@@ -14,7 +14,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from ringfence.data import matd3
 from ringfence.data.behaviour import POLICIES, BehaviourPolicy, load_behaviour, save_behaviour
 from ringfence.data.matd3 import Learner, MATD3Config, Mlp, Transitions
 from ringfence.envs.mujoco import SafeMuJoCo
-from ringfence.errors import CheckpointError
+from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key
 
 COMMAND = "python -m ringfence.data.robots"
@@ -65,6 +65,17 @@ class RobotsConfig:
     transitions: int = 2_000_000  # at most
     score_every: int = 40  # bouts between two scores
     score_episodes: int = 8
+    patience: int = 0  # bouts before the actors move, for critics that have to get to know them first
+    averaged: float = 0.0  # of the actors, per bout: snapshots are of the average (0: of the actors as they are)
+
+
+# A second stage, for robots that fall: it starts with actors that walk and makes them stand the noise of collection.
+STEADYING = RobotsConfig(
+    learner=replace(RobotsConfig.learner, actor_rate=3e-4, critic_rate=3e-4, noise=NOISE),
+    random_steps=0,
+    patience=100,
+    averaged=0.98,
+)
 
 
 class Memory(NamedTuple):
@@ -87,9 +98,16 @@ class Snapshot(NamedTuple):
 
 @partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
 def learn(
-    config: RobotsConfig, env: SafeMuJoCo, learner: Learner, memory: Memory, fresh: Memory, at: Array, key: Key
+    config: RobotsConfig,
+    env: SafeMuJoCo,
+    learner: Learner,
+    memory: Memory,
+    fresh: Memory,
+    at: Array,
+    improve: Array,
+    key: Key,
 ) -> tuple[Learner, Memory]:
-    """Put fresh transitions into the memory at row `at` and make a bout of updates."""
+    """Put fresh transitions into the memory at row `at` and make a bout of updates; actors move if `improve`."""
     memory = jax.tree.map(lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, at, 0), memory, fresh)
     stored = at + len(fresh.reward)
 
@@ -100,7 +118,8 @@ def learn(
         m = Memory(*(x[rows] for x in memory))
         seen, later = m.state[:, env.observed], m.after[:, env.observed]
         batch = Transitions(seen, m.state, m.action, m.reward[:, None], m.terminated, later, m.after)
-        return matd3.update(config.learner, learner, batch, index % config.learner.delay == 0, k_noise), None
+        due = improve & (index % config.learner.delay == 0)
+        return matd3.update(config.learner, learner, batch, due, k_noise), None
 
     steps = jnp.arange(config.updates), jax.random.split(key, config.updates)
     return jax.lax.scan(one, learner, steps)[0], memory
@@ -118,9 +137,10 @@ def train(
     seed: int,
     progress: Callable[[Snapshot], None] | None = None,
     enough: float = np.inf,
+    start: Mlp | None = None,
 ) -> list[Snapshot]:
-    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2. Ends early
-    when the last four earn `enough` on average."""
+    """Train from scratch, or from actors; a snapshot every `score_every` bouts, with the return it earns under noise
+    0.2. Ends early when the last four earn `enough` on average."""
     b, n = config.robots, env.n_agents
     sim, judge = env.simulate(b), env.simulate(config.score_episodes)
     rng = np.random.default_rng(seed)
@@ -137,7 +157,10 @@ def train(
     )
     key, k = jax.random.split(key)
     learner = matd3.init(config.learner, k, n, env.observed.shape[1], s, env.action_dim, team=True)
-    episode, age = b, np.zeros(b, int)
+    if start is not None:
+        copy = lambda: jax.tree.map(jnp.array, start)  # noqa: E731, as the training loop donates its buffers
+        learner = learner._replace(actors=copy(), actors_target=copy())
+    episode, age, average = b, np.zeros(b, int), jax.tree.map(np.array, learner.actors)
     sim.reset([(seed, e) for e in range(b)])
     found = []
     for bout in range(bouts):
@@ -158,10 +181,14 @@ def train(
                 episode, age[over] = episode + len(over), 0
         fresh = Memory(*(np.concatenate(x) for x in zip(*rows)))
         key, k = jax.random.split(key)
-        learner, memory = learn(config, env, learner, memory, fresh, bout * b * config.stretch, k)
+        learner, memory = learn(
+            config, env, learner, memory, fresh, bout * b * config.stretch, bout >= config.patience, k
+        )
+        fold = lambda a, w: config.averaged * a + (1 - config.averaged) * np.asarray(w)  # noqa: E731
+        average = jax.tree.map(fold, average, learner.actors)
         if (bout + 1) % config.score_every == 0 or bout + 1 == bouts:
-            score = float(returns(env, learner.actors, judge, seed).mean())
-            found.append(Snapshot(jax.tree.map(np.asarray, learner.actors), (bout + 1) * b * config.stretch, score))
+            score = float(returns(env, average, judge, seed).mean())
+            found.append(Snapshot(average, (bout + 1) * b * config.stretch, score))
             if progress is not None:
                 progress(found[-1])
             if len(found) >= MIXED and np.mean([s.score for s in found[-MIXED:]]) > enough:
@@ -281,7 +308,7 @@ class Candidate(NamedTuple):
 
 def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]:
     """The snapshots of a run that come nearest to a level: picked by the scores of training, then judged again."""
-    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: 3 * MIXED]
+    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: MIXED + 2]
     judged = []
     for s in rough:
         actors = _halved(_load_snapshot(run / f"{s['seen']:07d}.npz"))
@@ -330,6 +357,7 @@ def main() -> None:
     trained.add_argument("parts", choices=tuple(LEVELS))
     trained.add_argument("--seed", type=int, default=0)
     trained.add_argument("--transitions", type=int, default=RobotsConfig.transitions)
+    trained.add_argument("--start", type=Path, help="a run whose last four snapshots, averaged, are to be steadied")
     trained.add_argument("--level", choices=TIERS, default="good", help="end when this tier's level is passed")
     trained.add_argument("--out", type=Path, default=Path("runs/behaviour"))
     packed = what.add_parser("pack")
@@ -342,18 +370,25 @@ def main() -> None:
         for tier, card in pack(env, a.runs, a.out).items():
             print(tier, json.dumps(card["policies"]))
     else:
-        _train_and_keep(env, a.seed, a.transitions, a.level, a.out)
+        _train_and_keep(env, a.seed, a.transitions, a.level, a.start, a.out)
 
 
-def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, out: Path) -> None:
+def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, start: Path | None, out: Path) -> None:
     folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
+    if folder.exists():
+        raise UserError(f"'{folder}' exists already; delete it or give another --seed or --out.")
     enough = 1.03 * LEVELS[env.parts][level]
+    config = RobotsConfig() if start is None else STEADYING
+    actors = None
+    if start is not None:
+        last = [_load_snapshot(start / f"{s['seen']:07d}.npz") for s in _scores(start)[-MIXED:]]
+        actors = jax.tree.map(lambda *x: jnp.stack(x).mean(0), *last)
 
     def progress(snapshot: Snapshot) -> None:
         keep(snapshot, folder, time.perf_counter() - begun)
         print(f"{snapshot.seen:,} transitions, {snapshot.score:.0f}", flush=True)
 
-    train(env, RobotsConfig(transitions=transitions), seed, progress, enough)
+    train(env, replace(config, transitions=transitions), seed, progress, enough, actors)
 
 
 if __name__ == "__main__":

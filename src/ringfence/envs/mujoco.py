@@ -159,6 +159,8 @@ class SafeMuJoCo:
         model = mujoco.MjModel.from_xml_string(re.sub(r'\s+settotalmass="[^"]*"', "", text))
         if self.ant and version >= (3, 5):
             model.geom_margin *= 0.5
+        if hasattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND"):  # one robot is one island: the same bits, 5 % faster
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
         if not self.ant:
             mujoco.mj_setTotalmass(model, 14.0)
             mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -76,10 +76,10 @@ def published(board: Board, tables: dict[str, list[Standing]]) -> dict | None:
     tasks = [t for t in board.tasks if any(t in p.values for p in PUBLISHED)]
     if not tasks:
         return None
-    rows = []
-    for k, p in enumerate(PUBLISHED):
+    rows, printed = [], [p for p in PUBLISHED if any(t in p.values for t in tasks)]
+    for k, p in enumerate(printed):
         ours = []
-        again = any(p.algorithms == later.algorithms for later in PUBLISHED[k + 1 :])  # ours follow the last of them
+        again = any(p.algorithms == later.algorithms for later in printed[k + 1 :])  # ours follow the last of them
         for m in (m for m in board.methods if matches(p, m.algorithm) and not again):
             cells = [next((r for r in tables[t] if r.method == m), None) for t in tasks]
             ours.append({"label": m.label, "numbers": [c and 100 * c.returns_norm for c in cells]})
@@ -107,6 +107,7 @@ def _section(board: Board, task: str, k: int, rows: list[Standing], rows_to_beat
         "absent": _absent(board, rows),
         "contests": contests(rows),
         "constants": constants,
+        "ceiling": card.get("return_ceiling"),
         "scatter": Markup(drawn) if drawn else None,
         "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],
         "card": facts(card),

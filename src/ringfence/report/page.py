@@ -81,6 +81,7 @@ def _section(section: Section, k: int, out: Path) -> dict:
             for split, rows in section.tables.items()
         ],
         "constants": section.constants,
+        "ceiling": section.card.get("return_ceiling"),
         "protocol": section.protocol,
         "several_seeds": any(len(r.seeds) > 1 for r in section.rows),
         "colours": figures.COLOURS,

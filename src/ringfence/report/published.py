@@ -30,8 +30,47 @@ def _spread(expert: float, replay: float, medium: float, random: float) -> dict[
     }
 
 
+# Random and best return of OG-MARL's sets (Formanek et al. 2023), which normalise the robots' raw returns.
+_RANGE = {"halfcheetah_2x3": (-280.18, 9132.25), "ant_2x4": (-325.6, 3362.44), "ant_4x2": (-325.6, 3224.91)}
+
+
+def _robots(**raw: tuple[float, float, float]) -> dict[str, float]:
+    """Raw returns of good, medium and poor by robot; no speed limit was known there, so both protocols show them."""
+    found = {}
+    for robot, returns in raw.items():
+        low, high = _RANGE[robot]
+        for tier, value in zip(("good", "medium", "poor"), returns):
+            for protocol in ("", "-quantile"):
+                found[f"{robot}-{tier}{protocol}"] = round(100 * (value - low) / (high - low), 1)
+    return found
+
+
 PUBLISHED = (
     Published("BC", OMAR, ("bc",), _spread(35.0, 10.0, 31.6, -0.5)),
+    Published(
+        "BC",
+        MADIFF,
+        ("bc",),
+        _robots(halfcheetah_2x3=(6846, 1627, 465), ant_2x4=(2697, 1145, 954), ant_4x2=(2802, 1617, 1033)),
+    ),
+    Published(
+        "MA-TD3+BC",
+        MADIFF,
+        ("matd3bc",),
+        _robots(halfcheetah_2x3=(7025, 2561, 736), ant_2x4=(2922, 744, 1256), ant_4x2=(2628, 1843, 1075)),
+    ),
+    Published(
+        "OMAR",
+        MADIFF,
+        ("omar",),
+        _robots(halfcheetah_2x3=(1434, 1892, 384), ant_2x4=(464, 799, 857), ant_4x2=(344, 929, 518)),
+    ),
+    Published(
+        "MADiff-D (each agent plans for itself)",
+        MADIFF,
+        ("madiff",),
+        _robots(halfcheetah_2x3=(8246, 2207, 759), ant_2x4=(2946, 1211, 946), ant_4x2=(3080, 1649, 1295)),
+    ),
     Published("MA-ICQ", OMAR, ("maicq",), _spread(104.0, 13.6, 29.3, 6.3)),
     Published("MA-TD3+BC", OMAR, ("matd3bc",), _spread(108.3, 15.4, 29.3, 9.8)),
     Published("MA-CQL", OMAR, ("macql",), _spread(98.2, 20.0, 34.1, 24.0)),
