@@ -9,6 +9,7 @@ import numpy as np
 
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
+from ringfence.envs import SimpleSpread
 from ringfence.evaluate import PROTOCOL, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
 from ringfence.runs import read_json, write_json
@@ -55,7 +56,7 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
             return known
     spec = task.spec(task.feature_map("pruned"))
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
-    if task.tier in behaviour.TARGETS:
+    if isinstance(task.env, SimpleSpread) and task.tier in behaviour.TARGETS:  # robots' tiers mix several policies
         policies["behaviour policy"] = Behaviour(behaviour.shipped_policy(task.tier))
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
     for name, policy in policies.items():

@@ -71,9 +71,9 @@ class RobotsConfig:
 
 # A second stage, for robots that fall: it starts with actors that walk and makes them stand the noise of collection.
 STEADYING = RobotsConfig(
-    learner=replace(RobotsConfig.learner, actor_rate=3e-4, critic_rate=3e-4, noise=NOISE),
+    learner=replace(RobotsConfig.learner, actor_rate=1e-4, critic_rate=3e-4, noise=NOISE),
     random_steps=0,
-    patience=100,
+    patience=400,
     averaged=0.98,
 )
 
