@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from ringfence.bench import paper
 from ringfence.report import board, export
 
 matplotlib.use("Agg")
@@ -43,6 +44,26 @@ ROWS = (
     ("icbf", "long", "`long`: `split` for 6000 updates"),
     ("icbf", "long+guarded", "**`long`, guarded planner**"),
 )
+ROBOTS = ("halfcheetah_2x3", "ant_2x4", "ant_4x2")
+LEVELS = ("good", "medium", "poor")
+ROBOT_ROWS = (
+    ("behaviour data", "reference", "behaviour data"),
+    ("do-nothing", "reference", "do nothing"),
+    ("bc", "mujoco", "BC"),
+    ("bc-safe", "mujoco", "BC on the cheapest episodes"),
+    ("ma-td3bc", "mujoco", "MA-TD3+BC"),
+    ("omar", "mujoco", "OMAR"),
+    ("ma-cql", "mujoco", "MA-CQL"),
+    ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
+    ("fisor", "mujoco", "FISOR per agent"),
+    ("madiff", "mujoco", "MADIFF (no barrier)"),
+    ("madiff", "mujoco+steady", "MADIFF, steady"),
+    ("madiff", "mujoco+shielded", "MADIFF, shielded"),
+    ("icbf", "mujoco-paper", "ICBF-Diffuser `paper`"),
+    ("icbf", "mujoco", "ICBF-Diffuser `split`"),
+    ("icbf", "mujoco+steady", "`split`, steady"),
+    ("icbf", "mujoco+shielded", "**`split`, shielded**"),
+)
 # Pan et al. 2022, means as tabulated in MADIFF's repository; on the public files.
 PUBLISHED = {
     "published: MA-TD3+BC, public data": (1.083, 0.293, 0.154, 0.098),
@@ -51,24 +72,46 @@ PUBLISHED = {
 
 
 def main() -> None:
-    with open(RESULTS / "simple_spread" / "table.csv") as f:
-        table = list(csv.DictReader(f))
-    groups = defaultdict(list)
-    for row in table:
-        if not row["task"]:
-            continue
-        groups[row["task"], row["algorithm"], row["variant"]].append(row)
+    groups = grouped("simple_spread")
     put("README.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
     put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv"))
     put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
+    measured = grouped("mujoco")
+    for protocol, ending in (("native", ""), ("quantile", "-quantile")):
+        put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
+    put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
+    put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.SUITES)))
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
         speed += [(r["name"], r["value"], r["unit"], r["command"]) for r in json.loads(file.read_text())]
     lines = ["| what | measured | command |", "|---|---|---|"]
     lines += [f"| {name} | {value:.4g} {unit} | `{command}` |" for name, value, unit, command in speed]
     put("docs/performance.md", "performance", "\n".join(lines))
+
+
+def grouped(suite: str) -> dict:
+    """Rows of a suite's table by (task, algorithm, variant)."""
+    groups = defaultdict(list)
+    with open(RESULTS / suite / "table.csv") as f:
+        for row in csv.DictReader(f):
+            if row["task"]:
+                groups[row["task"], row["algorithm"], row["variant"]].append(row)
+    return groups
+
+
+def robots(groups: dict, ending: str) -> str:
+    """One line per method, one column per task that has results: return (normalised) / cost."""
+    names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
+    names = [name for name in names if any(task == name for task, *_ in groups)]
+    lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
+    for algorithm, variant, label in ROBOT_ROWS:
+        found = [groups.get((name, algorithm, variant), []) for name in names]
+        if any(found):
+            cells = (cell(rows, "cost_mean", 1) if rows else "–" for rows in found)
+            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def searched(file: Path) -> str:
@@ -168,13 +211,14 @@ def draw(groups: dict, path: Path) -> None:
     print(path)
 
 
-def cell(rows: list[dict]) -> str:
-    """Return ± deviation between seeds (normalised) / avoidable cost."""
+def cell(rows: list[dict], cost: str = "avoidable_cost", digits: int = 3) -> str:
+    """Return ± deviation between seeds (normalised) / cost."""
     column = lambda key: np.array([float(r[key]) for r in rows])  # noqa: E731
     returns = column("return_mean")
     spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
-    spread += f" [{len(rows)} seeds]" if 1 < len(rows) < SEEDS else ""
-    return f"{returns.mean():.0f}{spread} ({column('return_norm').mean():.2f}) / {column('avoidable_cost').mean():.3f}"
+    made = sum(r["variant"] != "reference" for r in rows)
+    spread += f" [{made} seed{'s' * (made > 1)}]" if 0 < made < SEEDS else ""
+    return f"{returns.mean():.0f}{spread} ({column('return_norm').mean():.2f}) / {column(cost).mean():.{digits}f}"
 
 
 def put(file: str, name: str, text: str) -> None:

@@ -179,7 +179,7 @@ def evaluate(
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
     record: int = 4,
-    planner: Literal["plain", "guarded"] = "plain",
+    planner: Literal["plain", "guarded", "steady", "shielded"] = "plain",
     plans: int | None = None,
     steps: int | None = None,
     sampler: str | None = None,
@@ -201,7 +201,8 @@ def evaluate(
         episodes: at least 200 for a table.
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
-        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one.
+        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one; steady and shielded
+            are for robots.
         plans: drawn per step; the best safe one is followed.
         steps: of the sampler.
         sampler: ddim, ddpm or dpm++.
