@@ -166,6 +166,9 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(trained):
         foreseen[name] = np.asarray(policy.safety(policy.foreseen_step(now[:, None], now, out.action)).min(-1))
     np.testing.assert_allclose(acted["easy"], acted["none"], atol=1e-5)
     assert np.abs(acted["hard"]).max() <= 1.0
+    _, same = evaluate.load(trained["icbf"], **told, margin=0.0, share=4.0, shield=8)  # 4 x 0.075 m
+    _, out = same.act(same.start(64), env.observe(state), env.global_state(state), jax.random.key(1))
+    np.testing.assert_allclose(out.action, acted["hard"], atol=1e-5)
     short = foreseen["none"] < 0.3
     assert 5 < short.sum() < 64
     assert foreseen["hard"][short].mean() > foreseen["none"][short].mean()

@@ -130,12 +130,10 @@ def test_behaviour_learning_is_reproducible():
     assert one[0].actors.weights[0].shape == (2, 12, 8)
     other = robots.train(env, config, 1)
     assert other[-1].score != one[-1].score
-    # Given actors stand still while critics get to know them; snapshots are averages.
-    still = replace(config, random_steps=0, patience=100, averaged=0.5)
-    (first, second) = robots.train(env, still, 0, start=one[-1].actors)
-    assert np.allclose(second.actors.weights[0], one[-1].actors.weights[0], atol=1e-7)
-    moved = robots.train(env, replace(still, patience=0), 0, start=one[-1].actors)
-    assert not np.allclose(moved[-1].actors.weights[0], one[-1].actors.weights[0], atol=1e-4)
+    # Averages move less than what they are averages of.
+    calm = robots.train(env, replace(config, averaged=0.9), 0)
+    w = lambda found, k: found[k].actors.weights[0]  # noqa: E731
+    assert 0 < np.abs(w(calm, 1) - w(calm, 0)).max() < np.abs(w(one, 1) - w(one, 0)).max()
 
 
 def test_tiers_are_packed_from_runs_and_read_back(tmp_path):

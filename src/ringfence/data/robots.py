@@ -65,17 +65,13 @@ class RobotsConfig:
     transitions: int = 2_000_000  # at most
     score_every: int = 40  # bouts between two scores
     score_episodes: int = 8
-    patience: int = 0  # bouts before the actors move, for critics that have to get to know them first
     averaged: float = 0.0  # of the actors, per bout: snapshots are of the average (0: of the actors as they are)
 
 
-# A second stage, for robots that fall: it starts with actors that walk and makes them stand the noise of collection.
-STEADYING = RobotsConfig(
-    learner=replace(RobotsConfig.learner, actor_rate=1e-4, critic_rate=3e-4, noise=NOISE),
-    random_steps=0,
-    patience=400,
-    averaged=0.98,
-)
+def config_for(env: SafeMuJoCo) -> RobotsConfig:
+    """The Ant falls, so it learns under the noise of collection, and its snapshots are of averages, which fall less."""
+    config = RobotsConfig()
+    return replace(config, learner=replace(config.learner, noise=NOISE), averaged=0.98) if env.ant else config
 
 
 class Memory(NamedTuple):
@@ -104,10 +100,9 @@ def learn(
     memory: Memory,
     fresh: Memory,
     at: Array,
-    improve: Array,
     key: Key,
 ) -> tuple[Learner, Memory]:
-    """Put fresh transitions into the memory at row `at` and make a bout of updates; actors move if `improve`."""
+    """Put fresh transitions into the memory at row `at` and make a bout of updates."""
     memory = jax.tree.map(lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, at, 0), memory, fresh)
     stored = at + len(fresh.reward)
 
@@ -118,8 +113,7 @@ def learn(
         m = Memory(*(x[rows] for x in memory))
         seen, later = m.state[:, env.observed], m.after[:, env.observed]
         batch = Transitions(seen, m.state, m.action, m.reward[:, None], m.terminated, later, m.after)
-        due = improve & (index % config.learner.delay == 0)
-        return matd3.update(config.learner, learner, batch, due, k_noise), None
+        return matd3.update(config.learner, learner, batch, index % config.learner.delay == 0, k_noise), None
 
     steps = jnp.arange(config.updates), jax.random.split(key, config.updates)
     return jax.lax.scan(one, learner, steps)[0], memory
@@ -137,9 +131,8 @@ def train(
     seed: int,
     progress: Callable[[Snapshot], None] | None = None,
     enough: float = np.inf,
-    start: Mlp | None = None,
 ) -> list[Snapshot]:
-    """Train from scratch, or from actors; a snapshot every `score_every` bouts, with the return it earns under noise
+    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise
     0.2. Ends early when the last four earn `enough` on average."""
     b, n = config.robots, env.n_agents
     sim, judge = env.simulate(b), env.simulate(config.score_episodes)
@@ -157,9 +150,6 @@ def train(
     )
     key, k = jax.random.split(key)
     learner = matd3.init(config.learner, k, n, env.observed.shape[1], s, env.action_dim, team=True)
-    if start is not None:
-        copy = lambda: jax.tree.map(jnp.array, start)  # noqa: E731, as the training loop donates its buffers
-        learner = learner._replace(actors=copy(), actors_target=copy())
     episode, age, average = b, np.zeros(b, int), jax.tree.map(np.array, learner.actors)
     sim.reset([(seed, e) for e in range(b)])
     found = []
@@ -181,9 +171,7 @@ def train(
                 episode, age[over] = episode + len(over), 0
         fresh = Memory(*(np.concatenate(x) for x in zip(*rows)))
         key, k = jax.random.split(key)
-        learner, memory = learn(
-            config, env, learner, memory, fresh, bout * b * config.stretch, bout >= config.patience, k
-        )
+        learner, memory = learn(config, env, learner, memory, fresh, bout * b * config.stretch, k)
         fold = lambda a, w: config.averaged * a + (1 - config.averaged) * np.asarray(w)  # noqa: E731
         average = jax.tree.map(fold, average, learner.actors)
         if (bout + 1) % config.score_every == 0 or bout + 1 == bouts:
@@ -357,7 +345,6 @@ def main() -> None:
     trained.add_argument("parts", choices=tuple(LEVELS))
     trained.add_argument("--seed", type=int, default=0)
     trained.add_argument("--transitions", type=int, default=RobotsConfig.transitions)
-    trained.add_argument("--start", type=Path, help="a run whose last four snapshots, averaged, are to be steadied")
     trained.add_argument("--level", choices=TIERS, default="good", help="end when this tier's level is passed")
     trained.add_argument("--out", type=Path, default=Path("runs/behaviour"))
     packed = what.add_parser("pack")
@@ -370,25 +357,20 @@ def main() -> None:
         for tier, card in pack(env, a.runs, a.out).items():
             print(tier, json.dumps(card["policies"]))
     else:
-        _train_and_keep(env, a.seed, a.transitions, a.level, a.start, a.out)
+        _train_and_keep(env, a.seed, a.transitions, a.level, a.out)
 
 
-def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, start: Path | None, out: Path) -> None:
+def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, out: Path) -> None:
     folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
     if folder.exists():
         raise UserError(f"'{folder}' exists already; delete it or give another --seed or --out.")
     enough = 1.03 * LEVELS[env.parts][level]
-    config = RobotsConfig() if start is None else STEADYING
-    actors = None
-    if start is not None:
-        last = [_load_snapshot(start / f"{s['seen']:07d}.npz") for s in _scores(start)[-MIXED:]]
-        actors = jax.tree.map(lambda *x: jnp.stack(x).mean(0), *last)
 
     def progress(snapshot: Snapshot) -> None:
         keep(snapshot, folder, time.perf_counter() - begun)
         print(f"{snapshot.seen:,} transitions, {snapshot.score:.0f}", flush=True)
 
-    train(env, replace(config, transitions=transitions), seed, progress, enough, actors)
+    train(env, replace(config_for(env), transitions=transitions), seed, progress, enough)
 
 
 if __name__ == "__main__":
