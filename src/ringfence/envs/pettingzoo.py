@@ -28,7 +28,28 @@ def parallel_env(render_mode: str | None = None, **options: Any) -> SimpleSpread
     return SimpleSpreadParallel(render_mode=render_mode, **options)
 
 
-class SimpleSpreadParallel(ParallelEnv):
+class _Parallel(ParallelEnv):
+    """Agents `agent_0` .. `agent_{N-1}` and their spaces."""
+
+    def __init__(self, agents: int, observation: int, action: int, state: int, kind: type):
+        self.possible_agents = names = [f"agent_{i}" for i in range(agents)]
+        self.agents: list[str] = []
+        # One object per agent, made once: the API demands identity, so that seeding a space lasts.
+        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (observation,), kind) for a in names}
+        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (action,), np.float32) for a in names}
+        self.state_space = spaces.Box(-np.inf, np.inf, (state,), kind)
+
+    def observation_space(self, agent: str) -> spaces.Box:
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Box:
+        return self.action_spaces[agent]
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+class SimpleSpreadParallel(_Parallel):
     """Simple Spread as `agent_0` .. `agent_{N-1}`.
 
     Observations are float32 (O,), actions force directions in [-1, 1]^2 (clipped), rewards floats. Every agent's info
@@ -42,14 +63,9 @@ class SimpleSpreadParallel(ParallelEnv):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"There is no render_mode='{render_mode}'; use 'rgb_array', or None to draw nothing.")
         self.core = SimpleSpread(**options)
+        sizes = self.core.n_agents, self.core.observation_dim, 2, len(self.core.state_names)
+        super().__init__(*sizes, np.float32)
         self.render_mode = render_mode
-        self.possible_agents = names = [f"agent_{i}" for i in range(self.core.n_agents)]
-        self.agents: list[str] = []
-        observation, state = (self.core.observation_dim,), (len(self.core.state_names),)
-        # One object per agent, made once: the API demands identity, so that seeding a space lasts.
-        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, observation, np.float32) for a in names}
-        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (2,), np.float32) for a in names}
-        self.state_space = spaces.Box(-np.inf, np.inf, state, np.float32)
         self._key: jax.Array | None = None
         self._state: SpreadState | None = None
         self._steps = 0
@@ -57,12 +73,6 @@ class SimpleSpreadParallel(ParallelEnv):
         self._reset = jax.jit(lambda key: core.reset(key, 1))
         self._step = jax.jit(core.step)
         self._observe = jax.jit(core.observe)
-
-    def observation_space(self, agent: str) -> spaces.Box:
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Box:
-        return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
         """Start an episode; a seed fixes this and all later episodes. `options` is accepted and ignored."""
@@ -117,9 +127,6 @@ class SimpleSpreadParallel(ParallelEnv):
             frame[inside] = (0.25 * frame[inside] + 0.75 * colour).astype(np.uint8)  # landmarks show through
         return frame
 
-    def close(self) -> None:
-        """Nothing to release."""
-
     def _observations(self) -> dict[str, np.ndarray]:
         observations = np.asarray(self._observe(self._state)[0], np.float32)
         return dict(zip(self.possible_agents, observations))
@@ -135,7 +142,7 @@ class SimpleSpreadParallel(ParallelEnv):
         return distance.min(1) - CONTACT_DISTANCE
 
 
-class SafeMuJoCoParallel(ParallelEnv):
+class SafeMuJoCoParallel(_Parallel):
     """A robot of `SafeMuJoCo` as `agent_0` .. `agent_{N-1}`.
 
     Observations are float64 (O,), actions torques in [-1, 1]^A (clipped), rewards shared. Every agent's info carries
@@ -146,21 +153,11 @@ class SafeMuJoCoParallel(ParallelEnv):
 
     def __init__(self, **options: Any):
         self.core = SafeMuJoCo(**options)
-        self.possible_agents = names = [f"agent_{i}" for i in range(self.core.n_agents)]
-        self.agents: list[str] = []
-        observation, state = (self.core.observed.shape[1],), (len(self.core.state_names),)
-        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, observation, np.float64) for a in names}
-        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (self.core.action_dim,), np.float32) for a in names}
-        self.state_space = spaces.Box(-np.inf, np.inf, state, np.float64)
+        sizes = self.core.n_agents, self.core.observed.shape[1], self.core.action_dim, len(self.core.state_names)
+        super().__init__(*sizes, np.float64)
         self._sim = self.core.simulate(1, threads=1)
         self._seeds: np.random.SeedSequence | None = None
         self._steps = 0
-
-    def observation_space(self, agent: str) -> spaces.Box:
-        return self.observation_spaces[agent]
-
-    def action_space(self, agent: str) -> spaces.Box:
-        return self.action_spaces[agent]
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
         """Start an episode; a seed fixes this one, as in safety-gymnasium, and all later ones."""
@@ -200,9 +197,6 @@ class SafeMuJoCoParallel(ParallelEnv):
 
     def render(self) -> None:
         """Draws nothing; videos come from the report."""
-
-    def close(self) -> None:
-        """Nothing to release."""
 
     def _observations(self) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, self._sim.observe()[0]))
