@@ -345,6 +345,8 @@ def main() -> None:
     trained.add_argument("parts", choices=tuple(LEVELS))
     trained.add_argument("--seed", type=int, default=0)
     trained.add_argument("--transitions", type=int, default=RobotsConfig.transitions)
+    trained.add_argument("--noise", type=float, help="std of the exploration noise, if it is to be another")
+    trained.add_argument("--averaged", type=float, help="decay of the average that snapshots are of, likewise")
     trained.add_argument("--level", choices=TIERS, default="good", help="end when this tier's level is passed")
     trained.add_argument("--out", type=Path, default=Path("runs/behaviour"))
     packed = what.add_parser("pack")
@@ -357,10 +359,15 @@ def main() -> None:
         for tier, card in pack(env, a.runs, a.out).items():
             print(tier, json.dumps(card["policies"]))
     else:
-        _train_and_keep(env, a.seed, a.transitions, a.level, a.out)
+        config = replace(config_for(env), transitions=a.transitions)
+        if a.noise is not None:
+            config = replace(config, learner=replace(config.learner, noise=a.noise))
+        if a.averaged is not None:
+            config = replace(config, averaged=a.averaged)
+        _train_and_keep(env, config, a.seed, a.level, a.out)
 
 
-def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, out: Path) -> None:
+def _train_and_keep(env: SafeMuJoCo, config: RobotsConfig, seed: int, level: str, out: Path) -> None:
     folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
     if folder.exists():
         raise UserError(f"'{folder}' exists already; delete it or give another --seed or --out.")
@@ -370,7 +377,7 @@ def _train_and_keep(env: SafeMuJoCo, seed: int, transitions: int, level: str, ou
         keep(snapshot, folder, time.perf_counter() - begun)
         print(f"{snapshot.seen:,} transitions, {snapshot.score:.0f}", flush=True)
 
-    train(env, replace(config_for(env), transitions=transitions), seed, progress, enough)
+    train(env, config, seed, progress, enough)
 
 
 if __name__ == "__main__":
