@@ -89,7 +89,17 @@ _ROBOTS = {
     "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=25.0),
 }
 # m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
-QUANTILE_LIMITS = {"halfcheetah_2x3-good": 7.903, "halfcheetah_2x3-medium": 2.197, "halfcheetah_2x3-poor": 1.026}
+QUANTILE_LIMITS = {
+    "halfcheetah_2x3-good": 7.903,
+    "halfcheetah_2x3-medium": 2.197,
+    "halfcheetah_2x3-poor": 1.026,
+    "ant_2x4-good": 2.673,
+    "ant_2x4-medium": 0.888,
+    "ant_2x4-poor": 9.0,
+    "ant_4x2-good": 4.059,
+    "ant_4x2-medium": 2.185,
+    "ant_4x2-poor": 0.562,
+}
 
 
 def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None, quantile: bool = False) -> Task:
@@ -108,11 +118,17 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
     )
 
 
-# The Ant's tiers (2x4: 2621.5, 1099.98, 437.67; 4x2: 2769.29, 1546.05, 542.73) follow with their behaviour policies.
+# Means of OG-MARL's sets (Formanek et al. 2023); it tells no deviations of the Ant's.
 _ROBOT_TIERS: tuple[tuple[Parts, str, float, float | None], ...] = (
     ("2x3", "good", 6924.11, 1270.0),
     ("2x3", "medium", 1485.0, 469.0),
     ("2x3", "poor", 400.45, 334.0),
+    ("2x4", "good", 2621.5, None),
+    ("2x4", "medium", 1099.98, None),
+    ("2x4", "poor", 437.67, None),
+    ("4x2", "good", 2769.29, None),
+    ("4x2", "medium", 1546.05, None),
+    ("4x2", "poor", 542.73, None),
 )
 
 TASKS = {

@@ -254,20 +254,16 @@ def shipped_policies(env: SafeMuJoCo, tier: str, folder: Path = POLICIES) -> lis
     return [BehaviourPolicy(one(k), packed.noise, packed.info) for k in range(count)]
 
 
-def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES) -> dict[str, dict]:
-    """Choose the policies of every tier among the snapshots of `runs` and write their files; returns their cards.
+def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES, tiers: tuple[str, ...] = TIERS) -> dict[str, dict]:
+    """Choose the policies of the tiers among the snapshots of `runs` and write their files; returns their cards.
 
     The runs take turns: of each, the snapshot whose return is nearest to the tier's level, then the next nearest, as
     long as it is within a tenth of it. Returns are of 32 episodes of the policy as it is stored, in half precision.
     """
     judge, cards = env.simulate(32), {}
-    for tier, level in LEVELS[env.parts].items():
-        found = [_nearest(env, judge, run, level) for run in runs]
-        turns = sorted(
-            (c for f in found for c in f),
-            key=lambda c: (abs(c.earned - level) > 0.1 * level, c.rank, abs(c.earned - level)),
-        )
-        chosen = turns[:MIXED]
+    for tier in tiers:
+        level = LEVELS[env.parts][tier]
+        chosen = _in_turns([c for run in runs for c in _nearest(env, judge, run, level)], level)[:MIXED]
         if len(chosen) < MIXED:
             raise CheckpointError(
                 f"The runs hold {len(chosen)} snapshots for '{tier}', {MIXED} are needed; train more."
@@ -294,9 +290,22 @@ class Candidate(NamedTuple):
     actors: Mlp
 
 
+def _in_turns(found: list[Candidate], level: float) -> list[Candidate]:
+    """Those within a tenth of the level, one of every run in turn, then the others, the nearest first."""
+
+    def place(c: Candidate) -> tuple:
+        gap = abs(c.earned - level)
+        return (False, c.rank, gap) if gap <= 0.1 * level else (True, 0, gap)
+
+    return sorted(found, key=place)
+
+
 def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]:
-    """The snapshots of a run that come nearest to a level: picked by the scores of training, then judged again."""
-    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))[: MIXED + 2]
+    """The snapshots of a run that come nearest to a level: picked by the scores of training, which are rough, and
+    judged again; of a run that never came near, the nearest few."""
+    rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))
+    close = sum(abs(s["score"] - level) <= 0.3 * level for s in rough)
+    rough = rough[: min(max(close, MIXED), 2 * MIXED)]
     judged = []
     for s in rough:
         actors = _halved(_load_snapshot(run / f"{s['seen']:07d}.npz"))
@@ -352,11 +361,12 @@ def main() -> None:
     packed = what.add_parser("pack")
     packed.add_argument("parts", choices=tuple(LEVELS))
     packed.add_argument("runs", type=Path, nargs="+")
+    packed.add_argument("--tiers", nargs="+", choices=TIERS, default=TIERS)
     packed.add_argument("--out", type=Path, default=POLICIES)
     a = parser.parse_args()
     env = SafeMuJoCo(a.parts)
     if a.what == "pack":
-        for tier, card in pack(env, a.runs, a.out).items():
+        for tier, card in pack(env, a.runs, a.out, tuple(a.tiers)).items():
             print(tier, json.dumps(card["policies"]))
     else:
         config = replace(config_for(env), transitions=a.transitions)
