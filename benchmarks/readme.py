@@ -64,6 +64,16 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+steady", "`split`, steady"),
     ("icbf", "mujoco+shielded", "**`split`, shielded**"),
 )
+IN_README = (
+    ("behaviour data", "reference"),
+    ("bc", "mujoco"),
+    ("ma-td3bc", "mujoco"),
+    ("omar", "mujoco"),
+    ("ma-td3bc-lag", "mujoco"),
+    ("madiff", "mujoco+shielded"),
+    ("icbf", "mujoco"),
+    ("icbf", "mujoco+shielded"),
+)
 # Pan et al. 2022, means as tabulated in MADIFF's repository; on the public files.
 PUBLISHED = {
     "published: MA-TD3+BC, public data": (1.083, 0.293, 0.154, 0.098),
@@ -81,6 +91,8 @@ def main() -> None:
     measured = grouped("mujoco")
     for protocol, ending in (("native", ""), ("quantile", "-quantile")):
         put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
+    short = [r for r in ROBOT_ROWS if (r[0], r[1]) in IN_README]
+    put("README.md", "robots", robots(measured, "", tuple(short)))
     put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
     put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.SUITES)))
     speed = []
@@ -101,12 +113,12 @@ def grouped(suite: str) -> dict:
     return groups
 
 
-def robots(groups: dict, ending: str) -> str:
+def robots(groups: dict, ending: str, shown: tuple = ROBOT_ROWS) -> str:
     """One line per method, one column per task that has results: return (normalised) / cost."""
     names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
     names = [name for name in names if any(task == name for task, *_ in groups)]
     lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
-    for algorithm, variant, label in ROBOT_ROWS:
+    for algorithm, variant, label in shown:
         found = [groups.get((name, algorithm, variant), []) for name in names]
         if any(found):
             cells = (cell(rows, "cost_mean", 1) if rows else "–" for rows in found)

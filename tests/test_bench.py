@@ -256,6 +256,8 @@ def test_what_reads_no_danger_is_trained_once(tmp_path):
 
 
 def test_the_table_of_the_paper_keeps_others_data_apart(made, tmp_path):
+    with pytest.raises(UserError, match="Neither .*nothing' is a results folder"):
+        paper.lines([tmp_path / "nothing"])
     table = paper.lines([made.out, tmp_path / "nothing"])
     assert len(table) == 13 * 3
     ours = [x for x in table if x.ours]

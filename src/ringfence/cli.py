@@ -435,7 +435,7 @@ def bench_paper(folder: Positional[Path] = Path("results")) -> None:
         for x in (x for x in lines if x.task == task):
             cells += [f"{v[0]:.2f}/{v[2]:.2f}" if v else "–" for v in (x.printed, x.ours)]
         table.add_row(name, *cells)
-    Console(highlight=False, width=max(out.width, 90)).print(table)
+    Console(highlight=False, width=max(out.width, 100)).print(table)
     print(paper.write(lines, folder / "paper.csv"))
 
 

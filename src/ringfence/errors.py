@@ -22,5 +22,5 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
     """`UserError` for a name that is not in `known`, suggesting the nearest one."""
     known = sorted(known)
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    hint = f"did you mean '{near[0]}'?" if near else "choose one of:"
-    return UserError(f"Unknown {kind} '{name}'; {hint} Known: {', '.join(known)}.")
+    hint = f"did you mean '{near[0]}'? Known:" if near else "choose one of:"
+    return UserError(f"Unknown {kind} '{name}'; {hint} {', '.join(known)}.")

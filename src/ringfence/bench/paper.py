@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from ringfence.bench.table import rows
+from ringfence.errors import UserError
 from ringfence.files import whole
 
 SUITES = ("simple_spread", "mujoco")  # whose results are read, in folders of these names
@@ -80,9 +81,14 @@ class Line:
 
 def lines(folders: Iterable[str | Path]) -> list[Line]:
     """The table from results folders; a task or method that they lack has no measured values."""
-    found: dict[tuple[str, str, str], list[dict]] = {}
+    folders, found = [Path(f) for f in folders], {}
+    if not any((f / "bench.json").exists() for f in folders):
+        names = " nor ".join(f"'{f}'" for f in folders)
+        raise UserError(
+            f"Neither {names} is a results folder; run `ringfence bench paper`, or name the folder it wrote."
+        )
     for folder in folders:
-        for r in rows(folder) if (Path(folder) / "bench.json").exists() else ():
+        for r in rows(folder) if (folder / "bench.json").exists() else ():
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
     out = []
     for task, (_, values) in PRINTED.items():

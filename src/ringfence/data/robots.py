@@ -364,6 +364,13 @@ def main() -> None:
     packed.add_argument("--tiers", nargs="+", choices=TIERS, default=TIERS)
     packed.add_argument("--out", type=Path, default=POLICIES)
     a = parser.parse_args()
+    try:
+        _run(a)
+    except UserError as error:
+        parser.exit(2, f"error: {error}\n")
+
+
+def _run(a: argparse.Namespace) -> None:
     env = SafeMuJoCo(a.parts)
     if a.what == "pack":
         for tier, card in pack(env, a.runs, a.out, tuple(a.tiers)).items():
