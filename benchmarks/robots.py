@@ -93,7 +93,7 @@ def main() -> None:
         for batch in (16, 256):
             name = f"{SafeMuJoCo(parts).name} batch={batch}"
             rows.append({"name": name, "value": rate(parts, batch, a.repeats), "unit": "env-steps/s"})
-    for task in ("halfcheetah_2x3-good",):
+    for task in ("halfcheetah_2x3-good", "ant_2x4-good"):
         seconds, peak, steps = collected(task, a.transitions)
         rows += [
             {"name": f"data make {task}, {steps:,} transitions", "value": seconds, "unit": "s"},
