@@ -117,6 +117,8 @@ def robots(groups: dict, ending: str, shown: tuple = ROBOT_ROWS) -> str:
     """One line per method, one column per task that has results: return (normalised) / cost."""
     names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
     names = [name for name in names if any(task == name for task, *_ in groups)]
+    if not names:
+        return "No results yet."
     lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     for algorithm, variant, label in shown:
         found = [groups.get((name, algorithm, variant), []) for name in names]

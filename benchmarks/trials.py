@@ -20,7 +20,19 @@ from ringfence.policies import PlanOptions
 from ringfence.runs import Run
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "mujoco.csv"
-FIELDS = ("task", "algorithm", "seed", "changes", "planner", "episodes", "return", "cost", "cost_cvar10", "seconds")
+FIELDS = (
+    "task",
+    "transitions",
+    "algorithm",
+    "seed",
+    "changes",
+    "planner",
+    "episodes",
+    "return",
+    "cost",
+    "cost_cvar10",
+    "seconds",
+)
 
 
 def differing(values: dict, defaults) -> str:
@@ -37,6 +49,7 @@ def rows_of(run: Run) -> list[dict]:
             found.append(
                 {
                     "task": r["task"],
+                    "transitions": told["data"].get("transitions"),
                     "algorithm": r["algorithm"],
                     "seed": r["seed"],
                     "changes": config,
