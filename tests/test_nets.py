@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,6 +51,17 @@ def test_agents_are_interchangeable_and_their_number_is_free(kind):
         np.testing.assert_allclose(apply(net, x[:, :, order], *rest), out[:, :, order], atol=2e-5)
         other = apply(net, x.at[:, :, 0].add(1.0), *rest)
         assert (np.abs(other - out)[:, :, 1:].max((1, 3)) > 1e-5).all()  # what one does reaches the others
+
+
+def test_limbs_of_one_body_are_told_apart():
+    """With a vector per agent the same window means something else for another agent; while it is 0, it does not."""
+    x, *rest = inputs(3)
+    plain = denoiser("attention")
+    for vectors, same in ((jnp.zeros((3, 16)), True), (jnp.eye(3, 16), False)):
+        net = eqx.tree_at(lambda n: n.which, plain, vectors, is_leaf=lambda leaf: leaf is None)
+        out = apply(net, x, *rest)
+        turned = apply(net, x[:, :, ::-1], *rest)[:, :, ::-1]
+        assert np.allclose(turned, out, atol=2e-5) == same
 
 
 @pytest.mark.parametrize("kind", ["attention", "unet"])
