@@ -462,7 +462,11 @@ def test_published_values_stand_beside_ours_and_apart(folder, tmp_path):
     omar = next(p for p in told["rows"] if p["name"] == "OMAR")
     assert omar["numbers"] == [114.9, 47.9] and omar["ours"] == []
     assert "on the public data files; ours are on regenerated data" in build_board(folder, tmp_path).read_text()
-    assert [p.name for p in PUBLISHED if matches(p, "ma-td3bc")] == ["MA-TD3+BC"]
+    assert {p.name for p in PUBLISHED if matches(p, "ma-td3bc")} == {"MA-TD3+BC"}
+    names = [p["name"] for p in told["rows"]]
+    assert len(names) == len(set(names)), "robots' values stay off this board"
+    robot = next(p for p in PUBLISHED if p.name == "BC" and "ant_2x4-good" in p.values)
+    assert robot.values["ant_2x4-good"] == pytest.approx(100 * (2697 + 325.6) / (3362.44 + 325.6), abs=0.05)
     assert not any(matches(p, "bc-safe") for p in PUBLISHED)
 
 

@@ -137,7 +137,7 @@ def test_behaviour_learning_is_reproducible():
 
 
 def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
-    """Runs take turns with their nearest snapshots, in half precision, with what they earn."""
+    """The nearest to a level, in half precision, with what they earn; within a tenth of it runs take turns."""
     env = SafeMuJoCo("4x2", episode_length=20)
     for k in range(4):
         for run in ("one", "two"):
@@ -146,7 +146,14 @@ def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
             robots.keep(robots.Snapshot(actors, 100 * (k + 1), 10.0 * k), tmp_path / run, 0.1)
     cards = robots.pack(env, [tmp_path / "one", tmp_path / "two"], tmp_path / "out")
     assert set(cards) == {"good", "medium", "poor"}
-    assert sorted(p["run"] for p in cards["good"]["policies"]) == ["one", "one", "two", "two"]
+    gaps = [abs(p["return"] - 2770.0) for p in cards["good"]["policies"]]
+    assert gaps == sorted(gaps) and {p["run"] for p in cards["good"]["policies"]} == {"one", "two"}
+    made = [
+        robots.Candidate(k, run, 0, e, None)
+        for run, es in (("a", (100, 101, 80)), ("b", (95,)))
+        for k, e in enumerate(es)
+    ]
+    assert [c.earned for c in robots._in_turns(made, 100.0)] == [100, 95, 101, 80]
     policies = robots.shipped_policies(env, "good", tmp_path / "out")
     assert len(policies) == 4 and policies[0].noise == 0.2 and policies[0].info["published_level"] == 2770.0
     first = cards["good"]["policies"][0]
