@@ -166,7 +166,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     return update
 
 
-# TD3+BC's own values (Fujimoto & Gu 2021) at sizes for a CPU; Safety-Gymnasium's cost limit.
+# TD3+BC's own values (Fujimoto & Gu 2021), but for layers, rate and updates, which are for a CPU; Safety-Gymnasium's
+# cost limit.
 _MUJOCO = {
     "width": 128,
     "batch": 256,

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ringfence import tasks
 from ringfence.bench.table import rows
 from ringfence.errors import UserError
 from ringfence.files import whole
@@ -64,7 +65,6 @@ OURS = {
     "OMAR": ("omar", ("",)),
     "ICBF": ("icbf", ("+guarded", "+shielded", "")),
 }
-PRESETS = ("split", "mujoco", "default", "expert", "medium", "medium-replay", "random")  # of rows that may stand there
 
 
 @dataclass(frozen=True)
@@ -92,8 +92,9 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
     out = []
     for task, (_, values) in PRINTED.items():
+        presets = ("split", *tasks.get(task).presets, "default")  # of rows that may stand there
         for (method, (algorithm, endings)), printed in zip(OURS.items(), values):
-            wanted = [preset + ending for ending in endings for preset in PRESETS]
+            wanted = [preset + ending for ending in endings for preset in presets]
             variant = next((v for v in wanted if (task, algorithm, v) in found), "")
             runs = found.get((task, algorithm, variant), [])
             ours = _summary(runs) if runs else None

@@ -4,7 +4,7 @@ OG-MARL's sets (Formanek et al. 2023) were made by training MATD3 to a level, ro
 noise of 0.2 on the actions, and mixing four such policies. The learner here reads the global state in its critic,
 which one team needs once, since everybody has the same reward.
 
-    python -m ringfence.data.robots train 2x3 --seed 0 --out runs/behaviour      # hours, for the snapshots
+    python -m ringfence.data.robots train 2x3 --seed 0 --out runs/behaviour      # half an hour to an hour
     python -m ringfence.data.robots pack 2x3 runs/behaviour/2x3-0                # the files that are shipped
 """
 
@@ -132,8 +132,8 @@ def train(
     progress: Callable[[Snapshot], None] | None = None,
     enough: float = np.inf,
 ) -> list[Snapshot]:
-    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise
-    0.2. Ends early when the last four earn `enough` on average."""
+    """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2. Ends early
+    when the last four earn `enough` on average."""
     b, n = config.robots, env.n_agents
     sim, judge = env.simulate(b), env.simulate(config.score_episodes)
     rng = np.random.default_rng(seed)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ringfence import tasks
+
 NOTE = "Published, on the public data files; ours are on regenerated data."
 
 
@@ -30,18 +32,13 @@ def _spread(expert: float, replay: float, medium: float, random: float) -> dict[
     }
 
 
-# Random and best return of OG-MARL's sets (Formanek et al. 2023), which normalise the robots' raw returns.
-_RANGE = {"halfcheetah_2x3": (-280.18, 9132.25), "ant_2x4": (-325.6, 3362.44), "ant_4x2": (-325.6, 3224.91)}
-
-
 def _robots(**raw: tuple[float, float, float]) -> dict[str, float]:
     """Raw returns of good, medium and poor by robot; no speed limit was known there, so both protocols show them."""
     found = {}
     for robot, returns in raw.items():
-        low, high = _RANGE[robot]
         for tier, value in zip(("good", "medium", "poor"), returns):
-            for protocol in ("", "-quantile"):
-                found[f"{robot}-{tier}{protocol}"] = round(100 * (value - low) / (high - low), 1)
+            for name in (f"{robot}-{tier}", f"{robot}-{tier}-quantile"):
+                found[name] = round(100 * tasks.get(name).normalised_return(value), 1)
     return found
 
 
