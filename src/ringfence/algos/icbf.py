@@ -106,8 +106,16 @@ _PAPER = {
     "weigh_by_signal": False,
 }
 # A thousand steps forgive no outlier, so robots need a denoiser that is fitted well; and where nearly all data is fast,
-# a strong barrier leaves nothing to imitate.
-_MUJOCO = {"steps": 6000, "width": 192, "barrier_weight": 0.3, "barrier_batch": 32, "bank_batch": 64}
+# a strong barrier leaves nothing to imitate. The return-to-go tells the policies of a mixed log apart; a window's
+# advantage does not, and the average of plans of a poor one and a good one stands still.
+_MUJOCO = {
+    "steps": 6000,
+    "width": 192,
+    "condition": "return",
+    "barrier_weight": 0.3,
+    "barrier_batch": 32,
+    "bank_batch": 64,
+}
 PRESETS: dict[str, dict] = {
     "split": {},
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
@@ -556,7 +564,7 @@ MADIFF = Algorithm(
     make_policy,
     {
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
-        "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0, "condition": "return"},
+        "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
     heeds_danger=False,
