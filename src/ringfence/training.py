@@ -185,23 +185,22 @@ def make_program(job: Job):
         return update(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
 
     def advance(state, roots, arrays, count):
-        several = lambda s: jax.vmap(one, in_axes=(0, 0, None))(s, roots, arrays)  # noqa: E731
-        if roots.shape[0] == 1:  # no vmap of one: its matrix products would be batched ones, which are slower
-
-            def several(s):
-                out = one(jax.tree.map(lambda x: x[0], s), roots[0], arrays)
-                return jax.tree.map(lambda x: x[None], out)
-
-        shapes = jax.eval_shape(several, state)[1]
+        # No vmap of one seed: its matrix products would be batched ones, which are slower; and no axis of one within
+        # the loop, for which the compiler would copy the whole state at every update.
+        alone = roots.shape[0] == 1
+        several, known = (one, roots[0]) if alone else (jax.vmap(one, in_axes=(0, 0, None)), roots)
+        state = jax.tree.map(lambda x: x[0], state) if alone else state
+        shapes = jax.eval_shape(several, state, known, arrays)[1]
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, jnp.float32), shapes)
 
         def body(_, carry):
             state, total = carry
-            state, metrics = several(state)
+            state, metrics = several(state, known, arrays)
             return state, jax.tree.map(jnp.add, total, metrics)
 
         state, total = jax.lax.fori_loop(0, count, body, (state, zeros))
-        return state, jax.tree.map(lambda x: x / jnp.maximum(count, 1), total)
+        means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), total)
+        return jax.tree.map(lambda x: x[None], (state, means)) if alone else (state, means)
 
     def diagnose(state, roots, arrays):
         def of(state, root):
