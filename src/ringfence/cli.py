@@ -348,40 +348,39 @@ def bench(
         memory: GiB that a worker may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
-    from ringfence.bench import SUITES, make_grid, paper, run_local
-    from ringfence.errors import unknown
+    from ringfence.bench import make_grid, paper
 
-    def run(suite: str, folder: Path, only: list[str], of: list[str]) -> bool:
-        grid = make_grid(suite, folder, seeds=seeds, episodes=episodes, only_tasks=of, only=only, steps=steps)
-        if engine == "ray":
-            from ringfence.bench.cluster import run_ray
-
-            counts = run_ray(grid, address=address, threads=threads)
-        else:
-            counts = run_local(grid, workers=workers, threads=threads, memory=memory)
+    root, parts = out_dir or Path("results"), {suite: tasks}
+    if suite == "paper":
+        parts, algorithms = paper.parts(tasks), algorithms or list(paper.METHODS)
+    elif out_dir is None:
+        root = root / suite
+    complete = True
+    for part, names in parts.items():
+        folder = root / part if suite == "paper" else root
+        grid = make_grid(part, folder, seeds=seeds, episodes=episodes, only_tasks=names, only=algorithms, steps=steps)
+        counts = _run_grid(grid, engine, workers, threads, memory, address)
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
-        if counts["done"] and suite == wanted:
+        if counts["done"] and suite != "paper":
             bench_results(folder)
         if counts["failed"] or counts["to do"]:
             bench_status(folder)
-        return counts["failed"] + counts["to do"] == 0
-
-    wanted = suite
-    if suite != "paper":
-        if not run(suite, out_dir or Path("results") / suite, algorithms, tasks):
-            sys.exit(1)
-        return
-    root, whole = out_dir or Path("results"), True
-    for name in tasks:
-        if name not in paper.PRINTED:
-            raise unknown("task of the paper", name, paper.PRINTED)
-    for part in paper.SUITES:
-        mine = [t for t in SUITES[part].tasks if t in (tasks or paper.PRINTED)]
-        if mine:
-            whole &= run(part, root / part, algorithms or list(paper.METHODS), mine)
-    bench_paper(root)
-    if not whole:
+            complete = False
+    if suite == "paper":
+        bench_paper(root)
+    if not complete:
         sys.exit(1)
+
+
+def _run_grid(grid, engine: str, workers: int | None, threads: int, memory: float | None, address: str | None) -> dict:
+    """Cells by state after the run."""
+    if engine == "ray":
+        from ringfence.bench.cluster import run_ray
+
+        return run_ray(grid, address=address, threads=threads)
+    from ringfence.bench import run_local
+
+    return run_local(grid, workers=workers, threads=threads, memory=memory)
 
 
 def bench_status(folder: Positional[Path]) -> None:
@@ -425,7 +424,7 @@ def bench_paper(folder: Positional[Path] = Path("results")) -> None:
     """
     from ringfence.bench import paper
 
-    lines = paper.lines(folder / name for name in paper.SUITES)
+    lines = paper.lines(folder / name for name in paper.FOLDERS)
     table = Table(Column("reward/cost", no_wrap=True), box=box.SIMPLE, padding=(0, 0, 0, 1))
     for method in paper.OURS:
         for whose in (f"{method}\npaper", "\nours"):

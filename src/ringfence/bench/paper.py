@@ -15,11 +15,12 @@ from pathlib import Path
 import numpy as np
 
 from ringfence import tasks
+from ringfence.bench.suites import SUITES
 from ringfence.bench.table import rows
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.files import whole
 
-SUITES = ("simple_spread", "mujoco")  # whose results are read, in folders of these names
+FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
 METHODS = ("ma-td3bc", "omar", "icbf")
 # The paper's rows: its name of a task, ours, and (reward, deviation, cost, deviation) of MA-TD3BC, OMAR and its own
 # method. "md" is the one tier of Simple Spread that is left: medium-replay.
@@ -65,6 +66,15 @@ OURS = {
     "OMAR": ("omar", ("",)),
     "ICBF": ("icbf", ("+guarded", "+shielded", "")),
 }
+
+
+def parts(only: Iterable[str] = ()) -> dict[str, list[str]]:
+    """The paper's tasks, or those named, by the suite that holds them."""
+    for name in only:
+        if name not in PRINTED:
+            raise unknown("task of the paper", name, PRINTED)
+    found = {suite: [t for t in SUITES[suite].tasks if t in (only or PRINTED)] for suite in FOLDERS}
+    return {suite: names for suite, names in found.items() if names}
 
 
 @dataclass(frozen=True)
