@@ -78,6 +78,15 @@ def test_every_suite_names_algorithms_and_presets_that_exist():
         assert len({c.id for c in g.cells}) == len(g.cells)
 
 
+def test_entries_are_chosen_by_algorithm_or_preset(tmp_path):
+    def presets(only):
+        g = make_grid("mujoco", tmp_path, seeds=1, only_tasks=["ant_2x4-good"], only=only)
+        return [(c.algorithm, c.preset) for c in g.cells]
+
+    assert presets(["icbf"]) == [("icbf", "mujoco-paper"), ("icbf", "mujoco")]
+    assert presets(["icbf:mujoco", "bc"]) == [("bc", "mujoco"), ("icbf", "mujoco")]
+
+
 def test_table(made):
     found = rows(made.out)
     ours = [r for r in found if r["variant"] != "reference"]

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
-from ringfence.bench.suites import EVALUATIONS, SUITES, Entry, Suite
+from ringfence.bench.suites import EVALUATIONS, SUITES
 from ringfence.data.make import make
 from ringfence.errors import UserError, unknown
 from ringfence.files import whole
@@ -187,30 +187,25 @@ def make_grid(
     episodes = chosen.episodes if episodes is None else episodes
     if seeds < 1 or episodes < 1:
         raise UserError(f"seeds={seeds} and episodes={episodes} must be at least 1.")
-    entries = _chosen_entries(chosen, tuple(only))
-    names = tuple(only_tasks) or chosen.tasks
+    names, only = tuple(only_tasks) or chosen.tasks, tuple(only)
     for name in names:
         if name not in chosen.tasks:
             raise unknown(f"task of the suite {suite}", name, chosen.tasks)
+    known = {name for task in chosen.tasks for e in chosen.entries for name in e.names(tasks.get(task))}
+    for name in only:
+        if name not in known:
+            raise unknown("entry", name, known)
     changes = () if steps is None else (("steps", steps),)
     cells = []
     for name in names:
         task = tasks.get(name)
-        for e in entries:
-            if e.tiers and task.tier not in e.tiers:
+        for e in chosen.entries:
+            if (e.tiers and task.tier not in e.tiers) or (only and not set(only) & set(e.names(task))):
                 continue
             played = tuple((e.variant(task, v), v) for v in e.evaluations)
             preset = e.preset_for(task)
             cells += [Cell(name, e.algorithm, preset, k, changes, played, transitions) for k in range(seeds)]
     return Grid(Path(out), suite, tuple(cells), episodes)
-
-
-def _chosen_entries(suite: Suite, only: tuple[str, ...]) -> list[Entry]:
-    known = {e.name for e in suite.entries} | {e.algorithm for e in suite.entries}
-    for name in only:
-        if name not in known:
-            raise unknown("entry", name, known)
-    return [e for e in suite.entries if not only or e.name in only or e.algorithm in only]
 
 
 def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, Cell], None]) -> None:

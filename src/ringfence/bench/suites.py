@@ -33,6 +33,10 @@ class Entry:
     def preset_for(self, task: Task) -> str:
         return self.preset or algos.get(self.algorithm).preset_for(task.presets)
 
+    def names(self, task: Task) -> tuple[str, str]:
+        """What the entry is called where entries are chosen."""
+        return self.algorithm, f"{self.algorithm}:{self.preset_for(task)}"
+
     def variant(self, task: Task, evaluation: str) -> str:
         """The name of an evaluation in results.json."""
         preset = self.preset_for(task)
