@@ -85,16 +85,18 @@ def main() -> None:
     groups = grouped("simple_spread")
     put("README.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
-    put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv"))
+    put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv", "simple_spread-medium"))
     put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
     draw(groups, ROOT / "docs" / "images" / "return-cost.png")
     measured = grouped("mujoco")
     for protocol, ending in (("native", ""), ("quantile", "-quantile")):
         put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
+    robots_searched = searched(RESULTS / "tuning" / "robots.csv", "halfcheetah_2x3-medium-quantile")
+    put("docs/benchmark.md", "robots-search", robots_searched)
     short = [r for r in ROBOT_ROWS if (r[0], r[1]) in IN_README]
     put("README.md", "robots", robots(measured, "", tuple(short)))
     put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
-    put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.SUITES)))
+    put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
         speed += [(r["name"], r["value"], r["unit"], r["command"]) for r in json.loads(file.read_text())]
@@ -128,15 +130,18 @@ def robots(groups: dict, ending: str, shown: tuple = ROBOT_ROWS) -> str:
     return "\n".join(lines)
 
 
-def searched(file: Path) -> str:
-    """One line per setting tried on the medium tier."""
-    lines = ["| algorithm | setting | changes | norm. return | cost |", "|---|---|---|---|---|"]
+def searched(file: Path, task: str) -> str:
+    """One line per setting tried on the task."""
+    if not file.exists():
+        return "No results yet."
+    lines = ["| algorithm | setting | changes | return | norm. return | cost |", "|---|---|---|---|---|---|"]
     with open(file) as f:
-        rows = [r for r in csv.DictReader(f) if r["task"].endswith("-medium")]
-    for r in rows:
+        rows = [r for r in csv.DictReader(f) if r["task"] == task]
+    for r in sorted(rows, key=lambda r: (r["algorithm"], int(r["setting"]))):
         told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
-        name = f"{r['algorithm']} {r['preset']}".strip()
-        lines.append(f"| `{name}` | {r['setting']} | {told} | {float(r['return_norm']):.3f} | {float(r['cost']):.2f} |")
+        name, gain, cost = f"{r['algorithm']} {r['preset']}".strip(), float(r["return"]), float(r["cost"])
+        norm = float(r["return_norm"])
+        lines.append(f"| `{name}` | {r['setting']} | {told} | {gain:.0f} | {norm:.3f} | {cost:.2f} |")
     return "\n".join(lines)
 
 
