@@ -88,18 +88,17 @@ _ROBOTS = {
     "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=25.0),
     "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=25.0),
 }
-# m/s: the 60th percentile of the step speed in a tier's own data, as regenerated with seed 0, in full (HalfCheetah) or
-# with 200 000 transitions (Ant).
+# m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
 QUANTILE_LIMITS = {
     "halfcheetah_2x3-good": 7.903,
     "halfcheetah_2x3-medium": 2.197,
     "halfcheetah_2x3-poor": 1.026,
-    "ant_2x4-good": 2.673,
-    "ant_2x4-medium": 0.888,
-    "ant_2x4-poor": 0.244,
-    "ant_4x2-good": 4.059,
-    "ant_4x2-medium": 2.185,
-    "ant_4x2-poor": 0.562,
+    "ant_2x4-good": 2.671,
+    "ant_2x4-medium": 0.894,
+    "ant_2x4-poor": 0.252,
+    "ant_4x2-good": 4.044,
+    "ant_4x2-medium": 2.253,
+    "ant_4x2-poor": 0.528,
 }
 
 
