@@ -130,15 +130,16 @@ def robots_short(groups: dict) -> str:
     return "\n".join([*lines, "", f"Cells: {told}."])
 
 
-def robots(groups: dict, ending: str, shown: tuple = ROBOT_ROWS) -> str:
+def robots(groups: dict, ending: str) -> str:
     """One line per method, one column per task that has results: return (normalised) / cost."""
     names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
     names = [name for name in names if any(task == name for task, *_ in groups)]
     if not names:
         return "No results yet."
     lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
-    for algorithm, variant, label in shown:
-        found = [groups.get((name, algorithm, variant), []) for name in names]
+    for algorithm, variant, label in ROBOT_ROWS:
+        bound = variant.replace("mujoco", "mujoco-quantile", 1)  # preset of whoever has one for the quantile limits
+        found = [groups.get((n, algorithm, variant)) or groups.get((n, algorithm, bound), []) for n in names]
         if any(found):
             cells = (cell(rows, "cost_mean", 1) if rows else "–" for rows in found)
             lines.append(f"| {label} | " + " | ".join(cells) + " |")

@@ -107,7 +107,7 @@ STUDIES = {
             ("ma-cql", ""): [{"cql_weight": 1.0}, {"cql_weight": 10.0}, {"steps": 12_000}],
             ("omar", ""): [{"cql_weight": 1.0}, {"coefficient": 0.7}, {"steps": 12_000}],
             ("madiff", ""): [{"lr": 1e-3}, {"discount": 0.99}, {"width": 128}],
-            ("icbf", ""): [{"barrier_weight": 3.0}, {"discount": 0.99}, {"condition": "advantage"}],
+            ("icbf", "mujoco"): [{"barrier_weight": 3.0}, {"discount": 0.99}, {"condition": "advantage"}],
         },
         "robots.csv",
         planner="shielded",

@@ -79,12 +79,14 @@ def test_every_suite_names_algorithms_and_presets_that_exist():
 
 
 def test_entries_are_chosen_by_algorithm_or_preset(tmp_path):
-    def presets(only):
-        g = make_grid("mujoco", tmp_path, seeds=1, only_tasks=["ant_2x4-good"], only=only)
+    def presets(task, only):
+        g = make_grid("mujoco", tmp_path, seeds=1, only_tasks=[task], only=only)
         return [(c.algorithm, c.preset) for c in g.cells]
 
-    assert presets(["icbf"]) == [("icbf", "mujoco-paper"), ("icbf", "mujoco")]
-    assert presets(["icbf:mujoco", "bc"]) == [("bc", "mujoco"), ("icbf", "mujoco")]
+    assert presets("ant_2x4-good", ["icbf"]) == [("icbf", "mujoco-paper"), ("icbf", "mujoco")]
+    assert presets("ant_2x4-good", ["icbf:mujoco", "bc"]) == [("bc", "mujoco"), ("icbf", "mujoco")]
+    limit_binds = presets("ant_2x4-good-quantile", ["icbf", "bc"])
+    assert limit_binds == [("bc", "mujoco"), ("icbf", "mujoco-paper"), ("icbf", "mujoco-quantile")]
 
 
 def test_table(made):
