@@ -252,12 +252,11 @@ def mean(rows: list[dict], key: str) -> float:
 
 def cell(rows: list[dict], cost: str = "avoidable_cost", digits: int = 3) -> str:
     """Return ± deviation between seeds (normalised) / cost."""
-    column = lambda key: np.array([float(r[key]) for r in rows])  # noqa: E731
-    returns = column("return_mean")
+    returns = np.array([float(r["return_mean"]) for r in rows])
     spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
     made = sum(r["variant"] != "reference" for r in rows)
     spread += f" [{made} seed{'s' * (made > 1)}]" if 0 < made < SEEDS else ""
-    return f"{returns.mean():.0f}{spread} ({column('return_norm').mean():.2f}) / {column(cost).mean():.{digits}f}"
+    return f"{returns.mean():.0f}{spread} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
 
 
 def put(file: str, name: str, text: str) -> None:

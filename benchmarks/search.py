@@ -57,9 +57,8 @@ class Study:
     file: str
     planner: str = "plain"
     safe: tuple[str, ...] = SAFE  # ranked by the rule of the leaderboard
-    further: dict[str, tuple[str, ...]] = field(
-        default_factory=dict
-    )  # tasks on which settings 0, 1 and 4 were tried, too
+    # Algorithm -> tasks on which settings 0, 1 and 4 were tried, too.
+    further: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 STUDIES = {

@@ -175,7 +175,8 @@ def test_tasks_and_their_limits(name):
     policies = robots.shipped_policies(task.env, task.tier)
     assert len(policies) == robots.MIXED and policies[0].info["level"] == task.tier
     earned = np.mean([p["return"] for p in policies[0].info["policies"]])
-    assert earned == pytest.approx(task.published_return[0], rel=0.15), "the levels of the public sets"
+    rel = 0.15 if name.startswith("ant_2x4-poor") else 0.1
+    assert earned == pytest.approx(task.published_return[0], rel=rel), "the levels of the public sets"
     assert task.hazard.limit == task.env.limit
     if task.protocol == "quantile":
         assert task.env.limit == tasks.QUANTILE_LIMITS[name.removesuffix("-quantile")]
