@@ -26,6 +26,7 @@ TIERS = ("expert", "medium", "medium-replay", "random")
 ANY = ""  # the one plain variant of an algorithm, whose preset may be named after the tier
 ROWS = (
     ("behaviour data", "reference", "behaviour data"),
+    ("data within the limit", "reference", "its episodes within the limit"),
     ("do-nothing", "reference", "do nothing"),
     ("random actions", "reference", "random actions"),
     ("bc", ANY, "BC"),
@@ -48,6 +49,7 @@ ROBOTS = ("halfcheetah_2x3", "ant_2x4", "ant_4x2")
 LEVELS = ("good", "medium", "poor")
 ROBOT_ROWS = (
     ("behaviour data", "reference", "behaviour data"),
+    ("data within the limit", "reference", "its episodes within the limit"),
     ("do-nothing", "reference", "do nothing"),
     ("bc", "mujoco", "BC"),
     ("bc-safe", "mujoco", "BC on the cheapest episodes"),
@@ -68,6 +70,7 @@ BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.
 IN_README = (
     ("behaviour data", "reference", "data"),
+    ("data within the limit", "reference", "data within the limit"),
     ("bc", "mujoco", "BC"),
     ("bc-safe", "mujoco", "BC on the cheapest episodes"),
     ("ma-td3bc", "mujoco", "MA-TD3+BC"),

@@ -1,5 +1,6 @@
 """The grid: cells are made once, survive whatever happens to the runner, and make one honest table."""
 
+import dataclasses
 import json
 import os
 import signal
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from ringfence import evaluate
+from ringfence import evaluate, reference, tasks
 from ringfence.bench import cells as grid
 from ringfence.bench import local, make_grid, paper, rows, run_local, suites, write_csv
 from ringfence.errors import UserError
@@ -264,6 +265,21 @@ def test_what_reads_no_danger_is_trained_once(tmp_path):
     grid.make_reference(names[0], g.out, 1, 1000)
     told = [Run(c.folder(g.out)).config for c in g.cells]
     assert [t["task"] for t in told] == names and told[0]["hazard"]["limit"] > told[1]["hazard"]["limit"]
+
+
+def test_reference_rows_tell_the_data_from_its_safe_part(small_store, tmp_path):
+    task = tasks.get("simple_spread-random")
+    found = reference.make(task, small_store, tmp_path, 2)
+    safe = small_store.episode_costs <= task.cost_limit
+    assert 0 < safe.sum() < small_store.episodes
+    assert found["behaviour data"]["return_mean"] == pytest.approx(small_store.returns.mean())
+    part = found["data within the limit"]
+    assert part["episodes"] == safe.sum() and part["cost_mean"] <= task.cost_limit
+    assert part["return_mean"] == pytest.approx(small_store.returns[safe].mean())
+    assert reference.make(task, small_store, tmp_path, 2) == json.loads(json.dumps(found))  # as it was kept
+    # a limit that no logged episode keeps: the row is missing, not empty
+    none = dataclasses.replace(task, cost_limit=-1.0)
+    assert list(reference.make(none, small_store, tmp_path, 2)) == ["behaviour data", "do-nothing", "random actions"]
 
 
 def test_the_table_of_the_paper_keeps_others_data_apart(made, tmp_path):

@@ -1,4 +1,4 @@
-"""The rows that every table needs: the behaviour data itself, doing nothing, acting at random."""
+"""The rows that every table needs: the behaviour data itself and its safe part, doing nothing, acting at random."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ringfence.tasks import Task
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
 FILE = "reference.json"
+SAFE = "data within the limit"
 
 
 class Behaviour(eqx.Module):
@@ -31,8 +32,9 @@ class Behaviour(eqx.Module):
         return memory, PolicyStep(self.policy.act(observations, key), {})
 
 
-def of_data(store: EpisodeStore, task: Task) -> dict:
-    """The protocol's numbers of the logged episodes themselves (their own resets, not the test resets)."""
+def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict:
+    """The protocol's numbers of the logged episodes themselves (their own resets, not the test resets), or of those
+    that `kept` (E,) names."""
     length = int(store.lengths.max())
     pad = np.arange(length) < store.lengths[:, None]
     rewards, costs = np.zeros(pad.shape), np.zeros(pad.shape)
@@ -42,23 +44,31 @@ def of_data(store: EpisodeStore, task: Task) -> dict:
         starts = unsafe_starts(task, store.state[first])
     else:
         starts = np.zeros(store.episodes, bool)
-    result = summarise({"rewards": rewards, "costs": costs}, task, starts)
+    kept = np.ones(store.episodes, bool) if kept is None else kept
+    result = summarise({"rewards": rewards[kept], "costs": costs[kept]}, task, starts[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
 
 def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:
-    """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes."""
+    """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes.
+
+    Where no logged episode is within the cost limit, the row of those that are is missing.
+    """
     file = Path(out) / task.name / FILE
+    safe = store.episode_costs <= task.cost_limit
     if file.exists():
         known = read_json(file, "is damaged; delete it")
-        if known.get("do-nothing", {}).get("episodes") == episodes and known["behaviour data"]["data"] == store.card:
+        same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()
+        if same and known["behaviour data"]["data"] == store.card:
             return known
     spec = task.spec(task.feature_map("pruned"))
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
     if isinstance(task.env, SimpleSpread) and task.tier in behaviour.TARGETS:  # robots' tiers mix several policies
         policies["behaviour policy"] = Behaviour(behaviour.shipped_policy(task.tier))
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
+    if safe.any():
+        rows[SAFE] = of_data(store, task, safe)
     for name, policy in policies.items():
         rows[name], _ = evaluate_policy(policy, task, episodes, label=name, quiet=quiet)
     write_json(file, rows)

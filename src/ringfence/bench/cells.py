@@ -1,7 +1,7 @@
 """Cells of a grid: content-addressed run folders that are made once, resumed when cut short, and never made twice.
 
 DIR/bench.json                                      suite, protocol and the number of episodes
-DIR/reference/<task>/reference.json                 do-nothing, random actions, the data itself
+DIR/reference/<task>/reference.json                 do-nothing, random actions, the data and its safe part
 DIR/cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   a run folder (runs.py), and status.json
 """
 
