@@ -1,6 +1,7 @@
 """The command line: what it prints, what it refuses, and the whole job from data to page."""
 
 import json
+import sys
 
 import pytest
 
@@ -48,6 +49,22 @@ def test_refuses_in_one_sentence(arguments, message, capsys, tmp_path, monkeypat
     told = capsys.readouterr().err
     assert stop.value.code == 2 and message in told and "Traceback" not in told
     assert not list(tmp_path.iterdir())
+
+
+def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
+    folder = tmp_path / "[bold]" / "[" / "abs]"
+    folder.mkdir(parents=True)
+    (folder / "metadata.json").write_text("{}")
+    with pytest.raises(SystemExit):
+        main(["data", "import-ogmarl", str(folder), "--task", "ant_2x4", "--out", str(tmp_path / "x.h5")])
+    assert "[bold]/[/abs]/metadata.json' is damaged" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "tensorstore", None)  # as if it were not installed
+    with pytest.raises(SystemExit):
+        main(["data", "import-ogmarl", str(folder), "--task", "ant_2x4", "--out", str(tmp_path / "x.h5")])
+    assert "run pip install 'ringfence[vault]'" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["data", "import-madiff", str(folder), "--task", "ant_2x4", "--out", str(tmp_path / "x.h5")])
+    assert "[bold]/[/abs]' lacks obs.npy" in capsys.readouterr().err
 
 
 def test_the_whole_job(tmp_path, monkeypatch, capsys):

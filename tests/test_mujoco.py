@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ringfence.envs.mujoco as simulator
-from ringfence.envs.mujoco import DT, SafeMuJoCo
+from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.pettingzoo import SafeMuJoCoParallel
 from ringfence.errors import UserError
 
@@ -81,6 +81,7 @@ def test_masses_and_margins():
     cheetah, ant = SafeMuJoCo("2x3").model(), SafeMuJoCo("2x4").model()
     assert cheetah.body_mass.sum() == pytest.approx(14.0)
     assert ant.body_mass.sum() == pytest.approx(0.91088, abs=1e-4)
+    assert set(ant.geom_margin) == {0.005 if VERSION >= (3, 5) else 0.01}
 
 
 def test_an_ant_at_rest_stands_where_it_used_to():
@@ -137,6 +138,9 @@ def test_actions_are_clipped_and_bad_input_is_refused(monkeypatch):
         sim.step(np.full((1, 2, 3), size))
         states.append(sim.state())
     np.testing.assert_array_equal(*states)
+    for wrong in ((1, 2, 1), (1, 3, 2), (2, 2, 3)):
+        with pytest.raises(UserError, match=r"halfcheetah_2x3 takes \(1, 2, 3\)"):
+            sim.step(np.zeros(wrong))
     with pytest.raises(UserError, match="2 seeds for 1 robots"):
         sim.reset([0, 1])
     with pytest.raises(UserError, match="did you mean"):
@@ -190,11 +194,12 @@ def test_live_against_gymnasium_robotics(parts, tmp_path, monkeypatch):
         place = data.xpos[1, :2][None].copy() if env.ant else None
         ours.restore(data.qpos[None], data.qvel[None], data.qacc_warmstart[None], place)
         action = rng.uniform(-1, 1, (env.n_agents, env.action_dim)).astype(np.float32)
-        seen, reward, *_, info = theirs.step(dict(zip(theirs.possible_agents, action)))
+        seen, reward, ended, _, info = theirs.step(dict(zip(theirs.possible_agents, action)))
         out = ours.step(action[None])
         told = np.stack([seen[a] for a in theirs.possible_agents])
         np.testing.assert_allclose(ours.observe()[0], told, rtol=0, atol=1e-5)
         assert out.reward[0] == pytest.approx(reward[theirs.possible_agents[0]], abs=1e-6)
-        velocity = info[theirs.possible_agents[0]]["x_velocity"]
-        assert out.speed[0] >= abs(velocity) - 1e-6 and DT == 0.05
+        told = info[theirs.possible_agents[0]]
+        assert out.speed[0] == pytest.approx(np.hypot(told["x_velocity"], told.get("y_velocity", 0.0)), abs=1e-6)
+        assert out.terminated[0] == ended[theirs.possible_agents[0]]
     theirs.close()

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from ringfence import evaluate, tasks, training
 from ringfence.data import EpisodeStore, ogmarl
+from ringfence.data.audit import audit
 from ringfence.data.ogmarl import import_madiff, import_vault
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import StoreError, UserError
@@ -15,21 +18,34 @@ from ringfence.errors import StoreError, UserError
 TASKS = {"halfcheetah_2x3": "2x3", "ant_2x4": "2x4", "ant_4x2": "4x2"}
 
 
-def recorded(parts: str, episodes: int = 3, length: int = 20) -> dict[str, np.ndarray]:
-    """Flat logs of random episodes: state and action of every step, its reward and cost, and where episodes end."""
+def recorded(parts: str, episodes: int = 3, length: int = 20, jump: bool = False) -> dict[str, np.ndarray]:
+    """Flat logs of random episodes: state and action of every step, its reward and cost, and where episodes end.
+
+    The first robot starts too fast; with `jump` the last one leaps out of the Ant's healthy heights.
+    """
     env = SafeMuJoCo(parts)
     sim, rng = env.simulate(episodes, threads=1), np.random.default_rng(0)
     sim.reset([(3, k) for k in range(episodes)])
-    rows = []
+    qpos, qvel = sim._robots.qpos.copy(), sim._robots.qvel.copy()
+    qvel[0, : 2 if env.ant else 1] += 4.0  # across, too
+    qvel[-1, 2] += 8.0 * jump
+    sim.restore(qpos, qvel)
+    rows = [[] for _ in range(episodes)]
+    fallen = np.zeros(episodes, bool)
     for _ in range(length):
         action = rng.uniform(-1, 1, (episodes, env.n_agents, env.action_dim)).astype(np.float32)
-        state = sim.state().astype(np.float32)
+        state, on = sim.state().astype(np.float32), sim.running.copy()
         out = sim.step(action)
-        rows.append((state, action, out.reward, out.cost))
-    state, action, reward, cost = (np.stack(x, 1).reshape(episodes * length, *x[0].shape[1:]) for x in zip(*rows))
-    last = np.tile(np.arange(length) == length - 1, episodes)
+        fallen |= out.terminated
+        for k in np.flatnonzero(on):
+            rows[k].append((state[k], action[k], out.reward[k], out.cost[k], out.speed[k]))
+    lengths = np.array([len(r) for r in rows])
+    state, action, reward, cost, speed = (np.stack(x) for x in zip(*[step for r in rows for step in r]))
+    last = np.zeros(len(state), bool)
+    last[np.cumsum(lengths) - 1] = True
     rewards = np.repeat(reward[:, None], env.n_agents, 1).astype(np.float32)
-    return {"state": state, "actions": action, "rewards": rewards, "costs": cost, "last": last}
+    told = {"costs": cost, "speed": speed, "last": last, "lengths": lengths, "fallen": fallen}
+    return {"state": state, "actions": action, "rewards": rewards, **told}
 
 
 def write_vault(folder, log, reverse=False, states=None, pad=False):
@@ -86,42 +102,105 @@ def write_madiff(folder, log, parts, reverse=True):
     np.save(folder / "obs.npy", np.concatenate([number, seen], -1).astype(np.float32))
     np.save(folder / "actions.npy", log["actions"][..., ::-1] if reverse else log["actions"])
     np.save(folder / "rewards.npy", log["rewards"])
-    np.save(folder / "path_lengths.npy", np.full(log["last"].sum(), steps // log["last"].sum()))
+    np.save(folder / "path_lengths.npy", log["lengths"])
     return folder
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_vault_becomes_the_simulators_own_data(tmp_path, task):
-    env, log = SafeMuJoCo(TASKS[task]), recorded(TASKS[task])
+    env = SafeMuJoCo(TASKS[task])
+    log = recorded(TASKS[task], jump=env.ant)
     extra = np.zeros((len(log["state"]), 84 if env.ant else 0))
     vault = write_vault(tmp_path, log, reverse=not env.ant, states=np.concatenate([log["state"], extra], 1), pad=True)
     store = import_vault(vault, task)
-    assert (store.episodes, store.lengths.tolist()) == (3, [19, 19, 19])
-    inside = ~log["last"]
-    np.testing.assert_allclose(store.actions, log["actions"][inside], atol=1e-6)
-    np.testing.assert_array_equal(store.state[:20], log["state"][:20])
+    assert (store.episodes, store.lengths.tolist()) == (3, log["lengths"].tolist())
+    np.testing.assert_allclose(store.actions, log["actions"], atol=1e-6)
+    first = log["lengths"][0]
+    np.testing.assert_array_equal(store.state[:first], log["state"][:first])
     np.testing.assert_array_equal(store.observations, store.state[:, env.observed])
-    assert (store.costs == log["costs"][inside]).mean() > 0.97  # vy is an approximation
-    assert store.truncated.sum() == 3 and not store.terminated.any()
+    # what the last action led to: one more step, since nothing else is recorded between
+    sim = env.simulate(1, threads=1)
+    planar = 2 if env.ant else 1
+    before = log["state"][first - 1][None].astype(np.float64)
+    n = (15 if env.ant else 9) - planar
+    sim.restore(np.concatenate([np.zeros((1, planar)), before[:, :n]], 1), before[:, n:])
+    sim.step(log["actions"][first - 1][None])
+    np.testing.assert_allclose(store.state[first], sim.state()[0], atol=1e-5)
+    # vy is an approximation, vx is not
+    assert log["costs"].sum() >= 3 and (store.costs == log["costs"]).mean() > 0.95
+    assert store.terminated[store.episode_ends - 1].tolist() == log["fallen"].tolist()
+    assert store.terminated.sum() == log["fallen"].sum() == env.ant
     assert store.card["task"] == f"{task}-good"
     told = " ".join(store.card["warnings"])
     assert ("actions are as recorded" if env.ant else "actions are reversed") in told
+    assert ("1 of 3 episodes end with a fall" in told) == env.ant
     again = EpisodeStore.load(store.save(tmp_path / "store.h5"))
     assert again.hazard.limit == env.limit
+    facts, warnings = audit(again)
+    assert "(native); at most 25 steps" in facts["speed limit"] and warnings[: len(store.card["warnings"])]
+    assert facts["return ceiling"].startswith(f"{store.card['return_ceiling']:.0f} within the limit")
+
+
+def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
+    """Recordings are called Replay, or anything: their robot can still be played."""
+    vault = write_vault(tmp_path, recorded("2x3"))
+    vault.rename(tmp_path / "replay")
+    store = import_vault(tmp_path / "replay", "halfcheetah_2x3")
+    task = tasks.from_store(store)
+    assert task.name == "halfcheetah_2x3-replay" and task.env == SafeMuJoCo("2x3", 3.227)
+    assert (task.cost_limit, task.return_max, task.presets) == (25.0, 9132.25, ("mujoco",))
+    small = {"steps": 2, "batch": 4, "width": 8}
+    (run,) = training.train("bc", store, out=tmp_path / "runs", changes=small, quiet=True)
+    job, policy = evaluate.load(run)
+    assert job.task.env.limit == 3.227
+    played, _ = evaluate.evaluate_policy(policy, replace(job.task, env=SafeMuJoCo("2x3", 3.227, 5)), 1, "test", 0)
+    assert played["task"] == "halfcheetah_2x3-replay" and np.isfinite(played["return_norm"])
+    # a store of that name without the robot's states is anybody's own data
+    own = replace(store, state=None, card={**store.card, "state_names": []})
+    assert tasks.from_store(own).env is None
+
+
+def test_contact_forces_are_found_where_they_were_charged(tmp_path):
+    log = recorded("4x2")
+    contact = np.random.default_rng(0).uniform(0, 1, (len(log["state"]), 78)) * 3  # clipped at 1 where it is charged
+    after = np.append(contact[1:], contact[-1:], 0)
+    log["rewards"] -= (5e-4 * np.clip(after, -1, 1) ** 2).sum(1, keepdims=True).astype(np.float32) * 10
+    states = np.concatenate([log["state"], contact], 1)
+    with pytest.raises(StoreError, match="rewards are not this robot's, the speed that they tell is"):
+        import_vault(write_vault(tmp_path / "a", log, states=states), "ant_4x2")
+    log["rewards"] += (5e-4 * np.clip(after, -1, 1) ** 2).sum(1, keepdims=True).astype(np.float32) * 9
+    store = import_vault(write_vault(tmp_path / "b", log, states=states), "ant_4x2")
+    assert "contact forces charged" in " ".join(store.card["warnings"])
+
+
+def test_rewards_that_were_scaled_and_rows_out_of_order_are_refused(tmp_path):
+    log = recorded("2x3")
+    shared = {**log, "rewards": log["rewards"] / 2}
+    with pytest.raises(StoreError, match=r"speed that they tell is [\d.]+ m/s off .* undo any scaling or sharing"):
+        import_vault(write_vault(tmp_path / "a", shared), "halfcheetah_2x3")
+    mixed = {k: x.copy() for k, x in log.items()}
+    mixed["state"][10:14] = mixed["state"][10:14][::-1]
+    with pytest.raises(StoreError, match="% of replayed steps miss .* the first of them step 9; .* not consecutive"):
+        import_vault(write_vault(tmp_path / "b", mixed), "halfcheetah_2x3")
+    loud = {**log, "actions": log["actions"] * 1.5}
+    loud["rewards"] = log["rewards"] + 0.1 * (log["actions"] ** 2 - loud["actions"] ** 2).sum((1, 2))[:, None]
+    with pytest.raises(StoreError, match="misses the recorded state by"):  # it was driven by smaller actions
+        import_vault(write_vault(tmp_path / "c", loud), "halfcheetah_2x3")
 
 
 def test_costs_of_a_fast_cheetah_are_exact(tmp_path):
     log = recorded("2x3")
-    log["rewards"][5] += 4.0  # as if it had been 4 m/s faster
+    log["rewards"][45] += 4.0  # as if it had been 4 m/s faster
     store = import_vault(write_vault(tmp_path, log), "halfcheetah_2x3")
-    assert store.costs[5] == 1 and store.costs.sum() == 1
+    log["costs"][45] = 1.0
+    np.testing.assert_array_equal(store.costs, log["costs"])
 
 
 def test_madiffs_cheetah_has_its_state_back(tmp_path):
     log = recorded("2x3")
     store = import_madiff(write_madiff(tmp_path / "good", log, "2x3"), "halfcheetah_2x3")
     np.testing.assert_allclose(store.state[:20], log["state"][:20], atol=1e-6)
-    np.testing.assert_allclose(store.actions, log["actions"][~log["last"]], atol=1e-6)
+    np.testing.assert_allclose(store.actions, log["actions"], atol=1e-6)
     assert store.card["task"] == "halfcheetah_2x3-good"
 
 
@@ -129,7 +208,12 @@ def test_madiffs_ant_says_what_it_lacks(tmp_path):
     log = recorded("4x2")
     store = import_madiff(write_madiff(tmp_path / "medium", log, "4x2", reverse=False), "ant_4x2")
     assert store.state is None and store.observations.shape[1:] == (4, 33)
-    assert "cannot be recovered" in " ".join(store.card["warnings"])
+    told = " ".join(store.card["warnings"])
+    assert "cannot be recovered" in told and "order of actions are taken as recorded" in told
+    assert store.lengths.tolist() == [19, 19, 19] and "falls are not marked" in told
+    vx = log["rewards"].mean(1) - 1.0 + 0.5 * (log["actions"] ** 2).sum((1, 2))
+    np.testing.assert_array_equal(store.costs, (abs(vx) > 2.418)[~log["last"]])
+    assert tasks.from_store(store).env is None
     assert store.hazard.features == ("torso.vx",) and store.card["task"] == "ant_4x2-medium-observations"
 
 
@@ -151,6 +235,14 @@ def test_other_robots_and_damaged_files_are_refused(tmp_path):
     padded["state"][7, 3] = -np.inf
     with pytest.raises(StoreError, match="state of step 7 is not finite"):
         import_vault(write_vault(tmp_path / "d", padded), "halfcheetah_2x3")
+    short = {**log, "rewards": log["rewards"][:, :1]}
+    with pytest.raises(StoreError, match="rewards has shape"):
+        import_vault(write_vault(tmp_path / "e", short), "halfcheetah_2x3")
+    torn = write_vault(tmp_path / "f", log)
+    for blob in torn.glob("d/*"):  # as an interrupted download leaves them
+        blob.write_bytes(blob.read_bytes()[: blob.stat().st_size // 2])
+    with pytest.raises(StoreError, match="is missing or damaged"):
+        import_vault(torn, "halfcheetah_2x3")
     (vault / "metadata.json").write_text(json.dumps({"version": 1.2}))
     with pytest.raises(StoreError, match="metadata.json' is damaged"):
         import_vault(vault, "halfcheetah_2x3")

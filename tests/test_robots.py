@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import ringfence.envs.mujoco as simulator
 from ringfence import evaluate, features, hazards, tasks
 from ringfence.data import matd3, robots
 from ringfence.data.make import make
@@ -102,7 +103,8 @@ class Wait(Push):
         return memory, PolicyStep(jnp.zeros((*observations.shape[:2], 4)), {})
 
 
-def test_rollouts_stop_where_the_robot_falls():
+def test_rollouts_stop_where_the_robot_falls(monkeypatch):
+    monkeypatch.setattr(simulator, "HEALTHY_Z", (0.6, 1.0))  # it soon comes to rest below
     env = SafeMuJoCo("4x2", episode_length=150)
     played = evaluate.rollout(Push(), env, 6)
     assert played["rewards"].shape == played["costs"].shape == (6, 150)
@@ -111,8 +113,10 @@ def test_rollouts_stop_where_the_robot_falls():
     np.testing.assert_array_equal(again["rewards"], played["rewards"][:3])  # a reset is the same in any batch
     other = evaluate.rollout(Push(), env, 3, split="validation")
     assert not np.array_equal(other["states"][:, 0], played["states"][:3, 0])
-    for rewards, states in zip(played["rewards"], played["states"]):
-        end = len(rewards) if rewards[-1] else int(np.flatnonzero(rewards)[-1]) + 1
+    ends = [int(np.flatnonzero(r)[-1]) + 1 for r in played["rewards"]]
+    assert max(ends) < 150 and len(set(ends)) > 1
+    for end, rewards, states in zip(ends, played["rewards"], played["states"]):
+        assert states[end, 0] < 0.6 and (states[:end, 0] >= 0.6).all()
         assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
 
 
@@ -197,6 +201,8 @@ def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
         and "not the public" in card["provenance"]
     )
     assert sum(card["episodes_of_policy"]) == store.episodes and len(card["policies"]) == 4
+    with pytest.raises(UserError, match="size=0"):
+        make(task, 0)
     native, _ = make(replace(task, name="x", env=replace(task.env, speed_limit=0.01)), 300)
     np.testing.assert_array_equal(native.actions, store.actions)  # limits change labels alone
     assert native.costs.mean() > store.costs.mean()
@@ -214,8 +220,10 @@ def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
 
     env = SafeMuJoCo("2x4", episode_length=10)
     played = evaluate.rollout(Wait(), env, 1)
+    states, costs = played["states"][0], played["costs"][0]
+    fallen = np.concatenate([states, np.repeat(states[-1:], 30, 0)])  # the film ends there
     try:
-        file = animate(env, played["states"][0], played["costs"][0], tmp_path / "ant.gif")
+        file = animate(env, fallen, np.pad(costs, (0, 30)), tmp_path / "ant.gif")
     except UserError as error:  # no way to draw on this machine
         assert "install EGL" in str(error) and not list(tmp_path.iterdir())
         return
@@ -228,6 +236,7 @@ def test_the_floor_goes_on_where_the_robot_runs_far(tmp_path):
 
     env = SafeMuJoCo("2x3", episode_length=40)
     states = np.zeros((41, 17), np.float32)
+    states[:, 0] = np.linspace(0, 0.01, 41)
     states[:, env.state_names.index("torso.vx")] = 100.0  # 200 m in all; the model's floor ends after 40
     try:
         file = animate(env, states, np.zeros(40), tmp_path / "far.gif")

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 import tyro
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Column, Table
 
 from ringfence.errors import UserError
@@ -53,7 +54,7 @@ def make(
     from ringfence.data.make import make
 
     store, path = make(tasks.get(task), size, seed, out_file)
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
 
 
 def import_omar(directory: Positional[Path], out_file: Annotated[Path, tyro.conf.arg(name="out")]) -> None:
@@ -103,9 +104,9 @@ def import_madiff(
 
 
 def _imported(store, file: Path) -> None:
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True, markup=False)
     for note in store.card["warnings"]:
-        out.print(f"[yellow]note[/] {note}", soft_wrap=True)
+        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
 
 
 def info(file: Positional[Path]) -> None:
@@ -115,9 +116,9 @@ def info(file: Positional[Path]) -> None:
 
     report = audit(EpisodeStore.load(file))
     for name, value in report.facts.items():
-        out.print(f"{name:24} {value}", soft_wrap=True)
+        out.print(f"{name:24} {value}", soft_wrap=True, markup=False)
     for warning in report.warnings:
-        out.print(f"[yellow]warning[/] {warning}", soft_wrap=True)
+        out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
 
 
 def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
@@ -226,18 +227,18 @@ def evaluate(
     )
     found = _runs(runs)
     if video:
-        from ringfence import tasks
+        from ringfence.evaluate import load_job
         from ringfence.report.video import check, film
 
-        for name in {run.config["task"] for run in found}:
-            check(tasks.get(name))
+        for run in {run.config["task"]: run for run in found}.values():
+            check(load_job(run).task)
         record = max(record, 1)
     for run in found:
         r = run_evaluation(run, episodes=episodes, split=split, planner=planner, record=record, quiet=False, **given)
         if video:
             print(film(run, r["variant"]))
         table.add_row(
-            str(run.path),
+            escape(str(run.path)),
             r["variant"],
             f"{r['return_mean']:.1f}",
             f"{r['cost_mean']:.3f}",
@@ -390,7 +391,7 @@ def bench_status(folder: Positional[Path]) -> None:
     table = Table("task", "run", "state", "train s", "eval s", "why")
     for s in statuses(folder):
         seconds = [f"{s[k]:.0f}" if k in s else "" for k in ("train_seconds", "eval_seconds")]
-        table.add_row(s["task"], s["run"], s["state"], *seconds, s.get("error", ""))
+        table.add_row(s["task"], s["run"], s["state"], *seconds, escape(s.get("error", "")))
     out.print(table)
 
 
@@ -495,7 +496,7 @@ def main(arguments: list[str] | None = None) -> None:
                 args=arguments,
             )
     except UserError as error:
-        Console(stderr=True, highlight=False).print(f"[red]error:[/] {error}", soft_wrap=True, markup=True)
+        Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)

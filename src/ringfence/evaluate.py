@@ -204,7 +204,9 @@ def load_job(run: Run) -> training.Job:
     spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
     if told["feature_map"] is None:
         # Danger is what the run's data said it is, as in training.
-        task = dataclasses.replace(tasks.get(told["task"]), hazard=hazards.from_dict(told["hazard"]))
+        task = tasks.simulated(told["task"], hazards.from_dict(told["hazard"]))
+        if task is None:
+            raise unknown("task", told["task"], tasks.TASKS)
         feature_map = task.feature_map(config.view)
     else:
         card = told["data"]

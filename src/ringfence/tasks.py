@@ -82,11 +82,12 @@ def _spread(tier: str, mean: float, deviation: float, transitions: int = 1_000_0
     )
 
 
-# OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return; Safety-Gymnasium's cost limit.
-_ROBOTS = {
-    "2x3": dict(return_min=-280.18, return_max=9132.25, cost_limit=25.0),
-    "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=25.0),
-    "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=25.0),
+ROBOT_COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
+# OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return.
+_ROBOTS: dict[Parts, dict[str, float]] = {
+    "2x3": dict(return_min=-280.18, return_max=9132.25, cost_limit=ROBOT_COST_LIMIT),
+    "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=ROBOT_COST_LIMIT),
+    "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=ROBOT_COST_LIMIT),
 }
 # m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
 QUANTILE_LIMITS = {
@@ -157,11 +158,27 @@ def twin(name: str) -> str | None:
     return other if other != name else None
 
 
+def simulated(name: str, hazard: hazards.Hazard) -> Task | None:
+    """The task of that name with the danger that its data defines; None where there is no simulator for it.
+
+    `halfcheetah_2x3-replay` and the like, tiers that are not of this package, are played by their robot.
+    """
+    if name in TASKS:
+        return replace(TASKS[name], hazard=hazard)
+    robot, _, tier = name.partition("-")
+    for parts, constants in _ROBOTS.items():
+        env = SafeMuJoCo(parts, hazard.limit if isinstance(hazard, hazards.SpeedLimit) else None)
+        if tier and robot == env.name:
+            return Task(name, env, hazard, tier=tier, presets=("mujoco",), **constants)
+    return None
+
+
 def from_store(store: EpisodeStore) -> Task:
     """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
     name = store.card["task"]
-    if name in TASKS:  # danger is what the data says it is
-        return replace(TASKS[name], hazard=store.hazard)
+    task = simulated(name, store.hazard)  # danger is what the data says it is
+    if task is not None and (name in TASKS or store.card["state_names"] == list(task.env.state_names)):
+        return task
     returns = store.returns
     low, high = float(returns.min()), float(returns.max())
     return Task(

@@ -98,7 +98,6 @@ def _optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
 
 
-_MUJOCO = {"steps": 8_000}
 BC = Algorithm(
     "bc",
     Config,
@@ -107,12 +106,12 @@ BC = Algorithm(
     make_update,
     make_diagnose,
     make_policy,
-    {"default": {}, "mujoco": _MUJOCO},
+    {"default": {}, "mujoco": {"steps": 8_000}},
     heeds_danger=False,
 )
 BC_SAFE = replace(
     BC,
     name="bc-safe",
-    presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, **_MUJOCO}},
+    presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, "steps": 20_000}},
     heeds_danger=True,
 )

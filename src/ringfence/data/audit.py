@@ -40,7 +40,13 @@ def audit(store: EpisodeStore) -> Audit:
         f"{card['action_high']:g}",
         "ended by": f"{int(s.terminated.sum()):,} terminations, {int(s.truncated.sum()):,} truncations",
     }
-    warnings = []
+    if "speed_quantiles" in card:
+        spread = ", ".join(f"{100 * float(q):g} %: {v:.2f}" for q, v in card["speed_quantiles"].items())
+        limit = f"{card['speed_limit']:g} m/s ({card['protocol']})"
+        facts["speed limit"] = f"{limit}; at most {card['cost_limit']:g} steps of an episode may be above it"
+        facts["speed, quantiles"] = f"{spread} m/s"
+        facts["return ceiling"] = f"{card['return_ceiling']:.0f} within the limit, unless faster than all this data"
+    warnings = list(card.get("warnings", []))
     starts = _unsafe_starts(store)
     if starts is not None:
         facts["episodes starting unsafe"] = f"{100 * starts.mean():.2f} %"

@@ -31,7 +31,7 @@ def make(
     """(store, its file). `transitions` (default: the full size) is rounded up to whole episodes."""
     if task.env is None:
         raise UserError(f"Task '{task.name}' has no simulator to regenerate data with; import its files instead.")
-    transitions = transitions or task.transitions
+    transitions = task.transitions if transitions is None else transitions
     if transitions < 1 or seed < 0:
         raise UserError(f"size={transitions} and seed={seed} must be a positive size and a seed of 0 or more.")
     if isinstance(task.env, SimpleSpread):  # whose episodes all have one length
@@ -79,15 +79,13 @@ def _robot(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
     card |= {
         "simulator": f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}",
         "protocol": task.protocol,
-        "speed_limit": env.limit,
-        "cost_limit": task.cost_limit,
+        "size": transitions,  # asked for; episodes are whole
         "transitions": len(played["rewards"]),
         "collected": f"{len(policies)} MATD3 policies of the level {task.tier}, Gaussian action noise "
         f"{policies[0].noise:g}, as many steps of each",
         "policies": policies[0].info["policies"],
         "episodes_of_policy": np.bincount(played["policy"], minlength=len(policies)).tolist(),
-        "speed_quantiles": {str(q): float(np.quantile(played["speed"], q)) for q in (0.05, 0.25, 0.5, 0.6, 0.75, 0.95)},
-        "return_ceiling": env.return_ceiling(task.cost_limit, float(played["speed"].max())),
+        **env.describe(played["speed"], task.cost_limit),
         "observation_names": list(env.observation_names),
     }
     return EpisodeStore.from_steps(

@@ -8,10 +8,11 @@ Both were recorded with the old multi-agent MuJoCo, whose observations are not t
   is learned from them, and speed means |vx|;
 * the order of HalfCheetah's actions differs between versions of the old code. One step is replayed in the simulator
   with each order; the one that reproduces the next state is taken, and a data set that neither reproduces is refused;
-* what an episode's last action led to is not recorded, so that step is dropped; an episode that ended at the time
-  limit was truncated, whatever its flags say;
-* the speed follows from the reward, vx = r + 0.1 ‖a‖² (HalfCheetah) or r − 1 + 0.5 ‖a‖² (Ant); vy is the mean of both
-  ends' of a step, 0.01 m/s off in the median.
+* what an episode's last action led to is not recorded. Where there are states it is replayed in the simulator, which
+  also tells an Ant's fall from a time limit; the flags do not. Where there are none, the step is dropped;
+* the speed follows from the reward, vx = r + 0.1 ‖a‖² (HalfCheetah) or r − 1 + 0.5 ‖a‖² (Ant, and what contact forces
+  cost where they were charged); vy is the mean of both ends' of a step, 0.01 m/s off in the median. The replay checks
+  vx, since rewards may have been scaled or shared out.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 import json
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,13 +29,18 @@ import numpy as np
 from ringfence import hazards
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, mujoco
+from ringfence.envs.mujoco import Outcome
 from ringfence.errors import StoreError, unknown
+from ringfence.tasks import ROBOT_COST_LIMIT
 
 ROBOTS = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
 TIER = re.compile(r"(?<![a-z])(good|medium|poor|expert|replay)(?![a-z])", re.IGNORECASE)
 REPLAYED = 256  # steps that are replayed to find the order of actions
 AGREES = 0.05  # median over replayed steps of the largest error in the state; the wrong order has errors of 1 to 10
+STRAY, STRAYS = 1.0, 0.05  # a replayed step that misses by more is a stray; the share of them that is allowed
+SPEED_AGREES = 0.1  # m/s, median over replayed steps of the error of the speed that the reward tells
+CONTACT = 5e-4  # of the squared contact forces, which some versions of the Ant charge
 
 
 @dataclass
@@ -42,6 +49,7 @@ class Log:
 
     where: str
     state: np.ndarray | None  # (T, S) in the layout of SafeMuJoCo
+    contact: np.ndarray | None  # (T, F) contact forces, where the states hold them
     observations: np.ndarray | None  # (T, N, O), where there is no state
     actions: np.ndarray  # (T, N, A)
     rewards: np.ndarray  # (T, N)
@@ -51,30 +59,41 @@ class Log:
 def import_vault(vault: str | os.PathLike, task: str) -> EpisodeStore:
     """The store of a Vault, e.g. `2halfcheetah.vlt/Good`; `task`: halfcheetah_2x3, ant_2x4 or ant_4x2."""
     env, vault = _robot(task), Path(vault)
-    arrays = _read_vault(vault)
+    wanted = ("actions", "rewards", "terminals", "truncations", "infos.state")
+    arrays = _read_vault(vault, wanted)
     where = f"Vault '{vault}'"
-    for name in ("actions", "rewards", "terminals", "truncations", "infos.state"):
+    for name in wanted:
         if name not in arrays:
             raise StoreError(
                 f"{where} holds no '{name}'; only recordings with actions, rewards and states can be read."
             )
     sequences, steps = arrays["actions"].shape[:2]
+    _shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
     state = arrays["infos.state"]
     state = state[:, :, 0] if state.ndim == 4 else state  # some copies repeat it for every agent
-    _shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
     s = len(env.state_names)
     known = {17} if not env.ant else {27, 105, 111}
-    if state.shape[-1] not in known:
+    if state.ndim != 3 or state.shape[-1] not in known:
         raise StoreError(
             f"{where} has states of {state.shape[-1]} entries; known layouts of {task} have "
             f"{', '.join(str(k) for k in sorted(known))} (positions but the planar place, velocities, contact forces)."
         )
-    flags = (arrays["terminals"] > 0) | (arrays["truncations"] > 0)
-    last = flags.reshape(sequences, steps, -1).any(-1)
-    last[:, -1] |= True  # nothing after a sequence's end belongs to it
+    for name in ("rewards", "terminals", "truncations"):  # of every agent, or of the team
+        if arrays[name].ndim == 2:
+            arrays[name] = np.repeat(arrays[name][..., None], env.n_agents, -1)
+        _shape(where, name, arrays[name], (sequences, steps, env.n_agents))
+    last = ((arrays["terminals"] > 0) | (arrays["truncations"] > 0)).any(-1)
+    open_ = int((~last[:, -1]).sum())
+    last[:, -1] = True  # nothing after a sequence's end belongs to it
     flat = lambda x: x.reshape(sequences * steps, *x.shape[2:])  # noqa: E731
-    log = Log(where, flat(state[..., :s]), None, flat(arrays["actions"]), flat(arrays["rewards"]), last.ravel())
-    return _store(log, env, task, f"imported from an OG-MARL Vault, '{vault}'", _tier(vault))
+    contact = flat(state[..., s:]) if state.shape[-1] > s else None
+    log = Log(
+        where, flat(state[..., :s]), contact, None, flat(arrays["actions"]), flat(arrays["rewards"]), last.ravel()
+    )
+    notes = (
+        [f"{open_} episodes at the end of a recording have no end of their own and count as cut off"] if open_ else []
+    )
+    return _store(log, env, task, f"imported from an OG-MARL Vault, '{vault}'", _tier(vault), notes)
 
 
 def import_madiff(directory: str | os.PathLike, task: str) -> EpisodeStore:
@@ -96,8 +115,8 @@ def import_madiff(directory: str | os.PathLike, task: str) -> EpisodeStore:
     last[np.cumsum(lengths) - 1] = True
     obs = obs[:, :, n:]
     state = _cheetah_state(where, obs) if not env.ant else None
-    log = Log(where, state, None if state is not None else obs, actions, rewards, last)
-    return _store(log, env, task, f"imported from MADIFF's arrays in {where}", _tier(directory))
+    log = Log(where, state, None, None if state is not None else obs, actions, rewards, last)
+    return _store(log, env, task, f"imported from MADIFF's arrays in {where}", _tier(directory), [])
 
 
 def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
@@ -110,8 +129,8 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
     return np.column_stack([z, pitch, position, vx, vz, vpitch, velocity])
 
 
-def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str) -> EpisodeStore:
-    for name in ("state", "observations", "actions", "rewards"):
+def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, notes: list[str]) -> EpisodeStore:
+    for name in ("state", "contact", "observations", "actions", "rewards"):
         x = getattr(log, name)
         if x is not None and not np.isfinite(x).all():
             row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
@@ -123,7 +142,6 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str) -> 
     ends = np.flatnonzero(log.last) + 1
     total = int(ends[-1])
     lengths = np.diff(ends, prepend=0)
-    notes = ["the last step of every episode was dropped: what it led to is not recorded"]
     if total < len(log.actions):
         notes.append(f"the last {len(log.actions) - total} steps are an unfinished episode and were dropped")
     if (lengths > env.episode_length).any():
@@ -131,79 +149,158 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str) -> 
             f"{log.where} has an episode of {lengths.max()} steps, {task} ends after {env.episode_length}; "
             "its ends are marked wrongly."
         )
-    keep = np.ones(total, bool)
-    keep[ends - 1] = False
-    long_enough = lengths > 1
-    actions = np.clip(log.actions[:total], -1.0, 1.0).astype(np.float64)
-    rewards = log.rewards[:total].astype(np.float64).mean(-1)
-    order, told = np.arange(env.action_dim), ""
-    if log.state is not None:
-        order, told = _action_order(log, env, actions, np.flatnonzero(keep))
-        notes.append(told)
-    actions = actions[:, :, order]
-    effort = (actions**2).sum((1, 2))
-    vx = rewards - 1.0 + 0.5 * effort if env.ant else rewards + 0.1 * effort
-    speed, seen = np.abs(vx), ("torso.vx",)
-    if env.ant and log.state is not None:
-        at = env.state_names.index("torso.vy")
-        vy = (log.state[:total, at] + np.append(log.state[1:total, at], 0.0)) / 2
-        speed, seen = np.hypot(vx, vy), ("torso.vx", "torso.vy")
-    elif env.ant:
-        notes.append(
-            "vy, height and orientation are in no observation and cannot be recovered: costs and hazard read |vx| "
-            "alone, and the simulator cannot evaluate what is learned from this data"
-        )
-    x = log.state[:total].astype(np.float32) if log.state is not None else log.observations[:total].astype(np.float32)
+    beyond = float((np.abs(log.actions[:total]) > 1 + 1e-3).mean())
+    if beyond:
+        notes.append(f"{100 * beyond:.2g} % of action entries are beyond ±1 and were clipped, as the robot does")
+    made = (_from_states if log.state is not None else _from_observations)(log, env, ends, notes)
+    short = int((lengths < env.episode_length).sum() - made["terminated"].sum())
+    if env.ant and short:
+        notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
     name = f"{task}-{tier}" if log.state is not None else f"{task}-{tier}-observations"
-    observations = x[:, env.observed] if log.state is not None else x
-    final = np.flatnonzero(log.last[:total])[long_enough]
+    speed, seen = made.pop("speed"), made.pop("seen")
     card = {
         "task": name,
         "simulator": "multiagent_mujoco 1.1, MuJoCo 2.1",
         "provenance": provenance,
         "agents": [f"agent{i}" for i in range(env.n_agents)],
-        "observation_names": list(env.observation_names if log.state is not None else _old_names(x.shape[2], env)),
+        "observation_names": made.pop("names"),
         "state_names": list(env.state_names) if log.state is not None else [],
         "hazard": hazards.to_dict(hazards.SpeedLimit(env.limit, seen)),
         "episode_length": env.episode_length,
         "warnings": notes,
+        "protocol": "native",
+        **env.describe(speed, ROBOT_COST_LIMIT),
     }
-    return EpisodeStore.from_steps(
-        observations[keep],
-        actions[keep],
-        rewards[keep],
-        episode_ends=np.cumsum(lengths[long_enough] - 1),
-        final_observations=observations[final],
-        costs=(speed > env.limit)[keep],
-        state=x[keep] if log.state is not None else None,
-        final_state=x[final] if log.state is not None else None,
-        card=card,
+    return EpisodeStore.from_steps(**made, costs=speed > env.limit, card=card)
+
+
+def _forward_speed(log: Log, env: SafeMuJoCo, total: int, contact: bool = False) -> np.ndarray:
+    """(T,) vx of every step, from its reward. Contact forces are those after the step."""
+    effort = (log.actions[:total].astype(np.float64) ** 2).sum((1, 2))  # as recorded: what was charged
+    vx = log.rewards[:total].astype(np.float64).mean(-1) + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
+    if contact:
+        after = np.append(log.contact[1:total], log.contact[total - 1 : total], 0)
+        vx += CONTACT * (np.clip(after, -1.0, 1.0) ** 2).sum(1)
+    return vx
+
+
+def _from_states(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> dict:
+    """Arrays of a store whose episodes end with what the simulator says their last action led to."""
+    total, at = int(ends[-1]), ends - 1
+    actions = np.clip(log.actions[:total], -1.0, 1.0).astype(np.float64)
+    inside = np.ones(total, bool)
+    inside[at] = False
+    order, vx = _replay(log, env, actions, np.flatnonzero(inside), notes)
+    actions = actions[:, :, order]
+    outcome, final = _one_step(env, log.state[at], actions[at])
+    notes.append(
+        "what the last action of every episode led to is not recorded: it was replayed in the simulator"
+        + (f", in which {int(outcome.terminated.sum())} of {len(ends)} episodes end with a fall" if env.ant else "")
     )
+    state, final = log.state[:total].astype(np.float32), final.astype(np.float32)
+    speed, seen = np.abs(vx), ("torso.vx",)
+    if env.ant:
+        k = env.state_names.index("torso.vy")
+        after = np.append(state[1:, k], 0.0)
+        after[at] = final[:, k]
+        speed, seen = np.hypot(vx, (state[:, k] + after) / 2), ("torso.vx", "torso.vy")
+    return {
+        "observations": state[:, env.observed],
+        "actions": actions,
+        "rewards": log.rewards[:total].astype(np.float64).mean(-1),
+        "episode_ends": ends,
+        "final_observations": final[:, env.observed],
+        "state": state,
+        "final_state": final,
+        "terminated": outcome.terminated,
+        "speed": speed,
+        "seen": seen,
+        "names": list(env.observation_names),
+    }
 
 
-def _action_order(log: Log, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, str]:
-    """(order of an agent's action entries, what was found), by replaying single steps in the simulator."""
-    steps = np.random.default_rng(0).permutation(steps)[:REPLAYED]
+def _from_observations(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> dict:
+    """Arrays of a store without states; the last step of every episode is missing."""
+    notes += [
+        "the last step of every episode was dropped: what it led to is not recorded, and falls are not marked",
+        "vy, height and orientation are in no observation and cannot be recovered: costs and hazard read |vx| "
+        "alone, and the simulator cannot evaluate what is learned from this data",
+        "without states nothing could be replayed: rewards and the order of actions are taken as recorded",
+    ]
+    total, lengths = int(ends[-1]), np.diff(ends, prepend=0)
+    keep = np.ones(total, bool)
+    keep[ends - 1] = False
+    if not keep.any():
+        raise StoreError(f"{log.where} holds no episode of two steps or more.")
+    x = log.observations[:total].astype(np.float32)
+    return {
+        "observations": x[keep],
+        "actions": np.clip(log.actions[:total], -1.0, 1.0)[keep],
+        "rewards": log.rewards[:total].astype(np.float64).mean(-1)[keep],
+        "episode_ends": np.cumsum(lengths[lengths > 1] - 1),
+        "final_observations": x[ends[lengths > 1] - 1],
+        "terminated": np.zeros(int((lengths > 1).sum()), bool),
+        "speed": np.abs(_forward_speed(log, env, total))[keep],
+        "seen": ("torso.vx",),
+        "names": _old_names(x.shape[2], env),
+    }
+
+
+def _one_step(env: SafeMuJoCo, state: np.ndarray, actions: np.ndarray) -> tuple[Outcome, np.ndarray]:
+    """What the simulator makes of actions (B, N, A) in states (B, S): its outcome and the next states."""
+    sim = env.simulate(len(state))
+    planar, nq = (2, 15) if env.ant else (1, 9)
+    state = state.astype(np.float64)
+    sim.restore(np.concatenate([np.zeros((len(state), planar)), state[:, : nq - planar]], 1), state[:, nq - planar :])
+    return sim.step(actions), sim.state()
+
+
+def _replay(
+    log: Log, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndarray, notes: list[str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(order of an agent's action entries, vx (T,)), checked by replaying some of `steps` in the simulator."""
     if not len(steps):
         raise StoreError(f"{log.where} holds no episode of two steps or more.")
-    sim = env.simulate(len(steps))
-    planar, nq = (2, 15) if env.ant else (1, 9)
-    state = log.state[steps].astype(np.float64)
-    qpos = np.concatenate([np.zeros((len(steps), planar)), state[:, : nq - planar]], 1)
-    forward, errors = np.arange(env.action_dim), {}
-    for name, order in {"as recorded": forward, "reversed": forward[::-1]}.items():
-        sim.restore(qpos, state[:, nq - planar :])
-        sim.step(actions[steps][:, :, order])
-        errors[name] = float(np.median(np.abs(sim.state() - log.state[steps + 1]).max(1)))
-    best = min(errors, key=errors.get)
-    if errors[best] > AGREES:
+    steps = np.sort(np.random.default_rng(0).permutation(steps)[:REPLAYED])
+    forward, errors, earned = np.arange(env.action_dim), {}, {}
+    orders = {"as recorded": forward, "reversed": forward[::-1]}
+    for name, order in orders.items():
+        outcome, after = _one_step(env, log.state[steps], actions[steps][:, :, order])
+        errors[name] = np.abs(after - log.state[steps + 1]).max(1)
+        earned[name] = outcome.reward
+    best, other = sorted(errors, key=lambda name: np.median(errors[name]))
+    miss, astray = float(np.median(errors[best])), errors[best] > STRAY
+    if miss > AGREES:
         raise StoreError(
             f"{log.where} is not this robot's: one step in the simulator misses the recorded state by "
-            f"{errors[best]:.3g} in the median ({AGREES} is allowed) in either order of actions; check the task."
+            f"{miss:.3g} in the median ({AGREES} is allowed) in either order of actions; check the task."
         )
-    order = forward if best == "as recorded" else forward[::-1]
-    other = max(errors.values())
-    return order, f"actions are {best}: a replayed step misses by {errors[best]:.2g}, in the other order by {other:.2g}"
+    if astray.mean() > STRAYS:
+        raise StoreError(
+            f"{log.where}: {100 * astray.mean():.0f} % of replayed steps miss the next recorded state by more than "
+            f"{STRAY:g} ({100 * STRAYS:.0f} % are allowed), the first of them step {steps[astray][0]}; its rows are "
+            "not consecutive, so put them in order and mark the ends of episodes."
+        )
+    effort = (actions[steps] ** 2).sum((1, 2))
+    wanted = earned[best] + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
+    told = {
+        c: _forward_speed(log, env, len(actions), c) for c in ((False, True) if log.contact is not None else (False,))
+    }
+    off = {c: float(np.median(np.abs(vx[steps] - wanted))) for c, vx in told.items()}
+    charged = min(off, key=off.get)
+    if off[charged] > SPEED_AGREES:
+        raise StoreError(
+            f"{log.where}: rewards are not this robot's, the speed that they tell is {off[charged]:.3g} m/s off in the "
+            f"median ({SPEED_AGREES} is allowed); undo any scaling or sharing out of rewards first."
+        )
+    notes.append(
+        f"actions are {best}: a replayed step misses by {miss:.2g} in the median, in the other order by "
+        f"{np.median(errors[other]):.2g}; {100 * astray.mean():.2g} % miss by more than {STRAY:g}"
+    )
+    notes.append(
+        f"speeds follow from rewards, {off[charged]:.2g} m/s off in the median{', contact forces charged' * charged}"
+    )
+    return orders[best], told[charged]
 
 
 def _old_names(width: int, env: SafeMuJoCo) -> list[str]:
@@ -243,8 +340,9 @@ def _load(directory: Path, name: str) -> np.ndarray:
         raise StoreError(f"'{file}' is truncated or no .npy file of numbers ({error}); copy it again.") from error
 
 
-def _read_vault(vault: Path) -> dict[str, np.ndarray]:
-    """Dotted name -> (B, T, ...); a Vault is zarr arrays in an OCDBT store, with their names in metadata.json."""
+def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
+    """Those of the `wanted` arrays that a Vault holds, by dotted name, (B, T, ...). A Vault is zarr arrays in an OCDBT
+    store, with their names in metadata.json."""
     try:
         import tensorstore
     except ImportError:
@@ -259,21 +357,22 @@ def _read_vault(vault: Path) -> dict[str, np.ndarray]:
     except (ValueError, KeyError) as error:
         raise StoreError(f"'{file}' is damaged ({error}); copy the Vault again.") from error
 
-    def open_(name: str):
+    def read(name: str, cut: slice | None = None) -> np.ndarray:
         base = {"driver": "ocdbt", "base": f"file://{vault.resolve()}", "path": name}
         try:
-            return tensorstore.open({"driver": "zarr", "kvstore": base}).result()
+            array = tensorstore.open({"driver": "zarr", "kvstore": base}).result()
+            return np.asarray((array if cut is None else array[:, cut]).read().result())
         except ValueError as error:
             raise StoreError(
-                f"'{vault}' lacks the array '{name}' ({str(error)[:80]}); copy the Vault again."
+                f"The array '{name}' of '{vault}' is missing or damaged ({str(error)[:80]}); copy the Vault again."
             ) from error
 
     def leaves(tree: dict, lead: str = "") -> list[str]:
         return [
-            x for k, v in tree.items() for x in (leaves(v, f"{lead}{k}.") if isinstance(v, dict) else [f"{lead}{k}."])
+            x for k, v in tree.items() for x in (leaves(v, f"{lead}{k}.") if isinstance(v, dict) else [f"{lead}{k}"])
         ]
 
-    steps = int(open_("vault_index").read().result()[0])
+    steps = int(read("vault_index")[0])
     if steps < 2:
         raise StoreError(f"'{vault}' holds {steps} steps; it was never filled.")
-    return {name.rstrip("."): np.asarray(open_(name)[:, :steps].read().result()) for name in leaves(shapes)}
+    return {name: read(f"{name}.", slice(steps)) for name in leaves(shapes) if name in wanted}

@@ -86,6 +86,15 @@ class SafeMuJoCo:
             (self.episode_length - over) * self.limit + over * max(fastest, self.limit) + self.ant * self.episode_length
         )
 
+    def describe(self, speed: np.ndarray, cost_limit: float) -> dict:
+        """What a data card says of the limits: `speed` (T,) m/s of all steps, `cost_limit` steps above per episode."""
+        return {
+            "speed_limit": self.limit,
+            "cost_limit": cost_limit,
+            "speed_quantiles": {str(q): float(np.quantile(speed, q)) for q in (0.05, 0.25, 0.5, 0.6, 0.75, 0.95)},
+            "return_ceiling": self.return_ceiling(cost_limit, float(speed.max())),
+        }
+
     @property
     def n_agents(self) -> int:
         return int(self.parts[0])
@@ -233,7 +242,10 @@ class Simulation:
 
     def step(self, action: np.ndarray) -> Outcome:
         """Advance the running robots by 0.05 s; `action` (B, N, A) is clipped to [-1, 1]."""
-        action = np.clip(np.asarray(action, np.float64).reshape(self.batch, self.env.n_agents, -1), -1.0, 1.0)
+        wanted = (self.batch, self.env.n_agents, self.env.action_dim)
+        if np.shape(action) != wanted:
+            raise UserError(f"step() got actions of shape {np.shape(action)}; {self.env.name} takes {wanted}.")
+        action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
         self._ctrl[:, self.env.actuators] = action
         live = np.flatnonzero(self.running)
         self._robots.advance(self._ctrl, live)

@@ -239,8 +239,7 @@ def commands(section: Section, out: Path) -> list[str]:
     card, lines = section.card, []
     data = section.task
     if "regenerated" in str(card.get("provenance", "")):
-        logged = next((r for r in section.references if r.name == "behaviour data"), None)
-        steps = logged.episodes * section.runs[0].config["spec"]["episode_length"] if logged else None
+        steps = card.get("size", card.get("transitions"))
         full = tasks.TASKS[section.task].transitions if section.task in tasks.TASKS else None
         if card.get("seed", 0) == 0 and steps in (None, full):
             lines.append(f"ringfence data make {section.task}" + ("" if steps else "  # its size was not recorded"))

@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ringfence import tasks
 from ringfence.envs.mujoco import DT, SafeMuJoCo
 from ringfence.errors import UserError
+from ringfence.evaluate import load_job
 from ringfence.files import whole
 from ringfence.report.animation import recording
 from ringfence.runs import Run
@@ -53,7 +53,7 @@ def check(task: Task) -> None:
 
 def film(run: Run, variant: str) -> Path:
     """Make the GIF of the first episode that an evaluation recorded, beside its recording."""
-    task = tasks.get(run.config["task"])
+    task = load_job(run).task
     check(task)
     kept = recording(run, variant)
     if kept is None:
@@ -63,13 +63,16 @@ def film(run: Run, variant: str) -> Path:
 
 def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
     """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
+    The film ends with a fall, after which the last state is repeated.
 
     `UserError` where neither EGL nor OSMesa can draw.
     """
     out, name = Path(out), backend()
+    moved = np.flatnonzero((states[1:] != states[:-1]).any(1))
+    steps = int(moved[-1]) + 1 if len(moved) else len(costs)
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
         file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
-        np.savez(file, states=states, costs=costs, env=json.dumps(dataclasses.asdict(env)))
+        np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=json.dumps(dataclasses.asdict(env)))
         made = _run([sys.executable, "-m", "ringfence.report.video", str(file), str(picture)], name)
         if made.returncode:
             raise RuntimeError(made.stderr)
@@ -107,7 +110,7 @@ def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, camera="track")
         picture = Image.fromarray(renderer.render())
-        over = bool(costs[max(t - 1, 0)])
+        over = t > 0 and bool(costs[t - 1])
         draw = ImageDraw.Draw(picture)
         scale = (WIDTH - 20) / (2 * env.limit)
         draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=(225, 225, 225))
