@@ -136,8 +136,8 @@ def test_a_vault_becomes_the_simulators_own_data(tmp_path, task):
     assert ("1 of 3 episodes end with a fall" in told) == env.ant
     again = EpisodeStore.load(store.save(tmp_path / "store.h5"))
     assert again.hazard.limit == env.limit
-    facts, warnings = audit(again)
-    assert "(native); at most 25 steps" in facts["speed limit"] and warnings[: len(store.card["warnings"])]
+    facts, _, notes = audit(again)
+    assert "(native); at most 25 steps" in facts["speed limit"] and notes == store.card["warnings"]
     assert facts["return ceiling"].startswith(f"{store.card['return_ceiling']:.0f} within the limit")
 
 

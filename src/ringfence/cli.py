@@ -117,6 +117,8 @@ def info(file: Positional[Path]) -> None:
     report = audit(EpisodeStore.load(file))
     for name, value in report.facts.items():
         out.print(f"{name:24} {value}", soft_wrap=True, markup=False)
+    for note in report.notes:
+        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
     for warning in report.warnings:
         out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
 

@@ -14,6 +14,7 @@ from ringfence.errors import UserError
 class Audit(NamedTuple):
     facts: dict[str, str]
     warnings: list[str]
+    notes: list[str]  # what the import found and lost
 
 
 def audit(store: EpisodeStore) -> Audit:
@@ -46,7 +47,7 @@ def audit(store: EpisodeStore) -> Audit:
         facts["speed limit"] = f"{limit}; at most {card['cost_limit']:g} steps of an episode may be above it"
         facts["speed, quantiles"] = f"{spread} m/s"
         facts["return ceiling"] = f"{card['return_ceiling']:.0f} within the limit, unless faster than all this data"
-    warnings = list(card.get("warnings", []))
+    warnings = []
     starts = _unsafe_starts(store)
     if starts is not None:
         facts["episodes starting unsafe"] = f"{100 * starts.mean():.2f} %"
@@ -67,7 +68,7 @@ def audit(store: EpisodeStore) -> Audit:
         warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
     if s.terminated.any() and not s.truncated.any() and np.ptp(lengths) == 0:
         warnings.append("All episodes terminate at the same length: these are probably time limits (truncated).")
-    return Audit(facts, warnings)
+    return Audit(facts, warnings, list(card.get("warnings", [])))
 
 
 def _unsafe_starts(store: EpisodeStore) -> np.ndarray | None:
