@@ -105,15 +105,32 @@ STUDIES = {
                 {"steps": 8_000, "cost_limit": 100.0},
                 {"steps": 8_000, "cost_limit": 400.0},
             ],
-            ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"steps": 20_000}],
-            ("ma-td3bc-lag", ""): [{"multiplier_rate": 0.1}, {"alpha": 5.0}, {"steps": 20_000}],
-            ("fisor", ""): [{"temperature_reward": 1.0}, {"expectile_danger": 0.7}, {"discount": 0.9}],
+            # the last of each: targets that follow fast enough for so few updates
+            ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"steps": 20_000}, {"target_rate": 0.05}],
+            ("ma-td3bc-lag", ""): [
+                {"multiplier_rate": 0.1},
+                {"alpha": 5.0},
+                {"steps": 20_000},
+                {"target_rate": 0.05},
+            ],
+            ("fisor", ""): [
+                {"temperature_reward": 1.0},
+                {"expectile_danger": 0.7},
+                {"discount": 0.9},
+                {"target_rate": 0.05},
+            ],
             # the study's α, which was the preset's, first
-            ("ma-cql", ""): [{"cql_weight": 5.0}, {"cql_weight": 10.0}, {"cql_weight": 5.0, "steps": 12_000}],
+            ("ma-cql", ""): [
+                {"cql_weight": 5.0},
+                {"cql_weight": 10.0},
+                {"cql_weight": 5.0, "steps": 12_000},
+                {"target_rate": 0.05},
+            ],
             ("omar", ""): [
                 {"cql_weight": 5.0},
                 {"cql_weight": 5.0, "coefficient": 0.7},
                 {"cql_weight": 5.0, "steps": 12_000},
+                {"target_rate": 0.05},
             ],
             ("madiff", ""): [{"lr": 1e-3}, {"discount": 0.99}, {"width": 128}],
             ("icbf", "mujoco"): [{"barrier_weight": 3.0}, {"discount": 0.99}, {"condition": "advantage"}],

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -116,6 +117,41 @@ def test_mixed_protocols_are_refused(made, tmp_path):
         make_grid("simple_spread", made.out, **{**QUICK, "episodes": 6}).open()
 
 
+def test_one_cell_under_two_settings_is_no_table(made):
+    """As when a default changed, or a trial with fewer updates was left behind."""
+    folder = made.cells[0].folder(made.out)
+    other = folder.with_name("seed-0-0123456789")
+    shutil.copytree(folder, other)
+    try:
+        with pytest.raises(UserError, match="are both simple_spread-random bc default seed 0, with other settings"):
+            rows(made.out)
+    finally:
+        shutil.rmtree(other)
+
+
+def test_reference_rows_follow_the_size_of_the_data(made, tmp_path):
+    task, place = tasks.get("simple_spread-random"), made.out / "reference"
+    assert reference.there(task, place, 500)
+    assert not reference.there(task, place, 600) and not reference.there(task, place)
+    assert not reference.there(tasks.get("simple_spread-expert"), place, 500)
+    # a card that tells no size asked for: whole episodes, a little more
+    file = tmp_path / task.name / "reference.json"
+    file.parent.mkdir()
+    file.write_text(json.dumps({"behaviour data": {"data": {"transitions": 1_000_988}}}))
+    assert reference.there(task, tmp_path) and not reference.there(task, tmp_path, 900_000)
+
+
+def test_references_that_cannot_be_made_stop_nobody(tmp_path, capfd):
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
+    g.open()
+    (g.out / "reference" / "simple_spread-random").mkdir(parents=True)
+    # The rows of another size, in which one lacks what it is compared by.
+    damaged = {"behaviour data": {}, "do-nothing": {"episodes": 4}, "data within the limit": {}}
+    (g.out / "reference" / "simple_spread-random" / "reference.json").write_text(json.dumps(damaged))
+    assert run_local(g, workers=1, quiet=True)["done"] == 1
+    assert "reference rows of simple_spread-random could not be made: KeyError" in capfd.readouterr().err
+
+
 def test_bad_names_and_folders_are_refused(made, tmp_path):
     with pytest.raises(UserError, match="did you mean 'simple_spread'"):
         make_grid("simple_sprad", tmp_path)
@@ -160,7 +196,8 @@ def test_a_worker_that_outgrows_its_memory_is_stopped_and_said_so(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
     (tmp_path / "out" / "reference" / "simple_spread-random").mkdir(parents=True)
     grid.write_json(g.out / "bench.json", grid.about(g.suite, g.episodes))
-    (tmp_path / "out" / "reference" / "simple_spread-random" / "reference.json").write_text("{}")
+    known = {"behaviour data": {"data": {"size": 500}}}
+    (tmp_path / "out" / "reference" / "simple_spread-random" / "reference.json").write_text(json.dumps(known))
     assert run_local(g, workers=1, memory=0.05, quiet=True) == {"done": 0, "failed": 1, "to do": 0}
     assert "grew beyond 0.05 GiB" in g.cells[0].status(g.out)["error"]
 
@@ -224,12 +261,12 @@ def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
         assert len(ray.nodes()) == 2
         real = engine.packed
 
-        def packed(cell, episodes):
+        def packed(cell, episodes, begun):
             """The first task kills its own process once, half-way."""
             if not killed.exists():
                 killed.write_text("")
                 os.kill(os.getpid(), signal.SIGKILL)
-            return real(cell, episodes)
+            return real(cell, episodes, begun)
 
         engine.packed = packed
         try:

@@ -50,6 +50,17 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
 
+def there(task: Task, out: str | Path, transitions: int | None = None) -> bool:
+    """Whether reference rows of a data set of that size are there."""
+    file = Path(out) / task.name / FILE
+    if not file.exists():
+        return False
+    card = read_json(file, "is damaged; delete it").get("behaviour data", {}).get("data", {})
+    wanted = task.transitions if transitions is None else transitions
+    # A card without the size that was asked for tells that of its whole episodes.
+    return card.get("size") == wanted or ("size" not in card and wanted <= card.get("transitions", 0) < 1.01 * wanted)
+
+
 def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:
     """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes.
 

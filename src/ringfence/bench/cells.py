@@ -8,6 +8,7 @@ DIR/cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   a run folder (runs.py),
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import shutil
@@ -20,6 +21,7 @@ from pathlib import Path
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
 from ringfence.bench.suites import EVALUATIONS, SUITES
 from ringfence.data.make import make
+from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError, unknown
 from ringfence.files import whole
 from ringfence.policies import PLANNERS, PlanOptions
@@ -236,7 +238,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
 
         tell("start", current)
         try:
-            store, _ = make(tasks.get(current.task), current.transitions)
+            store = data_of(current.task, current.transitions)
             for cell in left:
                 adopt(cell, out)
             training.train(
@@ -252,6 +254,13 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
         except Exception as error:
             record_failure(current, out, f"{type(error).__name__}: {error}", traceback.format_exc())
             tell("failed", left.pop(0))
+
+
+@functools.lru_cache(maxsize=1)
+def data_of(task: str, transitions: int | None) -> EpisodeStore:
+    """The data set of a task. The last one is kept: groups of one task follow each other, and what was computed from a
+    store (windows, critic) is found again by the store itself."""
+    return make(tasks.get(task), transitions)[0]
 
 
 def adopt(cell: Cell, out: Path) -> None:
@@ -277,6 +286,4 @@ def record_failure(cell: Cell, out: Path, error: str, trace: str = "") -> None:
 
 def make_reference(task: str, out: Path, episodes: int, transitions: int | None = None) -> None:
     """Reference rows of a task, once."""
-    found = tasks.get(task)
-    store, _ = make(found, transitions)
-    reference.make(found, store, out / "reference", episodes)
+    reference.make(tasks.get(task), data_of(task, transitions), out / "reference", episodes)

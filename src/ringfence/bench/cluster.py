@@ -1,7 +1,7 @@
 """The Ray engine: the same cells as Ray tasks, for more machines than one; no shared file system is needed.
 
-A task makes its data where it runs, trains in a temporary folder and returns the run folder; the driver puts it in
-place whole. Ray repeats a task whose worker or node died.
+A task makes its data where it runs, goes on in a temporary folder from what the driver's holds of its cell, and returns
+the run folder; the driver puts it in place whole. Ray repeats a task whose worker or node died.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
     grid.open()
 
     @ray.remote(num_cpus=threads, max_retries=RETRIES)
-    def make_cell(cell: Cell, episodes: int) -> bytes:
-        return make(cell, episodes)
+    def make_cell(cell: Cell, episodes: int, begun: bytes) -> bytes:
+        return make(cell, episodes, begun)
 
     with owned(grid.out):
         for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
             make_reference(name, grid.out, grid.episodes, transitions)
         cells = [c for group in grid.groups() for c in group]
-        waiting = {make_cell.remote(c, grid.episodes): c for c in cells}
+        waiting = {make_cell.remote(c, grid.episodes, begun(c, grid.out)): c for c in cells}
         with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
             while waiting:
                 (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -73,9 +73,21 @@ def knock(address: str | None, seconds: float = 5.0) -> None:
         socket.create_connection((host, int(port)), timeout=seconds).close()
 
 
-def packed(cell: Cell, episodes: int) -> bytes:
-    """Make a cell in a temporary folder and return its run folder as a tar file."""
+def begun(cell: Cell, out: Path) -> bytes:
+    """What `out` holds of a cell and of its twin, as a tar file."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+        for known in (cell, cell.twin()):
+            if known is not None and known.folder(out).exists():
+                tar.add(known.folder(out), arcname=str(known.folder(out).relative_to(out)))
+    return buffer.getvalue()
+
+
+def packed(cell: Cell, episodes: int, begun: bytes) -> bytes:
+    """Make a cell in a temporary folder, from what was begun, and return its run folder as a tar file."""
     with tempfile.TemporaryDirectory() as place:
+        with tarfile.open(fileobj=io.BytesIO(begun)) as tar:
+            tar.extractall(place, filter="data")
         run_group([cell], Path(place), episodes, lambda event, cell: None)
         buffer = io.BytesIO()
         with tarfile.open(fileobj=buffer, mode="w:gz") as tar:

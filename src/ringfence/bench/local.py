@@ -17,6 +17,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ringfence import reference, tasks
 from ringfence.bench.cells import Cell, Grid, record_failure
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
@@ -65,12 +66,11 @@ def run_local(
 
 
 def _references(grid: Grid) -> list[dict]:
-    tasks = {c.task: c.transitions for c in grid.cells}
-    done = [t for t in tasks if (grid.out / "reference" / t / "reference.json").exists()]
+    sizes = {c.task: c.transitions for c in grid.cells}
     return [
         {"reference": t, "transitions": n, "out": str(grid.out), "episodes": grid.episodes}
-        for t, n in tasks.items()
-        if t not in done
+        for t, n in sizes.items()
+        if not reference.there(tasks.get(t), grid.out / "reference", n)
     ]
 
 
@@ -143,8 +143,9 @@ class _Pool:
         for line in worker.stdout:
             told = json.loads(line)
             if told["event"] in ("finished", "broken"):
-                if told["event"] == "broken":
-                    raise RuntimeError(f"a worker could not take {job}: {told['error']}")
+                if told["event"] == "broken":  # a cell's own failures are recorded; this is a reference's
+                    what = f"the reference rows of {job['reference']}" if "reference" in job else "a group of cells"
+                    print(f"{what} could not be made: {told['error']}", file=sys.stderr, flush=True)
                 return
             if told["event"] == "ready":
                 continue

@@ -25,7 +25,7 @@ def rows(out: str | Path) -> list[dict]:
     """Every evaluation of every cell, and the reference rows; mixed protocols are refused, naming the files."""
     out = Path(out)
     about = read_about(out)
-    found, constants = [], {}
+    found, constants, seen = [], {}, {}
     for file in sorted((out / "reference").glob("*/reference.json")):
         for name, r in read_json(file, "is damaged; delete it").items():
             found.append({**r, "algorithm": name, "variant": "reference", "seed": 0, "run": str(file.relative_to(out))})
@@ -47,6 +47,13 @@ def rows(out: str | Path) -> list[dict]:
             first = constants.setdefault(r["task"], (file, r["constants"]))
             if first[1] != r["constants"]:
                 raise UserError(f"'{file}' and '{first[0]}' normalise {r['task']} differently; evaluate one again.")
+            key = r["task"], r["algorithm"], r["variant"], r["seed"]
+            other = seen.setdefault(key, file.parent)
+            if other != file.parent:
+                raise UserError(
+                    f"'{file.parent}' and '{other}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, with other "
+                    "settings; delete the one that is not meant."
+                )
             found.append({**r, "run": str(file.parent.relative_to(out))})
     if not any(r["variant"] != "reference" for r in found):
         raise UserError(f"'{out}' holds no finished cell yet; run `ringfence bench`.")
