@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -49,6 +50,16 @@ def test_refuses_in_one_sentence(arguments, message, capsys, tmp_path, monkeypat
     told = capsys.readouterr().err
     assert stop.value.code == 2 and message in told and "Traceback" not in told
     assert not list(tmp_path.iterdir())
+
+
+def test_info_says_where_cost_and_hazard_disagree(small_store, tmp_path, capsys):
+    """Every step's cost is what the formula says of the state after it; three are changed by hand."""
+    costs = small_store.costs.copy()
+    costs[[3, 24, 25]] = 1 - (costs[[3, 24, 25]] > 0)
+    for name, store in (("a", small_store), ("b", replace(small_store, costs=costs))):
+        main(["data", "info", str(store.save(tmp_path / f"{name}.h5"))])
+    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("cost and hazard disagree")]
+    assert [line.split()[4] for line in told] == ["0.00", f"{300 / small_store.steps:.2f}"]
 
 
 def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):

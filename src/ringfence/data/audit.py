@@ -48,9 +48,11 @@ def audit(store: EpisodeStore) -> Audit:
         facts["speed, quantiles"] = f"{spread} m/s"
         facts["return ceiling"] = f"{card['return_ceiling']:.0f} within the limit, unless faster than all this data"
     warnings = []
-    starts = _unsafe_starts(store)
+    first = np.concatenate([[0], s.episode_ends[:-1]]) + np.arange(s.episodes)
+    starts, apart = _labels(s, first), _disagreement(s)
     if starts is not None:
         facts["episodes starting unsafe"] = f"{100 * starts.mean():.2f} %"
+        facts["cost and hazard disagree"] = f"{100 * apart:.2f} % of steps"
         if starts.any():
             warnings.append(
                 f"{100 * starts.mean():.1f} % of episodes start unsafe: their first cost says nothing about a policy; "
@@ -71,7 +73,8 @@ def audit(store: EpisodeStore) -> Audit:
     return Audit(facts, warnings, list(card.get("warnings", [])))
 
 
-def _unsafe_starts(store: EpisodeStore) -> np.ndarray | None:
+def _labels(store: EpisodeStore, rows: np.ndarray) -> np.ndarray | None:
+    """(K,) whether the hazard's formula calls these rows unsafe for anyone; None where it has none."""
     task = tasks.from_store(store)
     try:
         view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
@@ -80,6 +83,14 @@ def _unsafe_starts(store: EpisodeStore) -> np.ndarray | None:
         return None
     if not bound.has_formula:
         return None
-    first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
-    state = None if store.state is None else store.state[first]
-    return np.asarray(bound.labels(view(store.observations[first], state))[0]).any(-1)
+    state = None if store.state is None else store.state[rows]
+    return np.asarray(bound.labels(view(store.observations[rows], state))[0]).any(-1)
+
+
+def _disagreement(store: EpisodeStore) -> float | None:
+    """Share of steps (at most a hundred thousand, evenly spread) whose cost is not what the formula says of the state
+    that they end in."""
+    steps = np.unique(np.linspace(0, store.steps - 1, 100_000).astype(int))
+    episode = np.searchsorted(store.episode_ends, steps, side="right")
+    labels = _labels(store, steps + episode + 1)
+    return None if labels is None else float((labels != (store.costs[steps] > 0)).mean())
