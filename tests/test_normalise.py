@@ -48,6 +48,19 @@ def test_any_plan_survives_the_round_trip(windows):
         np.testing.assert_allclose(norm.apply(norm.invert(jnp.asarray(z))), z, atol=2e-4)
 
 
+@pytest.mark.parametrize("coordinates", ["displacement", "state"])
+def test_units_do_not_matter(windows, coordinates):
+    """Nanometres or kilometres, at any rate: the same coordinates; a constant of any size is none."""
+    x, valid, now = windows
+    z = normalise.fit(x, valid, now, coordinates).apply(jnp.asarray(x))
+    for unit in (1e-6, 1e4):
+        small = normalise.fit(x * np.float32(unit), valid, now, coordinates)
+        np.testing.assert_allclose(small.apply(jnp.asarray(x * np.float32(unit))), z, atol=2e-3)
+        still = np.concatenate([x, np.full_like(x[..., :1], 7.3)], -1) * np.float32(unit)
+        norm = normalise.fit(still, valid, now, coordinates)
+        assert norm.scale[-1] == 1 and (norm.step_scale[:, -1] == 1).all()
+
+
 def test_constant_entries_are_left_alone():
     x = np.zeros((10, 4, 2, 3), np.float32)
     x[..., 0] = 5.0

@@ -21,7 +21,7 @@ import numpy as np
 from ringfence.types import Array
 
 Coordinates = Literal["displacement", "state"]
-FLOOR = 1e-3  # an entry that never varies is centred and left alone
+ROUNDING = 1e-5  # of an entry's size: less variation is rounding, and the entry is centred and left alone
 
 
 class Normaliser(eqx.Module):
@@ -63,6 +63,11 @@ class Normaliser(eqx.Module):
         return (after - before - self.step_mean[0]) / self.step_scale[0]
 
 
+def varying(scale, size):
+    """Deviations (..., D), 1 where an entry of that size does not vary. In no unit: small ones are as good as large."""
+    return np.where(scale <= ROUNDING * np.abs(size), 1.0, scale)
+
+
 def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> Normaliser:
     """Statistics of windows (M, H, N, D) with `valid` (M, H); padded rows are left out."""
     h, d = windows.shape[1], windows.shape[-1]
@@ -73,15 +78,14 @@ def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> N
         means.append(moved.mean(0) if len(moved) else np.zeros(d))
         scales.append(moved.std(0) if len(moved) else np.ones(d))
 
-    def floor(x: np.ndarray) -> np.ndarray:
-        return np.where(x < FLOOR, 1.0, x)
+    mean, scale = rows.mean(0), rows.std(0)
 
     as_array = lambda x: jnp.asarray(np.asarray(x), jnp.float32)  # noqa: E731
     return Normaliser(
-        as_array(rows.mean(0)),
-        as_array(floor(rows.std(0))),
+        as_array(mean),
+        as_array(varying(scale, mean)),
         as_array(np.reshape(means, (-1, d))),
-        as_array(floor(np.reshape(scales, (-1, d)))),
+        as_array(varying(np.reshape(scales, (-1, d)), np.abs(mean) + scale)),
         now,
         coordinates,
     )

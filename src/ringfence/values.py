@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from ringfence.nets.mlp import MLP
+from ringfence.normalise import varying
 from ringfence.types import Array, Key
 
 Condition = Literal["advantage", "return"]
@@ -34,12 +35,12 @@ def fit_critic(
     """
     targets = jnp.stack([rewards, togo], -1)
     value = jnp.stack([targets.mean(0), jnp.maximum(targets.std(0), 1e-6)], -1)
-    flat = features.reshape(-1, features.shape[-1])[:: max(1, len(features) // 20_000)]
-    mean, deviation = flat.mean(0), flat.std(0)
+    flat = np.asarray(features.reshape(-1, features.shape[-1])[:: max(1, len(features) // 20_000)], np.float64)
+    mean = flat.mean(0)
     critic = {
         "net": MLP(key, (features.shape[-1], WIDTH, WIDTH, 2)),
-        "mean": mean,
-        "scale": jnp.where(deviation < 1e-3, 1.0, deviation),
+        "mean": jnp.asarray(mean, jnp.float32),
+        "scale": jnp.asarray(varying(flat.std(0), mean), jnp.float32),
         "value": value,
     }
     adam = optax.adam(optax.cosine_decay_schedule(4e-3, updates, 0.02))
