@@ -174,10 +174,16 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, not
     return EpisodeStore.from_steps(**made, costs=speed > env.limit, card=card)
 
 
+def _earned_by_running(env: SafeMuJoCo, rewards: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """(T,) the part of rewards (T,) that is neither for actions (T, N, A) nor, on the Ant, for standing."""
+    effort = (actions**2).sum((1, 2))
+    return rewards + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
+
+
 def _forward_speed(log: Log, env: SafeMuJoCo, total: int, contact: bool = False) -> np.ndarray:
     """(T,) vx of every step, from its reward. Contact forces are those after the step."""
-    effort = (log.actions[:total].astype(np.float64) ** 2).sum((1, 2))  # as recorded: what was charged
-    vx = log.rewards[:total].astype(np.float64).mean(-1) + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
+    rewards = log.rewards[:total].astype(np.float64).mean(-1)
+    vx = _earned_by_running(env, rewards, log.actions[:total].astype(np.float64))  # as recorded: what was charged
     if contact:
         after = np.append(log.contact[1:total], log.contact[total - 1 : total], 0)
         vx += CONTACT * (np.clip(after, -1.0, 1.0) ** 2).sum(1)
@@ -281,8 +287,7 @@ def _replay(
             f"{STRAY:g} ({100 * STRAYS:.0f} % are allowed), the first of them step {steps[astray][0]}; its rows are "
             "not consecutive, so put them in order and mark the ends of episodes."
         )
-    effort = (actions[steps] ** 2).sum((1, 2))
-    wanted = earned[best] + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
+    wanted = _earned_by_running(env, earned[best], actions[steps])
     told = {
         c: _forward_speed(log, env, len(actions), c) for c in ((False, True) if log.contact is not None else (False,))
     }
