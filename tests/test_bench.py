@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ringfence import evaluate, reference, tasks
@@ -71,6 +72,16 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
     assert cell.state(tmp_path, 5) == "to do"
     monkeypatch.setitem(PLANNERS, "guarded", {**PLANNERS["guarded"], "margin": 0.5})
     assert cell.state(tmp_path, 4) == "to do"
+
+
+@pytest.mark.parametrize(("task", "state"), [("ant_4x2-poor", "to do"), ("halfcheetah_2x3-poor", "done")])
+def test_a_result_that_hides_falls_is_played_again(tmp_path, task, state):
+    cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "plain"),))
+    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}}
+    Run(cell.folder(tmp_path)).add_result("mujoco", told)
+    assert cell.state(tmp_path, 4) == state
+    Run(cell.folder(tmp_path)).add_result("mujoco", {**told, "termination_rate": 0.0})
+    assert cell.state(tmp_path, 4) == "done"
 
 
 def test_every_suite_names_algorithms_and_presets_that_exist():
@@ -314,6 +325,12 @@ def test_reference_rows_tell_the_data_from_its_safe_part(small_store, tmp_path):
     assert part["episodes"] == safe.sum() and part["cost_mean"] <= task.cost_limit
     assert part["return_mean"] == pytest.approx(small_store.returns[safe].mean())
     assert reference.make(task, small_store, tmp_path, 2) == json.loads(json.dumps(found))  # as it was kept
+    # an episode that ends early is no safe one, however little it costs
+    cut = dataclasses.replace(small_store, terminated=small_store.terminated.copy())
+    cut.terminated[cut.episode_ends[np.flatnonzero(safe)[0]] - 1] = True
+    found = reference.make(task, cut, tmp_path / "cut", 2)
+    assert found["data within the limit"]["episodes"] == safe.sum() - 1
+    assert found["behaviour data"]["termination_rate"] == pytest.approx(1 / cut.episodes)
     # a limit that no logged episode keeps: the row is missing, not empty
     none = dataclasses.replace(task, cost_limit=-1.0)
     assert list(reference.make(none, small_store, tmp_path, 2)) == ["behaviour data", "do-nothing", "random actions"]

@@ -31,7 +31,8 @@ def summary(returns, costs, task=EXPERT, unsafe=(0, 0, 0, 0), **more) -> dict:
     """The protocol's summary of four episodes of two steps with these returns and costs."""
     rewards = np.stack([np.asarray(returns, float), np.zeros(len(returns))], 1)
     steps = np.stack([np.asarray(costs, float), np.zeros(len(costs))], 1)
-    made = evaluate.summarise({"rewards": rewards, "costs": steps}, tasks.get(task), np.asarray(unsafe, bool))
+    played = {"rewards": rewards, "costs": steps, "steps": np.full(4, 2), "terminated": np.zeros(4, bool)}
+    made = evaluate.summarise(played, tasks.get(task), np.asarray(unsafe, bool))
     made |= {"protocol": 1, "task": task, "split": "test", "parameters": 1234, "train_seconds": 10.0}
     return made | more
 

@@ -115,9 +115,15 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     assert not np.array_equal(other["states"][:, 0], played["states"][:3, 0])
     ends = [int(np.flatnonzero(r)[-1]) + 1 for r in played["rewards"]]
     assert max(ends) < 150 and len(set(ends)) > 1
+    assert played["steps"].tolist() == ends and played["terminated"].all()
+    told = evaluate.summarise(played, tasks.get("ant_4x2-good"), np.zeros(6, bool))
+    assert told["termination_rate"] == 1 and told["steps_mean"] == np.mean(ends)
+    assert told["cost_rate"] == pytest.approx(played["costs"].sum() / sum(ends))
     for end, rewards, states in zip(ends, played["rewards"], played["states"]):
         assert states[end, 0] < 0.6 and (states[:end, 0] >= 0.6).all()
         assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
+    cheetah = evaluate.rollout(Push(), SafeMuJoCo("2x3", episode_length=5), 2)
+    assert cheetah["steps"].tolist() == [5, 5] and not cheetah["terminated"].any()
 
 
 def test_behaviour_learning_is_reproducible():

@@ -41,8 +41,9 @@ def rollout(
     label: str = "",
     quiet: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S); the first `record` episodes
-    also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise, never the resets."""
+    """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
+    whether the task itself `terminated` (E,) it; the first `record` episodes also keep what the planner drew (`plans`,
+    `chosen`). `seed` moves the policy's noise, never the resets."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
@@ -79,7 +80,8 @@ def rollout(
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks])[:episodes] for k in chunks[0]}
-    return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | recorded
+    whole_length = {"steps": np.full(episodes, env.episode_length), "terminated": np.zeros(episodes, bool)}
+    return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | whole_length | recorded
 
 
 def _rollout_native(
@@ -92,13 +94,14 @@ def _rollout_native(
     act = jax.jit(lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key))
     memory = policy.start(episodes)
     states = [sim.state().astype(np.float32)]
-    steps, info = [], []
+    steps, info, lengths = [], [], np.zeros(episodes, int)
     with Progress(label or "evaluating", env.episode_length, 0, quiet) as bar:
         for t in range(env.episode_length):
             if not sim.running.any():
                 break
             seen = sim.observe(states[-1])
             memory, decided = act(policy, memory, seen, states[-1], jax.random.fold_in(key, t))
+            lengths += sim.running
             steps.append(sim.step(np.asarray(decided.action)))
             states.append(sim.state().astype(np.float32))
             if record:
@@ -106,6 +109,7 @@ def _rollout_native(
             bar.advance(1)
     kept = {"rewards": np.stack([s.reward for s in steps], 1), "costs": np.stack([s.cost for s in steps], 1)}
     kept = {k: _padded(v, env.episode_length) for k, v in kept.items()}
+    kept |= {"steps": lengths, "terminated": np.stack([s.terminated for s in steps], 1).any(1)}
     kept["states"] = np.stack(states, 1)
     kept["states"] = np.concatenate(
         [kept["states"], np.repeat(kept["states"][:, -1:], env.episode_length + 1 - len(states), 1)], 1
@@ -119,8 +123,11 @@ def _padded(x: np.ndarray, length: int) -> np.ndarray:
 
 
 def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.ndarray) -> dict:
-    """The protocol's numbers from per-step rewards and costs (E, L) and who started unsafe (E,)."""
+    """The protocol's numbers from per-step rewards and costs (E, L), the episodes' steps and terminations (E,), and
+    who started unsafe (E,). An episode that ends early costs little: `steps_mean`, `termination_rate` and `cost_rate`
+    (cost per step played) tell."""
     returns, costs = played["rewards"].sum(1, dtype=np.float64), played["costs"].sum(1, dtype=np.float64)
+    steps, terminated = played["steps"], played["terminated"]
     n, fine = len(returns), ~hazard_at_start
     violated = costs > 0
     avoidable = costs[fine] if fine.any() else np.zeros(1)
@@ -134,6 +141,9 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "cost_interval": stats.bootstrap_mean(costs),
         "cost_norm": float(task.normalised_cost(costs.mean())),
         "cost_cvar10": stats.cvar(costs),
+        "cost_rate": float(costs.sum() / steps.sum()),
+        "steps_mean": float(steps.mean()),
+        "termination_rate": float(terminated.mean()),
         "violation_rate": float(violated.mean()),
         "violation_interval": stats.clopper_pearson(int(violated.sum()), n),
         "violation_upper": stats.upper_bound(int(violated.sum()), n),
@@ -151,8 +161,16 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
             "return": [round(float(x), 3) for x in returns],
             "cost": [float(x) for x in costs],
             "unsafe_start": [bool(x) for x in hazard_at_start],
+            "steps": [int(x) for x in steps],
+            "terminated": [bool(x) for x in terminated],
         },
     }
+
+
+def complete(result: dict, task: Task) -> bool:
+    """Whether a stored result says all that the protocol asks for: how many episodes ended early is younger than
+    results there are, which matters only where they can."""
+    return "termination_rate" in result or task.env is None or not task.env.terminates
 
 
 def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:

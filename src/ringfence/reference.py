@@ -10,7 +10,7 @@ import numpy as np
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
-from ringfence.evaluate import PROTOCOL, evaluate_policy, summarise, unsafe_starts
+from ringfence.evaluate import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
 from ringfence.runs import read_json, write_json
 from ringfence.tasks import Task
@@ -45,17 +45,22 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     else:
         starts = np.zeros(store.episodes, bool)
     kept = np.ones(store.episodes, bool) if kept is None else kept
-    result = summarise({"rewards": rewards[kept], "costs": costs[kept]}, task, starts[kept])
+    ended = store.terminated[store.episode_ends - 1]
+    told = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": ended}
+    result = summarise({k: v[kept] for k, v in told.items()}, task, starts[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
 
 def there(task: Task, out: str | Path, transitions: int | None = None) -> bool:
-    """Whether reference rows of a data set of that size are there."""
+    """Whether complete reference rows of a data set of that size are there."""
     file = Path(out) / task.name / FILE
     if not file.exists():
         return False
-    card = read_json(file, "is damaged; delete it").get("behaviour data", {}).get("data", {})
+    known = read_json(file, "is damaged; delete it")
+    if not all(complete(r, task) for r in known.values()):
+        return False
+    card = known.get("behaviour data", {}).get("data", {})
     wanted = task.transitions if transitions is None else transitions
     # A card without the size that was asked for tells that of its whole episodes.
     return card.get("size") == wanted or ("size" not in card and wanted <= card.get("transitions", 0) < 1.01 * wanted)
@@ -64,14 +69,15 @@ def there(task: Task, out: str | Path, transitions: int | None = None) -> bool:
 def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:
     """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes.
 
-    Where no logged episode is within the cost limit, the row of those that are is missing.
+    The data's safe part is made of the episodes within the cost limit that did not end early: one that falls over at
+    once costs nothing, too. Where there is none, its row is missing.
     """
     file = Path(out) / task.name / FILE
-    safe = store.episode_costs <= task.cost_limit
+    safe = (store.episode_costs <= task.cost_limit) & ~store.terminated[store.episode_ends - 1]
     if file.exists():
         known = read_json(file, "is damaged; delete it")
         same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()
-        if same and known["behaviour data"]["data"] == store.card:
+        if same and all(complete(r, task) for r in known.values()) and known["behaviour data"]["data"] == store.card:
             return known
     spec = task.spec(task.feature_map("pruned"))
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}

@@ -32,7 +32,8 @@ class Env(Protocol):
 
     n_agents: int
     action_dim: int
-    episode_length: int
+    episode_length: int  # the time limit
+    terminates: bool  # whether the task itself may end an episode before
 
     def reset(self, key: Key, batch: int) -> PyTree: ...
 

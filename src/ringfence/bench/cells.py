@@ -83,6 +83,7 @@ class Cell:
         def there(variant: str, name: str) -> bool:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
+            same = same and evaluate.complete(r, tasks.get(self.task))
             return same and (not r["options"] or same_options(r["options"], EVALUATIONS[name]))
 
         return [e for e in self.evaluations if not there(*e)]

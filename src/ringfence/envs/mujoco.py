@@ -74,6 +74,11 @@ class SafeMuJoCo:
         return self.robot == "ant"
 
     @property
+    def terminates(self) -> bool:
+        """The Ant's episode ends with its fall."""
+        return self.ant
+
+    @property
     def limit(self) -> float:
         """m/s"""
         return LIMITS[self.parts] if self.speed_limit is None else self.speed_limit

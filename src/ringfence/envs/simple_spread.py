@@ -12,7 +12,7 @@ Two integrators exist in the world and differ in substance:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -51,6 +51,7 @@ class SimpleSpread:
     episode_length: int = 25
     arena: float | None = None  # half-width of the square of resets; None: 1 up to 3 agents, 2 above (as OMAR's)
     action_dim: int = 2  # force direction, each entry in [-1, 1]
+    terminates: ClassVar[bool] = False  # nothing but the time limit ends an episode
 
     def __post_init__(self):
         for field, options in (
