@@ -18,6 +18,7 @@ from ringfence.data.make import make
 from ringfence.data.matd3 import MATD3Config
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
+from ringfence.policies import Constant
 from ringfence.report.video import animate
 from ringfence.types import PolicyStep
 
@@ -122,7 +123,9 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     for end, rewards, states in zip(ends, played["rewards"], played["states"]):
         assert states[end, 0] < 0.6 and (states[:end, 0] >= 0.6).all()
         assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
-    cheetah = evaluate.rollout(Push(), SafeMuJoCo("2x3", episode_length=5), 2)
+    task = tasks.get("halfcheetah_2x3-poor")
+    idle = Constant(task.spec(task.feature_map("pruned")))
+    cheetah = evaluate.rollout(idle, replace(task.env, episode_length=5), 2)
     assert cheetah["steps"].tolist() == [5, 5] and not cheetah["terminated"].any()
 
 
