@@ -13,6 +13,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
+from ringfence import algos, tasks
 from ringfence.bench import paper
 from ringfence.report import board, export
 
@@ -66,6 +67,7 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+steady", "`split`, steady"),
     ("icbf", "mujoco+shielded", "**`split`, shielded**"),
 )
+NONE = "–"  # not played yet
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.
 IN_README = (
@@ -126,7 +128,10 @@ def robots_short(groups: dict) -> str:
         cells = []
         for algorithm, variant, _ in IN_README:
             rows = groups.get((name, algorithm, variant), [])
-            cells.append(" / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else "–")
+            if not rows and variant == "reference":
+                cells.append("none")
+                continue
+            cells.append(" / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) + fallen(rows) if rows else NONE)
             seeds[len(rows)] += bool(rows) and variant != "reference"
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     told = ", ".join(f"{n} of {k} seed{'s' * (k > 1)}" for k, n in sorted(seeds.items()) if n)
@@ -144,7 +149,8 @@ def robots(groups: dict, ending: str) -> str:
         bound = variant.replace("mujoco", "mujoco-quantile", 1)  # preset of whoever has one for the quantile limits
         found = [groups.get((n, algorithm, variant)) or groups.get((n, algorithm, bound), []) for n in names]
         if any(found):
-            cells = (cell(rows, "cost_mean", 1) if rows else "–" for rows in found)
+            empty = "none" if variant == "reference" else NONE
+            cells = (cell(rows, "cost_mean", 1) if rows else empty for rows in found)
             lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -165,17 +171,29 @@ def searched(file: Path, task: str) -> str:
 
 
 def spent(folder: Path) -> str:
-    """Seconds of training and playing a cell, by algorithm and preset; all cells together."""
+    """Seconds of training and playing a cell, by algorithm and preset; all cells together.
+
+    Cells that took over what another had learned from the same data cost their playing alone: lines of their own."""
     seconds = defaultdict(list)
     for file in sorted((folder / "cells").glob("*/*/*/status.json")):
-        told = json.loads(file.read_text())
-        seconds[file.parent.parent.name].append(told.get("train_seconds", 0.0) + told.get("eval_seconds", 0.0))
+        told, name = json.loads(file.read_text()), file.parent.parent.name
+        if "adopted" in told or (tasks.twin(file.parts[-4]) and not algos.get(_algorithm(name)).heeds_danger):
+            trained, name = told.get("train_seconds", 0.0), f"{name}, trained before"
+        else:  # of a cell that was played again the last attempt trained nothing
+            results = json.loads((file.parent / "results.json").read_text())
+            trained = max([told.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
+        seconds[name].append(trained + told.get("eval_seconds", 0.0))
     lines = ["| cells | number | mean s | longest s |", "|---|---:|---:|---:|"]
     lines += [f"| `{k}` | {len(v)} | {np.mean(v):.0f} | {max(v):.0f} |" for k, v in sorted(seconds.items())]
     total = sum(map(sum, seconds.values())) / 3600
     cells = sum(map(len, seconds.values()))
     lines.append(f"\nTogether {cells} cells and {total:.1f} hours of one core, {total / 2:.1f} hours on two.")
     return "\n".join(lines)
+
+
+def _algorithm(folder: str) -> str:
+    """Of a cell's folder, which is named algorithm[-preset]."""
+    return max((a for a in algos.ALGORITHMS if folder == a or folder.startswith(f"{a}-")), key=len)
 
 
 def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:
@@ -259,7 +277,15 @@ def cell(rows: list[dict], cost: str = "avoidable_cost", digits: int = 3) -> str
     spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
     made = sum(r["variant"] != "reference" for r in rows)
     spread += f" [{made} seed{'s' * (made > 1)}]" if 0 < made < SEEDS else ""
-    return f"{returns.mean():.0f}{spread} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
+    text = f"{returns.mean():.0f}{spread} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
+    return text + fallen(rows)
+
+
+def fallen(rows: list[dict]) -> str:
+    """How many episodes ended before the time limit, where any did: an early end costs little."""
+    ended = [float(r["termination_rate"]) for r in rows if r.get("termination_rate")]
+    share = 100 * float(np.mean(ended)) if ended else 0.0
+    return f", {max(share, 1):.0f} % fell" if share else ""
 
 
 def put(file: str, name: str, text: str) -> None:

@@ -151,6 +151,44 @@ def test_planner_options(trained, options):
     assert len(run.results) >= 1
 
 
+def test_a_controller_acts_like_the_policy(trained, small_store):
+    pilot = evaluate.Controller(trained["icbf"], planner="guarded", steps=2, plans=2, shield=1)
+    assert pilot.policy.options.ascent == 100.0 and pilot.policy.options.plans == 2
+    seen, state = small_store.observations[0], small_store.state[0]
+    first = pilot.act(seen, state)
+    assert first.shape == (3, 2) and (np.abs(first) <= 1).all()
+    again = evaluate.Controller(trained["icbf"], planner="guarded", steps=2, plans=2, shield=1)
+    np.testing.assert_array_equal(again.act(seen, state), first)
+    again.reset()
+    assert not np.array_equal(again.act(seen, state), first)  # a new draw of plans
+    with pytest.raises(UserError, match="did you mean 'guarded'"):
+        evaluate.Controller(trained["icbf"], planner="garded")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"steps": -3}, "steps=-3 of bc must be at least 1"),
+        ({"batch": 0}, "batch=0 of bc must be at least 1"),
+        ({"lr": -1.0}, "lr=-1.0 of bc must be positive"),
+        ({"ema": 3.0}, "ema=3.0 of bc must be between 0 and 1"),
+        ({"lr": float("nan")}, "lr=nan of bc must be finite"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(small_store, tmp_path, changes, said):
+    with pytest.raises(UserError, match=said):
+        training.train("bc", small_store, out=tmp_path, changes=changes)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_seed_and_no_store_are_refused(small_store, tmp_path):
+    for seeds in ((), (-1,)):
+        with pytest.raises(UserError, match="must be one or more numbers of 0 or more"):
+            training.train("bc", small_store, out=tmp_path, seeds=seeds)
+    with pytest.raises(UserError, match="data of type str; pass an EpisodeStore"):
+        training.train("bc", "simple_spread-random", out=tmp_path)
+
+
 def test_the_shield_corrects_what_falls_short_and_nothing_else(trained):
     """Actions are left alone where the plan keeps its margin, and otherwise lead to more clearance, within bounds."""
     env = tasks.get("simple_spread-random").env

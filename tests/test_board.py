@@ -19,8 +19,9 @@ from ringfence.report import board_csv, board_latex, board_markdown, board_markd
 from ringfence.report.board import Method, read
 from ringfence.report.board_page import published
 from ringfence.report.export import escape
+from ringfence.report.page import danger
 from ringfence.report.published import PUBLISHED, matches
-from ringfence.report.standings import aggregate, contests, interval, references, standings
+from ringfence.report.standings import aggregate, aggregates, contests, interval, references, standings
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation
@@ -104,6 +105,7 @@ def test_rows_are_read_with_their_folders(folder):
 
 def test_cells_without_results_are_named_with_the_reason(folder):
     assert [(m.task, m.job, m.seed, m.why) for m in read(folder).missing] == [
+        (EXPERT, "icbf-split", 0, "not every evaluation is there: plans8"),
         (EXPERT, "icbf-split", 1, "failed: MemoryError: no memory"),
         (MEDIUM, "icbf-split", 0, "not started"),
         (MEDIUM, "icbf-split", 1, "not started"),
@@ -112,7 +114,10 @@ def test_cells_without_results_are_named_with_the_reason(folder):
 
 def test_a_cell_done_under_another_mark_is_not_missing(folder):
     cell(folder, {"split": summary([1] * 4, [0] * 4)}, "icbf", "split", seed=1, mark="b2")
-    assert all(m.task == MEDIUM for m in read(folder).missing)
+    assert {m.why for m in read(folder).missing if m.task == EXPERT} == {
+        "not every evaluation is there: plans8",
+        "not every evaluation is there: plans8, guarded",
+    }
 
 
 def test_cells_that_the_suite_leaves_out_are_not_missing_and_entries_without_cells_are_named(folder):
@@ -120,8 +125,9 @@ def test_cells_that_the_suite_leaves_out_are_not_missing_and_entries_without_cel
     replay = "simple_spread-medium-replay"  # the suite has no icbf:long there
     cell(folder, {"default": summary([1] * 4, [0] * 4, replay)}, task=replay)
     board = read(folder)
-    missing = {(m.task, m.seed) for m in board.missing if m.job == "icbf-long"}
+    missing = {(m.task, m.seed) for m in board.missing if m.job == "icbf-long" and m.why == "not started"}
     assert missing == {(EXPERT, 1), (MEDIUM, 0), (MEDIUM, 1)}
+    assert board.untouched == ["simple_spread-random"]
     assert "omar" in board.unstarted and not {"bc", "icbf:split", "icbf:long"} & set(board.unstarted)
 
 
@@ -285,6 +291,52 @@ def test_ranks_are_lexicographic(folder):
     assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser split+guarded", 1), ("OMAR", 2)]
 
 
+def test_equal_methods_share_a_place(folder):
+    cell(folder, {"default": summary([400, 420, 410, 410], [0, 0, 0, 1])}, "omar")
+    rows = standings(read(folder))[EXPERT]
+    assert [(r.label, r.rank, r.best) for r in rows] == [
+        ("OMAR", 1, True),
+        ("ICBF-Diffuser split+guarded", 1, True),
+        ("ICBF-Diffuser split", 3, False),
+        ("BC", 4, False),
+    ]
+
+
+def test_settings_chosen_on_validation_stay_off_the_table(folder):
+    path = folder / "cells" / EXPERT / "bc" / "seed-0-a1" / "results.json"
+    told = json.loads(path.read_text())
+    write(path, told | {"default@validation": summary([999] * 4, [0] * 4, split="validation")})
+    assert len(read(folder).entries) == 6 and row(folder, "BC").returns == 310.0
+
+
+def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(tmp_path):
+    root = tmp_path / "results"
+    write(root / "bench.json", BENCH | {"suite": "mujoco"})
+    names = [f"halfcheetah_2x3-{tier}{limit}" for limit in ("", "-quantile") for tier in ("good", "poor")]
+    for task in names:
+        cell(root, {"mujoco": summary([300] * 4, [3] * 4, task)}, preset="mujoco", task=task)
+    native, quantile = aggregates(read(root))
+    assert (native.protocol, native.tasks, quantile.tasks) == ("native", names[:2], names[2:])
+    (told,) = native.iqm_returns.values()
+    assert told[1] is None and native.return_bands == native.cost_bands == [None]
+    page = text_of(build_board(root, tmp_path / "p.html").read_text())
+    assert "The 2 tasks with quantile limits" in page and "nothing is known of its spread between runs" in page
+    assert "A step costs 1 for a distance below 0.3 m. Cost limit l = 25" in page
+    assert danger({"kind": "SpeedLimit", "limit": 1.026}) == "a speed above 1.026 m/s"
+
+
+def test_falls_are_told(folder, tmp_path):
+    told = summary([400] * 4, [0] * 4) | {"termination_rate": 0.75, "steps_mean": 12.0}
+    cell(folder, {"default": told}, "omar")
+    page = text_of(section_of(build_board(folder, tmp_path).read_text(), EXPERT))
+    assert "ended early mean length" in page and "75.0 % 12 steps" in page
+    assert "| 75.0 % |" in board_markdown(read(folder)) and "ended early" not in section_of(
+        (tmp_path / "report.html").read_text(), MEDIUM
+    )
+    line = next(r for r in csv.DictReader(io.StringIO(board_csv(read(folder)))) if r["algorithm"] == "omar")
+    assert (line["ended_early"], line["steps_mean"]) == ("0.75", "12")
+
+
 def test_nobody_within_the_limit_means_no_best(folder):
     path = folder / "cells" / EXPERT / "icbf-split" / "seed-0-a1" / "results.json"
     write(path, {"split": summary([900] * 4, [2] * 4)})
@@ -336,9 +388,9 @@ def test_aggregate_takes_methods_with_every_task(folder):
     assert told.cost_profiles[0, at] == pytest.approx([10 / 16, 14 / 16])
     assert told.return_profiles[0, 0] == 1.0 and told.return_profiles[0, -1] == 0.0
     for shares, bands in ((told.return_profiles, told.return_bands), (told.cost_profiles, told.cost_bands)):
-        assert (bands[:, 0] <= shares + 1e-12).all() and (shares <= bands[:, 1] + 1e-12).all()
+        assert (bands[0][0] <= shares[0] + 1e-12).all() and (shares[0] <= bands[0][1] + 1e-12).all()
     # at cost 0, expert has 0 of 4 and 2 of 4 episodes, medium all: drawing a seed twice gives 1/2 or 3/4
-    assert told.cost_bands[0, :, at[0]] == pytest.approx([0.5, 0.75])
+    assert told.cost_bands[0][:, at[0]] == pytest.approx([0.5, 0.75])
 
 
 def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
@@ -440,7 +492,8 @@ def test_page_does_not_hide_what_is_missing(folder, tmp_path):
     html = build_board(folder, tmp_path).read_text()
     medium = text_of(section_of(html, MEDIUM))
     assert "ICBF-Diffuser split not measured on this task" in medium
-    assert "3 of the grid's cells have no result" in text_of(html)
+    assert "4 of the grid's cells have no result" in text_of(html)
+    assert "2 of the suite's 4 tasks were not begun" in text_of(html)
     made = text_of(section_of(html, "How it was made"))
     assert "simple_spread-expert, icbf-split, seed 1: failed: MemoryError: no memory" in made
     assert "simple_spread-medium, icbf-split, seeds 0, 1: not started" in made
@@ -449,8 +502,10 @@ def test_page_does_not_hide_what_is_missing(folder, tmp_path):
 
 def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
     told = text_of(section_of(build_board(folder, tmp_path).read_text(), "Ranking"))
-    assert told.index("BC 3") < told.index("ICBF-Diffuser split+guarded 1 ★")
-    assert "BC 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit 2.00 1" in told  # mean of ranks 3 and 1
+    assert told.index("BC 1.00") < told.index("ICBF-Diffuser split+guarded –")
+    # the only method with every task: the mean of its ranks among such methods is 1, whatever the others did on one
+    assert "BC 1.00 1 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit" in told
+    assert "1 ★ 0.70, cost 0.25 within limit 1 of 2 seeds" in told
 
 
 def test_published_values_stand_beside_ours_and_apart(folder, tmp_path):
@@ -535,8 +590,8 @@ def test_markdown_whole_and_short(folder):
     assert "| ICBF-Diffuser split+guarded | 1 | **410.0** | 0.701 | 0.250 |" in whole
     assert "| ICBF-Diffuser split | – | not measured |" in whole and "0 of 2" in whole
     short = board_markdown_short(board)
-    assert "| BC | 0.42 (2.167) † | **0.25 (0.000)** | 2.00 |" in short
-    assert "| ICBF-Diffuser split+guarded | **0.70 (0.250)** | not measured | – |" in short
+    assert "| BC | 0.42 (2.167) † | **0.25 (0.000)** | 1.00 |" in short
+    assert "| ICBF-Diffuser split+guarded | **0.70 (0.250) [1]** | not measured | – |" in short
     assert "| do nothing | 0.06 (0.000) | not measured | – |" in short
     for text in (whole, short):
         for block in re.findall(r"(?:^\|.*\n)+", text, re.M):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 
 import mujoco
@@ -170,6 +172,24 @@ def test_pettingzoo_face():
     assert infos["agent_3"]["clearance"] == pytest.approx(2.418 - infos["agent_3"]["speed"])
     with pytest.raises(UserError, match="call reset"):
         env.step(actions)
+    with pytest.raises(UserError, match="no render_mode='human' of robots"):
+        SafeMuJoCoParallel(render_mode="human")
+
+
+def test_a_copy_goes_on_like_the_original(engine):
+    """Tools that run several environments copy them, or send them to other processes."""
+    env = SafeMuJoCoParallel(parts="4x2", episode_length=30)
+    env.reset(seed=1)
+    actions = dict.fromkeys(env.agents, np.full(2, 0.7, np.float32))
+    for _ in range(5):
+        env.step(actions)
+    copies = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
+    for _ in range(5):
+        seen, reward, *_ = env.step(actions)
+        for other in copies:
+            theirs, paid, *_ = other.step(actions)
+            np.testing.assert_array_equal(theirs["agent_1"], seen["agent_1"])
+            assert paid == reward
 
 
 @pytest.mark.parametrize("parts", ROBOTS)
@@ -203,3 +223,10 @@ def test_live_against_gymnasium_robotics(parts, tmp_path, monkeypatch):
         assert out.speed[0] == pytest.approx(np.hypot(told["x_velocity"], told.get("y_velocity", 0.0)), abs=1e-6)
         assert out.terminated[0] == ended[theirs.possible_agents[0]]
     theirs.close()
+
+
+def test_actions_that_are_not_numbers_are_refused():
+    sim = SafeMuJoCo("2x3").simulate(1, threads=1)
+    sim.reset([0])
+    with pytest.raises(UserError, match="actions that are not numbers"):
+        sim.step(np.full((1, 2, 3), np.nan))

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ringfence import evaluate, tasks, training
+from ringfence import evaluate, hazards, tasks, training
 from ringfence.data import EpisodeStore, ogmarl
 from ringfence.data.audit import audit
 from ringfence.data.ogmarl import import_madiff, import_vault
@@ -141,6 +141,57 @@ def test_a_vault_becomes_the_simulators_own_data(tmp_path, task):
     assert facts["return ceiling"].startswith(f"{store.card['return_ceiling']:.0f} within the limit")
 
 
+def test_a_recording_can_be_read_under_another_limit(tmp_path):
+    log = recorded("2x3")
+    vault = write_vault(tmp_path, log)
+    store = import_vault(vault, "halfcheetah_2x3", "quantile")
+    assert tasks.from_store(store) == tasks.get("halfcheetah_2x3-good-quantile") and store.hazard.limit == 7.903
+    assert store.card["protocol"] == "quantile" and not store.costs.any()
+    slow = import_vault(vault, "halfcheetah_2x3", 0.5)
+    np.testing.assert_array_equal(slow.costs, log["speed"] > 0.5)
+    task = tasks.from_store(slow)
+    assert task.name == "halfcheetah_2x3-good-below-0.5" and task.env.limit == 0.5 and slow.card["protocol"] == "own"
+    with pytest.raises(UserError, match="no quantile limit for 'halfcheetah_2x3-imported'; pass --speed-limit"):
+        import_vault(vault.rename(tmp_path / "mine"), "halfcheetah_2x3", "quantile")
+
+
+def test_falls_that_were_not_paid_keep_their_speed(tmp_path):
+    """Gymnasium's version 5 pays nothing for standing on the step that falls."""
+    log = recorded("4x2", jump=True)
+    v5 = {**log, "rewards": log["rewards"].copy()}
+    ends = np.flatnonzero(log["last"])
+    v5["rewards"][ends[log["fallen"]]] -= 1.0
+    first = import_vault(write_vault(tmp_path / "a", log), "ant_4x2", 0.5)
+    store = import_vault(write_vault(tmp_path / "b", v5), "ant_4x2", 0.5)
+    np.testing.assert_array_equal(store.costs, first.costs)
+    assert "1 falls were not paid the 1 for standing" in " ".join(store.card["warnings"])
+    assert "not paid" not in " ".join(first.card["warnings"])
+
+
+def test_data_that_is_not_what_its_name_says_is_refused(tmp_path):
+    store = import_vault(write_vault(tmp_path, recorded("2x3")), "halfcheetah_2x3")
+    named = lambda **card: replace(store, card={**store.card, **card})  # noqa: E731
+    with pytest.raises(UserError, match="called 'halfcheetah_2x3-good', whose danger is .*3.227.* but defines .*1.0"):
+        tasks.from_store(named(hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vx"]}))
+    wide = hazards.to_dict(replace(store.hazard, safe_margin=1.0))  # the same danger
+    assert tasks.from_store(named(hazard=wide)).hazard.safe_margin == 1.0
+    bare = tasks.from_store(named(hazard={"kind": "CostColumn"}))
+    assert bare == tasks.get("halfcheetah_2x3-good")
+    shifted = np.concatenate([np.zeros((len(store.state), 1), np.float32), store.state], 1)
+    with pytest.raises(StoreError, match="has 18 state entries, its simulator 17; bring it into that layout"):
+        tasks.from_store(replace(store, state=shifted, card={**store.card, "state_names": None}))
+    names = list(store.card["state_names"])
+    names[:2] = names[1::-1]
+    with pytest.raises(StoreError, match="its state entry 0 is 'torso.pitch', of its simulator 'torso.z'"):
+        tasks.from_store(named(state_names=names))
+    report = audit(named(state_names=names))
+    assert report.warnings[0].startswith("Nothing can be trained on this: The data is called")
+    # danger that the robot's simulator does not count: data alone
+    own = named(task="halfcheetah_2x3-mine", hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vz"]})
+    task = tasks.from_store(own)
+    assert task.env is None and task.cost_limit == 25.0 and task.presets == ("mujoco",)
+
+
 def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     """Recordings are called Replay, or anything: their robot can still be played."""
     vault = write_vault(tmp_path, recorded("2x3"))
@@ -213,7 +264,8 @@ def test_madiffs_ant_says_what_it_lacks(tmp_path):
     assert store.lengths.tolist() == [19, 19, 19] and "falls are not marked" in told
     vx = log["rewards"].mean(1) - 1.0 + 0.5 * (log["actions"] ** 2).sum((1, 2))
     np.testing.assert_array_equal(store.costs, (abs(vx) > 2.418)[~log["last"]])
-    assert tasks.from_store(store).env is None
+    task = tasks.from_store(store)
+    assert task.env is None and (task.cost_limit, task.presets) == (25.0, ("mujoco",))
     assert store.hazard.features == ("torso.vx",) and store.card["task"] == "ant_4x2-medium-observations"
 
 

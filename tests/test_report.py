@@ -148,7 +148,7 @@ def test_seeds_are_pooled(runs):
 
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
-    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes, at most 7\.2 %"
+    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes \(2 seeds\), at most 7\.2 %"
     assert re.search(f'class="headline">{said}', text)
 
 

@@ -129,6 +129,25 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     assert cheetah["steps"].tolist() == [5, 5] and not cheetah["terminated"].any()
 
 
+class Outside:
+    """A policy that knows nothing of JAX, like one around a network of another library."""
+
+    def start(self, batch):
+        return 0
+
+    def act(self, memory, observations, state, key):
+        assert isinstance(observations, np.ndarray)
+        return memory + 1, PolicyStep(np.full((*observations.shape[:2], 3), 0.1 * (memory % 2)), {})
+
+
+def test_any_object_can_play_a_robot():
+    task = tasks.get("halfcheetah_2x3-poor")
+    told, _ = evaluate.evaluate_policy(Outside(), replace(task, env=replace(task.env, episode_length=4)), 2)
+    assert np.isfinite(told["return_mean"]) and told["steps_mean"] == 4
+    with pytest.raises(UserError, match="Outside is no pytree; make it an equinox.Module"):
+        evaluate.evaluate_policy(Outside(), tasks.get("simple_spread-expert"), 2)
+
+
 def test_behaviour_learning_is_reproducible():
     env = SafeMuJoCo("2x3", episode_length=40)
     learner = MATD3Config(hidden=8, batch=16, discount=0.9, reward_scale=1.0)
@@ -212,7 +231,10 @@ def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
     assert sum(card["episodes_of_policy"]) == store.episodes and len(card["policies"]) == 4
     with pytest.raises(UserError, match="size=0"):
         make(task, 0)
-    native, _ = make(replace(task, name="x", env=replace(task.env, speed_limit=0.01)), 300)
+    slow = replace(task, env=replace(task.env, speed_limit=0.01))
+    with pytest.raises(UserError, match="has the danger .*limit=1.026.* counts above 0.01 m/s"):
+        make(slow, 300)
+    native, _ = make(replace(slow, hazard=replace(task.hazard, limit=0.01)), 300)  # not the one that is kept
     np.testing.assert_array_equal(native.actions, store.actions)  # limits change labels alone
     assert native.costs.mean() > store.costs.mean()
     assert card["return_ceiling"] >= 60

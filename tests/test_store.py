@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import ringfence.data.store as store_module
 from ringfence.data.store import ARRAYS, EpisodeStore
 from ringfence.errors import StoreError, UserError
 from ringfence.windows import WindowData, at, return_scores, returns_to_go
@@ -314,3 +315,44 @@ def test_return_scores_keep_the_order_within_a_time_step(lengths, seed):
         assert (np.diff(scores[here][order]) >= 0).all()
         for value in np.unique(togo[here]):
             assert len(np.unique(scores[here & (togo == value)])) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("rewards", lambda x: x.T),
+        ("costs", lambda x: x.T),
+        ("costs", lambda x: x[:, :-1]),
+        ("observations", lambda x: x[:-1]),
+        ("state", lambda x: x[:, :-1]),
+        ("terminated", lambda x: x[:-1]),
+    ],
+)
+def test_arrays_that_do_not_fit_together_are_refused_by_name(played, name, wrong):
+    """Reshaped as they are, they would be spread over other episodes in silence."""
+    arrays = {k: played[k] for k in ("observations", "actions", "rewards", "costs", "state")}
+    arrays["rewards"] = arrays["rewards"].mean(-1)
+    arrays["terminated"] = np.zeros(len(arrays["costs"]), bool)
+    arrays[name] = wrong(arrays[name])
+    with pytest.raises(StoreError, match=f"got {name} of shape .*40 episodes of 25 steps and 3 agents|and actions"):
+        EpisodeStore.from_episodes(**arrays)
+
+
+def test_logs_without_costs_and_odd_cards(played):
+    arrays = [played[k] for k in ("observations", "actions", "rewards")]
+    assert not EpisodeStore.from_episodes(*arrays, None).costs.any()
+    for card, said in (
+        ({"hazard": "Separation"}, "hazard='Separation'; it must be a Separation, SpeedLimit"),
+        ({"action_low": [-1, -1]}, r"action_low=\[-1, -1\]; it must be one number"),
+        (["task"], "card is a list"),
+        ({"hazard": {"kind": "Separation", "radius": "big"}}, "radius='big'; it must be a number, 0 or more"),
+        ({"hazard": {"kind": "SpeedLimit", "limit": -1.0}}, "limit=-1.0; it must be a number, 0 or more"),
+    ):
+        with pytest.raises(UserError, match=said):
+            EpisodeStore.from_episodes(*arrays, None, card=card)
+
+
+def test_a_file_larger_than_memory_is_refused_before_it_is_read(tmp_path, small_store, monkeypatch):
+    monkeypatch.setattr(store_module, "_memory", lambda: 1000.0)
+    with pytest.raises(StoreError, match="GiB of arrays, this machine has 0.0 GiB of memory; take a larger"):
+        EpisodeStore.load(small_store.save(tmp_path / "s.h5"))

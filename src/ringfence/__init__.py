@@ -18,6 +18,7 @@ _WHERE = {
     "All": "ringfence.hazards",
     "train": "ringfence.training",
     "load": "ringfence.evaluate",
+    "Controller": "ringfence.evaluate",
     "build_report": "ringfence.report",
 }
 __all__ = list(_WHERE)

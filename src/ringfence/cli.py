@@ -73,6 +73,8 @@ def import_ogmarl(
     vault: Positional[Path],
     task: Robot,
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    speed_limit: float | None = None,
+    quantile: bool = False,
 ) -> None:
     """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
 
@@ -80,16 +82,20 @@ def import_ogmarl(
         vault: e.g. 2halfcheetah.vlt/Good.
         task: whose robot it is.
         out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
     """
     from ringfence.data.ogmarl import import_vault
 
-    _imported(import_vault(vault, task), out_file)
+    _imported(import_vault(vault, task, _limit(speed_limit, quantile)), out_file)
 
 
 def import_madiff(
     directory: Positional[Path],
     task: Robot,
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    speed_limit: float | None = None,
+    quantile: bool = False,
 ) -> None:
     """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
 
@@ -97,10 +103,18 @@ def import_madiff(
         directory: the one that holds the arrays.
         task: whose robot it is.
         out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
     """
     from ringfence.data.ogmarl import import_madiff
 
-    _imported(import_madiff(directory, task), out_file)
+    _imported(import_madiff(directory, task, _limit(speed_limit, quantile)), out_file)
+
+
+def _limit(speed_limit: float | None, quantile: bool):
+    if quantile and speed_limit is not None:
+        raise UserError("--quantile and --speed-limit both set the limit; give one of them.")
+    return "quantile" if quantile else speed_limit
 
 
 def _imported(store, file: Path) -> None:
@@ -224,9 +238,10 @@ def evaluate(
 
     given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
     given |= _assignments(set)
-    table = Table(
-        "run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm"
-    )
+    names = ("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
+    table = Table(*names, "ended early")
+    if not runs:
+        raise UserError("No run was given; name run folders that `ringfence train` made.")
     found = _runs(runs)
     if video:
         from ringfence.evaluate import load_job
@@ -248,6 +263,7 @@ def evaluate(
             f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
             f"{r['return_norm']:.3f}",
             f"{r['cost_norm']:.3f}",
+            f"{100 * r['termination_rate']:.0f} %",
         )
     out.print(table)
 
@@ -299,7 +315,18 @@ def doctor() -> None:
         out.print(f"{name:12} {version}")
     out.print(f"{'devices':12} {', '.join(told['devices'])}")
     out.print(f"{'cache':12} {cache_dir()}", soft_wrap=True)
-    for package, extra, use in (("tensorboardX", "tensorboard", "TensorBoard logs"), ("mpe2", "test", "parity tests")):
+    from ringfence.report import video
+
+    try:
+        out.print(f"{'films':12} drawn by {video.backend()}")
+    except UserError as error:
+        out.print(f"{'films':12} [yellow]missing[/], {escape(str(error))}", soft_wrap=True)
+    for package, extra, use in (
+        ("tensorboardX", "tensorboard", "TensorBoard logs"),
+        ("tensorstore", "vault", "OG-MARL's Vaults"),
+        ("ray", "ray", "benchmarks on a cluster"),
+        ("mpe2", "test", "parity tests"),
+    ):
         try:
             out.print(f"{package:12} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
@@ -337,6 +364,9 @@ def bench(
 ) -> None:
     """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
 
+    Of a results folder: `ringfence bench status FOLDER`, `bench results FOLDER`, `bench export FOLDER`; of two,
+    `bench paper-table`.
+
     Args:
         suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites.
         seeds: per algorithm and task.
@@ -358,10 +388,11 @@ def bench(
         parts, algorithms = paper.parts(tasks), algorithms or list(paper.METHODS)
     elif out_dir is None:
         root = root / suite
-    complete = True
+    complete, idle = True, True
     for part, names in parts.items():
         folder = root / part if suite == "paper" else root
         grid = make_grid(part, folder, seeds=seeds, episodes=episodes, only_tasks=names, only=algorithms, steps=steps)
+        idle = idle and not grid.groups()
         counts = _run_grid(grid, engine, workers, threads, memory, address)
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
         if counts["done"] and suite != "paper":
@@ -371,6 +402,10 @@ def bench(
             complete = False
     if suite == "paper":
         bench_paper(root)
+    if idle:
+        out.print(
+            f"All cells were there already, nothing was made; to make them yourself, give another --out than {root}."
+        )
     if not complete:
         sys.exit(1)
 
@@ -435,7 +470,7 @@ def bench_paper(folder: Positional[Path] = Path("results")) -> None:
     for task, (name, _) in paper.PRINTED.items():
         cells = []
         for x in (x for x in lines if x.task == task):
-            cells += [f"{v[0]:.2f}/{v[2]:.2f}" if v else "–" for v in (x.printed, x.ours)]
+            cells += [f"{x.printed[0]:.2f}/{x.printed[2]:.2f}", paper.brief(x).replace(" / ", "/")]
         table.add_row(name, *cells)
     Console(highlight=False, width=max(out.width, 100)).print(table)
     print(paper.write(lines, folder / "paper.csv"))
@@ -534,7 +569,7 @@ def _store(data: str):
     from ringfence.data.make import make
     from ringfence.data.store import EpisodeStore
 
-    if Path(data).suffix in (".h5", ".hdf5") or Path(data).is_file():
+    if Path(data).suffix in (".h5", ".hdf5", ".hdf") or Path(data).is_file() or len(Path(data).parts) > 1:
         return EpisodeStore.load(data)
     return make(tasks.get(data))[0]
 

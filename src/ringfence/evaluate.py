@@ -68,6 +68,11 @@ def rollout(
         kept["state"] = jnp.concatenate([env.global_state(state)[:, None], kept["state"]], 1)
         return kept
 
+    if _foreign(policy):
+        raise UserError(
+            f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
+            "act() uses jax.numpy."
+        )
     compiled = jax.jit(play, static_argnums=(2, 3))
     chunks, done, recorded = [], 0, {}
     with Progress(label or "evaluating", episodes, 0, quiet) as bar:
@@ -91,7 +96,8 @@ def _rollout_native(
     and costs are 0 and its state stays."""
     sim = env.simulate(episodes)
     sim.reset([(root, k) for k in range(episodes)])
-    act = jax.jit(lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key))
+    act = lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key)  # noqa: E731
+    act = act if _foreign(policy) else jax.jit(act)
     memory = policy.start(episodes)
     states = [sim.state().astype(np.float32)]
     steps, info, lengths = [], [], np.zeros(episodes, int)
@@ -115,6 +121,11 @@ def _rollout_native(
         [kept["states"], np.repeat(kept["states"][:, -1:], env.episode_length + 1 - len(states), 1)], 1
     )
     return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
+
+
+def _foreign(policy: Policy) -> bool:
+    """Whether a policy is an ordinary object that JAX cannot take apart, e.g. one around a PyTorch network."""
+    return jax.tree_util.all_leaves([policy])
 
 
 def _padded(x: np.ndarray, length: int) -> np.ndarray:
@@ -191,7 +202,8 @@ def evaluate_policy(
     label: str = "",
     quiet: bool = True,
 ) -> tuple[dict, dict[str, np.ndarray]]:
-    """(summary, what was recorded) of a policy on a task's simulator."""
+    """(summary, what was recorded) of a policy on a task's simulator. Robots are played by any object with `start` and
+    `act` (types.Policy); Simple Spread, which runs inside JAX, by pytrees."""
     if task.env is None:
         raise UserError(f"Task '{task.name}' exists only as data, so nothing can be evaluated; use a simulated task.")
     if episodes < 1:
@@ -203,15 +215,47 @@ def evaluate_policy(
     return result | {"eval_seconds": time.perf_counter() - begun}, played
 
 
-def load(run: Run | str, step: int | None = None, **options):
-    """(job, policy) of a finished run; `options` are fields of PlanOptions, read at evaluation time."""
+def load(run: Run | str, step: int | None = None, planner: str = "plain", **options):
+    """(job, policy) of a finished run; `planner` is a named set of planner options (policies.PLANNERS), `options` are
+    fields of PlanOptions that change it. The policy's `act` is a pure function: compile it with jax.jit, or use a
+    `Controller`."""
     run = run if isinstance(run, Run) else Run(Path(run))
+    if planner not in PLANNERS:
+        raise unknown("planner", planner, PLANNERS)
+    options = {**PLANNERS[planner], **options}
     job = load_job(run)
     template = jax.eval_shape(
         lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
     )
     _, state = run.load_checkpoint(template, step)
     return job, make_policy(job, state, options)
+
+
+class Controller:
+    """A trained policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
+
+    controller = Controller("runs/…/seed-0", planner="guarded")
+    controller.reset()                             # at the start of every episode
+    action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
+    """
+
+    def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
+        self.job, self.policy = load(run, planner=planner, **options)
+        self._key = jax.random.key(seed)
+        self._act = jax.jit(lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key))
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: plans in progress and histories are forgotten."""
+        self._memory = self.policy.start(1)
+
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None) -> np.ndarray:
+        """(N, A) joint action within the task's bounds."""
+        self._key, key = jax.random.split(self._key)
+        state = None if state is None else np.asarray(state, np.float32)[None]
+        seen = np.asarray(observations, np.float32)[None]
+        self._memory, step = self._act(self.policy, self._memory, seen, state, key)
+        return np.asarray(step.action[0])
 
 
 def load_job(run: Run) -> training.Job:
@@ -268,9 +312,7 @@ def evaluate(
 
     `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones.
     """
-    if planner not in PLANNERS:
-        raise unknown("planner", planner, PLANNERS)
-    job, policy = load(run, step, **{**PLANNERS[planner], **options})
+    job, policy = load(run, step, planner, **options)
     told = run.config
     plans = isinstance(policy, Planner)
     variant = variant_name(job, planner if plans else "plain", options if plans else {}, split)

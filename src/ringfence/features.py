@@ -47,7 +47,8 @@ class FeatureMap:
                     f"View '{self.view}' needs the global state, which this data does not have; "
                     "store it or use view='decentralized'."
                 )
-            return state[..., self.plus] - state[..., np.maximum(self.minus, 0)] * taken
+            entries = state[..., self.plus]
+            return entries - state[..., np.maximum(self.minus, 0)] * taken if taken.any() else entries
         rows = np.arange(self.plus.shape[0])[:, None]
         return observations[..., rows, self.plus]
 

@@ -141,10 +141,31 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
             raise unknown(f"config field of {of}", name, fields)
         default = fields[name].default
         values[name] = _parse(name, value, default) if isinstance(value, str) else value
+        _in_range(of, name, values[name])
         options = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
         if options and values[name] not in options:
             raise unknown(f"value of {of}'s {name}", str(values[name]), map(str, options))
     return kind(**values)
+
+
+# Least and largest value that a field of this name may have, in whatever config it is.
+RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps"), (1, None))
+RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "bank", "bank_batch"), (1, None))
+RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
+RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
+RANGES |= dict.fromkeys(("history", "warmup", "critic_updates", "barrier_weight", "delta", "cql_weight"), (0, None))
+RANGES |= {"horizon": (2, None), "grad_clip": (0, None), "cost_limit": (0, None)}
+
+
+def _in_range(of: str, name: str, value: Any) -> None:
+    low, high = RANGES.get(name, (None, None))
+    if not isinstance(value, int | float) or isinstance(value, bool):
+        return
+    if not np.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
+        bound = "finite" if low is None else f"at least {low}" if high is None else f"between {low} and {high}"
+        raise UserError(f"{name}={value} of {of} must be {bound}.")
+    if name == "lr" and value <= 0:
+        raise UserError(f"lr={value} of {of} must be positive.")
 
 
 def _parse(name: str, text: str, default: Any) -> Any:

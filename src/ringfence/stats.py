@@ -72,9 +72,9 @@ def stratified_bootstrap(
 ) -> tuple[float | np.ndarray, float | np.ndarray]:
     """Percentile interval of statistic(scores) for (R, M) scores; runs are resampled within every task.
 
-    `statistic` maps (draws, R, M) to (draws, ...), e.g. `iqm`.
+    `statistic` maps (draws, R, M) to (draws, ...), e.g. `iqm`. One run has no interval: it is refused.
     """
-    x = _matrix(scores)
+    x = _several(scores)
     parts = [statistic(part) for part in _resamples(x, draws, np.random.default_rng(seed))]
     return _percentiles(np.concatenate(parts), level)
 
@@ -93,7 +93,7 @@ def improvement_interval(
     """Stratified bootstrap interval of `probability_of_improvement`; both sides are resampled."""
     probability_of_improvement(x, y)
     rng = np.random.default_rng(seed)
-    x, y = _matrix(x), _matrix(y)
+    x, y = _several(x), _several(y)
     pairs = zip(_resamples(x, draws, rng, 200), _resamples(y, draws, rng, 200))
     return _percentiles(np.concatenate([_improvement(a, b) for a, b in pairs]), level)
 
@@ -129,15 +129,35 @@ def holm(p_values: np.ndarray) -> np.ndarray:
 def rank(returns: np.ndarray, costs: np.ndarray, limit: float) -> np.ndarray:
     """Order of entries, best first: those whose cost is within the limit by higher return, then the rest by lower
     cost. Pass the upper ends of the costs' intervals to demand more than a point estimate."""
+    safe, key = _merit(returns, costs, limit)
+    return np.lexsort((key, ~safe))
+
+
+def places(returns: np.ndarray, costs: np.ndarray, limit: float) -> np.ndarray:
+    """The place of every entry in the order of `rank`, from 1; equal entries share the better one."""
+    safe, key = _merit(returns, costs, limit)
+    ahead = (safe[:, None] > safe) | ((safe[:, None] == safe) & (key[:, None] < key))
+    return 1 + ahead.sum(0)
+
+
+def _merit(returns: np.ndarray, costs: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray]:
+    """(who is within the limit, what is least for the best among equals in that)."""
     returns, costs = np.asarray(returns, np.float64), np.asarray(costs, np.float64)
     safe = costs <= limit
-    return np.lexsort((np.where(safe, -returns, costs), ~safe))
+    return safe, np.where(safe, -returns, costs)
 
 
 def _matrix(scores: np.ndarray) -> np.ndarray:
     x = np.asarray(scores, np.float64)
     if x.ndim != 2 or not x.size:
         raise UserError(f"Scores of shape {x.shape} are not a table; pass (runs, tasks).")
+    return x
+
+
+def _several(scores: np.ndarray) -> np.ndarray:
+    x = _matrix(scores)
+    if len(x) < 2:
+        raise UserError("One run per task says nothing about the spread between runs; an interval needs two or more.")
     return x
 
 

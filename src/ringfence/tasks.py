@@ -8,7 +8,7 @@ from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, SimpleSpread
 from ringfence.envs.mujoco import Parts
-from ringfence.errors import UserError, unknown
+from ringfence.errors import StoreError, UserError, unknown
 from ringfence.types import Env, Spec
 
 
@@ -103,6 +103,11 @@ QUANTILE_LIMITS = {
 }
 
 
+def _velocity(env: SafeMuJoCo) -> tuple[str, ...]:
+    """The entries whose norm a robot's limit is about."""
+    return ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)
+
+
 def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None, quantile: bool = False) -> Task:
     """`native`: safety-gymnasium's speed limit. `quantile`: one that the tier's data exceeds on 40 % of its steps."""
     name = f"{SafeMuJoCo(parts).name}-{tier}"
@@ -110,7 +115,7 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
     return Task(
         name + "-quantile" * quantile,
         env,
-        hazards.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",)),
+        hazards.SpeedLimit(env.limit, _velocity(env)),
         tier=tier,
         presets=("mujoco-quantile", "mujoco") if quantile else ("mujoco",),
         published_return=(mean, deviation),
@@ -159,36 +164,79 @@ def twin(name: str) -> str | None:
 
 
 def simulated(name: str, hazard: hazards.Hazard) -> Task | None:
-    """The task of that name with the danger that its data defines; None where there is no simulator for it.
+    """The task of that name with the danger that its data defines; None where there is no simulator that counts it.
 
-    `halfcheetah_2x3-replay` and the like, tiers that are not of this package, are played by their robot.
+    `halfcheetah_2x3-replay` and the like, tiers that are not of this package, are played by their robot with the
+    data's speed limit. Data under the name of a task must mean the same danger; a bare cost column means the task's.
     """
     if name in TASKS:
-        return replace(TASKS[name], hazard=hazard)
+        task = TASKS[name]
+        if isinstance(hazard, hazards.CostColumn):
+            return task
+        if _danger(hazard) != _danger(task.hazard):
+            raise UserError(
+                f"The data is called '{name}', whose danger is {task.hazard}, but defines {hazard}; give it a name of "
+                f"its own, e.g. '{name}-mine', or the task's hazard."
+            )
+        return replace(task, hazard=hazard)
     robot, _, tier = name.partition("-")
     for parts, constants in _ROBOTS.items():
-        env = SafeMuJoCo(parts, hazard.limit if isinstance(hazard, hazards.SpeedLimit) else None)
+        env = SafeMuJoCo(parts)
         if tier and robot == env.name:
+            if not isinstance(hazard, hazards.SpeedLimit) or tuple(hazard.features) != _velocity(env):
+                return None
+            env = replace(env, speed_limit=hazard.limit)
             return Task(name, env, hazard, tier=tier, presets=("mujoco",), **constants)
     return None
 
 
+def _danger(hazard: hazards.Hazard) -> hazards.Hazard:
+    """What costs follow from: a hazard without its safe margin."""
+    return hazard if isinstance(hazard, hazards.CostColumn | hazards.All) else replace(hazard, safe_margin=0.0)
+
+
 def from_store(store: EpisodeStore) -> Task:
     """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
-    name = store.card["task"]
-    task = simulated(name, store.hazard)  # danger is what the data says it is
-    if task is not None and (name in TASKS or store.card["state_names"] == list(task.env.state_names)):
-        return task
+    name, card = store.card["task"], store.card
+    task = simulated(name, store.hazard)
+    if task is not None:
+        wrong = _misfit(store, task.env)
+        if name in TASKS and wrong:
+            raise StoreError(
+                f"The data is called '{name}', but {wrong}; bring it into that layout, or give it a name of its own."
+            )
+        if name in TASKS or (not wrong and card["state_names"]):
+            return task
     returns = store.returns
     low, high = float(returns.min()), float(returns.max())
+    robot = any(name.startswith(f"{SafeMuJoCo(parts).name}-") for parts in _ROBOTS)
     return Task(
         name,
         None,
         store.hazard,
         return_min=low,
         return_max=high if high > low else low + 1.0,
-        cost_limit=1.0,
+        cost_limit=float(card.get("cost_limit", 1.0)),
         transitions=store.steps,
-        action_low=float(store.card["action_low"]),
-        action_high=float(store.card["action_high"]),
+        presets=("mujoco",) if robot else (),
+        action_low=float(card["action_low"]),
+        action_high=float(card["action_high"]),
     )
+
+
+def _misfit(store: EpisodeStore, env: Env) -> str:
+    """Where a store's arrays are not those of the simulator, in words; empty where they are."""
+    width = 0 if store.state is None else store.state.shape[1]
+    for what, here, there in (
+        ("agents", store.n_agents, env.n_agents),
+        ("action entries", store.actions.shape[2], env.action_dim),
+        ("observation entries", store.observations.shape[2], env.observation_dim),
+        ("state entries", width, len(env.state_names)),
+    ):
+        if here != there:
+            return f"has {here} {what}, its simulator {there}"
+    names = store.card["state_names"]
+    if names and list(names) != list(env.state_names):
+        k = next(k for k, (a, b) in enumerate(zip(names, env.state_names)) if a != b)
+        return f"its state entry {k} is '{names[k]}', of its simulator '{env.state_names[k]}'"
+    return ""

@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import json
 import operator
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -98,9 +99,19 @@ def train(
     `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
+    if not isinstance(data, EpisodeStore):
+        raise UserError(
+            f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
+            "ringfence.data.make.make(ringfence.tasks.get(NAME))[0]."
+        )
     job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
     place = folder or (lambda seed: folder_of(out, job, seed))
+    if not seeds or min(seeds) < 0:
+        raise UserError(f"seeds={tuple(seeds)} must be one or more numbers of 0 or more.")
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
+    updates = getattr(job.config, "critic_updates", 0)
+    if updates and not quiet:
+        print(f"{data.card['task']}: what its states are worth, {updates} updates of a critic first", file=sys.stderr)
     windows = windows_of(
         data,
         job.task,
@@ -109,7 +120,7 @@ def train(
         getattr(job.config, "discount", 1.0),
         getattr(job.config, "condition", None),
         job.config.horizon,
-        getattr(job.config, "critic_updates", 0),
+        updates,
     )
     steps = job.config.steps
     chunk = chunk or max(1, steps // 40)

@@ -32,8 +32,10 @@ class Env(Protocol):
 
     n_agents: int
     action_dim: int
+    observation_dim: int
     episode_length: int  # the time limit
     terminates: bool  # whether the task itself may end an episode before
+    state_names: tuple[str, ...]  # entries of the global state
 
     def reset(self, key: Key, batch: int) -> PyTree: ...
 

@@ -216,7 +216,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
 
     A cell that fails is recorded and does not stop the others.
     """
-    left = list(cells)
+    left, adopted = list(cells), {}
     while left:
         begun = time.perf_counter()
         current = left[0]
@@ -230,6 +230,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
                 if found["variant"] != variant:
                     raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
             seconds = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
+            seconds |= adopted.get(current, {})
             _record(current, out, "done", seconds)
             tell("done", left.pop(0))
             begun = time.perf_counter()
@@ -241,7 +242,8 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
         try:
             store = data_of(current.task, current.transitions)
             for cell in left:
-                adopt(cell, out)
+                if twin := adopt(cell, out):
+                    adopted[cell] = {"adopted": str(twin.folder(out).relative_to(out))}
             training.train(
                 current.algorithm,
                 store,
@@ -264,15 +266,17 @@ def data_of(task: str, transitions: int | None) -> EpisodeStore:
     return make(tasks.get(task), transitions)[0]
 
 
-def adopt(cell: Cell, out: Path) -> None:
-    """Begin a cell with what its twin has learned, where that is there; its training is then over at once."""
+def adopt(cell: Cell, out: Path) -> Cell | None:
+    """Begin a cell with what its twin has learned, where that is there, and return the twin; its training is then over
+    at once."""
     twin = cell.twin()
     if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
-        return
+        return None
     there, here = Run(twin.folder(out)), Run(cell.folder(out))
     for file in (there.path / "metrics.jsonl", *(f for _, f in there.checkpoints()[-1:])):
         with whole(here.path / file.relative_to(there.path)) as temporary:
             shutil.copyfile(file, temporary)
+    return twin
 
 
 def _record(cell: Cell, out: Path, state: str, more: dict) -> None:

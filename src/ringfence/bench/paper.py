@@ -21,6 +21,7 @@ from ringfence.errors import UserError, unknown
 from ringfence.files import whole
 
 FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
+SEEDS = 5  # of the paper
 METHODS = ("ma-td3bc", "omar", "icbf")
 # The paper's rows: its name of a task, ours, and (reward, deviation, cost, deviation) of MA-TD3BC, OMAR and its own
 # method. "md" is the one tier of Simple Spread that is left: medium-replay.
@@ -84,7 +85,7 @@ class Line:
     task: str
     method: str
     printed: tuple[float, float, float, float]
-    ours: tuple[float, float, float, float] | None
+    ours: tuple[float, float | None, float, float | None] | None  # no deviation of one seed
     variant: str = ""
     seeds: int = 0
 
@@ -98,7 +99,7 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             f"Neither {names} is a results folder; run `ringfence bench paper`, or name the folder it wrote."
         )
     for folder in folders:
-        for r in rows(folder) if (folder / "bench.json").exists() else ():
+        for r in rows(folder, may_be_empty=True) if (folder / "bench.json").exists() else ():
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
     out = []
     for task, (_, values) in PRINTED.items():
@@ -112,9 +113,9 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
     return out
 
 
-def _summary(runs: list[dict]) -> tuple[float, float, float, float]:
+def _summary(runs: list[dict]) -> tuple[float, float | None, float, float | None]:
     reward, cost = (np.array([r[k] for r in runs]) for k in ("return_norm", "cost_norm"))
-    spread = lambda x: float(x.std(ddof=1)) if len(x) > 1 else 0.0  # noqa: E731
+    spread = lambda x: float(x.std(ddof=1)) if len(x) > 1 else None  # noqa: E731
     return float(reward.mean()), spread(reward), float(cost.mean()), spread(cost)
 
 
@@ -127,10 +128,16 @@ def markdown(table: list[Line]) -> str:
         for line in (x for x in table if x.task == task):
             r, _, c, _ = line.printed
             cells.append(f"*{r:.2f} / {c:.2f}*")
-            few = f" [{line.seeds}]" if 0 < line.seeds < 5 else ""
-            cells.append("–" if line.ours is None else f"{line.ours[0]:.2f} / {line.ours[2]:.2f}{few}")
+            cells.append(brief(line))
         out.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(out)
+
+
+def brief(line: Line) -> str:
+    """Ours in short: reward / cost, and the number of seeds where there are fewer than the paper's five."""
+    if line.ours is None:
+        return "–"
+    return f"{line.ours[0]:.2f} / {line.ours[2]:.2f}" + (f" [{line.seeds}]" if line.seeds < SEEDS else "")
 
 
 def write(table: list[Line], path: Path) -> Path:
@@ -141,7 +148,7 @@ def write(table: list[Line], path: Path) -> Path:
     head = [f"{whose}_{n}" for whose in ("paper", "ours") for n in names]
     writer.writerow(["task", "method", "variant", "seeds", *head])
     for x in table:
-        ours = [f"{v:.4f}" for v in x.ours] if x.ours else [""] * 4
+        ours = ["" if v is None else f"{v:.4f}" for v in x.ours or [None] * 4]
         writer.writerow([x.task, x.method, x.variant, x.seeds, *x.printed, *ours])
     with whole(path) as temporary:
         temporary.write_text(buffer.getvalue())

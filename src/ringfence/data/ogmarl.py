@@ -21,8 +21,9 @@ import json
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -30,8 +31,8 @@ from ringfence import hazards
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, mujoco
 from ringfence.envs.mujoco import Outcome
-from ringfence.errors import StoreError, unknown
-from ringfence.tasks import ROBOT_COST_LIMIT
+from ringfence.errors import StoreError, UserError, unknown
+from ringfence.tasks import QUANTILE_LIMITS, ROBOT_COST_LIMIT
 
 ROBOTS = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
@@ -40,6 +41,7 @@ REPLAYED = 256  # steps that are replayed to find the order of actions
 AGREES = 0.05  # median over replayed steps of the largest error in the state; the wrong order has errors of 1 to 10
 STRAY, STRAYS = 1.0, 0.05  # a replayed step that misses by more is a stray; the share of them that is allowed
 SPEED_AGREES = 0.1  # m/s, median over replayed steps of the error of the speed that the reward tells
+Limit = float | Literal["quantile"] | None
 CONTACT = 5e-4  # of the squared contact forces, which some versions of the Ant charge
 
 
@@ -56,9 +58,13 @@ class Log:
     last: np.ndarray  # (T,) bool: the step ended an episode
 
 
-def import_vault(vault: str | os.PathLike, task: str) -> EpisodeStore:
-    """The store of a Vault, e.g. `2halfcheetah.vlt/Good`; `task`: halfcheetah_2x3, ant_2x4 or ant_4x2."""
+def import_vault(vault: str | os.PathLike, task: str, speed_limit: Limit = None) -> EpisodeStore:
+    """The store of a Vault, e.g. `2halfcheetah.vlt/Good`; `task`: halfcheetah_2x3, ant_2x4 or ant_4x2.
+
+    `speed_limit`: safety-gymnasium's (None), that of the tier's `-quantile` task ("quantile"), or any other (m/s).
+    """
     env, vault = _robot(task), Path(vault)
+    env, called, protocol = _limited(env, f"{task}-{_tier(vault)}", speed_limit)
     wanted = ("actions", "rewards", "terminals", "truncations", "infos.state")
     arrays = _read_vault(vault, wanted)
     where = f"Vault '{vault}'"
@@ -93,12 +99,14 @@ def import_vault(vault: str | os.PathLike, task: str) -> EpisodeStore:
     notes = (
         [f"{open_} episodes at the end of a recording have no end of their own and count as cut off"] if open_ else []
     )
-    return _store(log, env, task, f"imported from an OG-MARL Vault, '{vault}'", _tier(vault), notes)
+    return _store(log, env, called, protocol, f"imported from an OG-MARL Vault, '{vault}'", notes)
 
 
-def import_madiff(directory: str | os.PathLike, task: str) -> EpisodeStore:
-    """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`."""
+def import_madiff(directory: str | os.PathLike, task: str, speed_limit: Limit = None) -> EpisodeStore:
+    """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` as
+    of `import_vault`."""
     env, directory = _robot(task), Path(directory)
+    env, called, protocol = _limited(env, f"{task}-{_tier(directory)}", speed_limit)
     where = f"'{directory}'"
     obs, actions, rewards, lengths = (_load(directory, f) for f in ("obs", "actions", "rewards", "path_lengths"))
     n, wide = env.n_agents, OLD_OBSERVATION[env.parts]
@@ -116,7 +124,18 @@ def import_madiff(directory: str | os.PathLike, task: str) -> EpisodeStore:
     obs = obs[:, :, n:]
     state = _cheetah_state(where, obs) if not env.ant else None
     log = Log(where, state, None, None if state is not None else obs, actions, rewards, last)
-    return _store(log, env, task, f"imported from MADIFF's arrays in {where}", _tier(directory), [])
+    return _store(log, env, called, protocol, f"imported from MADIFF's arrays in {where}", [])
+
+
+def _limited(env: SafeMuJoCo, name: str, speed_limit: Limit) -> tuple[SafeMuJoCo, str, str]:
+    """(the robot under its limit, the task's name, what the limit is): a name stands for one limit."""
+    if speed_limit is None:
+        return env, name, "native"
+    if speed_limit == "quantile":
+        if name not in QUANTILE_LIMITS:
+            raise UserError(f"There is no quantile limit for '{name}'; pass --speed-limit in m/s.")
+        return replace(env, speed_limit=QUANTILE_LIMITS[name]), f"{name}-quantile", "quantile"
+    return replace(env, speed_limit=float(speed_limit)), f"{name}-below-{speed_limit:g}", "own"
 
 
 def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
@@ -129,13 +148,13 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
     return np.column_stack([z, pitch, position, vx, vz, vpitch, velocity])
 
 
-def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, notes: list[str]) -> EpisodeStore:
-    for name in ("state", "contact", "observations", "actions", "rewards"):
-        x = getattr(log, name)
+def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str, notes: list[str]) -> EpisodeStore:
+    for array in ("state", "contact", "observations", "actions", "rewards"):
+        x = getattr(log, array)
         if x is not None and not np.isfinite(x).all():
             row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
             raise StoreError(
-                f"{log.where}: {name} of step {row} is not finite (some pad with -inf); cut those rows first."
+                f"{log.where}: {array} of step {row} is not finite (some pad with -inf); cut those rows first."
             )
     if not log.last.any():
         raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
@@ -146,7 +165,7 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, not
         notes.append(f"the last {len(log.actions) - total} steps are an unfinished episode and were dropped")
     if (lengths > env.episode_length).any():
         raise StoreError(
-            f"{log.where} has an episode of {lengths.max()} steps, {task} ends after {env.episode_length}; "
+            f"{log.where} has an episode of {lengths.max()} steps, {env.name} ends after {env.episode_length}; "
             "its ends are marked wrongly."
         )
     beyond = float((np.abs(log.actions[:total]) > 1 + 1e-3).mean())
@@ -156,7 +175,7 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, not
     short = int((lengths < env.episode_length).sum() - made["terminated"].sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
-    name = f"{task}-{tier}" if log.state is not None else f"{task}-{tier}-observations"
+    name += "" if log.state is not None else "-observations"
     speed, seen = made.pop("speed"), made.pop("seen")
     card = {
         "task": name,
@@ -168,7 +187,7 @@ def _store(log: Log, env: SafeMuJoCo, task: str, provenance: str, tier: str, not
         "hazard": hazards.to_dict(hazards.SpeedLimit(env.limit, seen)),
         "episode_length": env.episode_length,
         "warnings": notes,
-        "protocol": "native",
+        "protocol": protocol,
         **env.describe(speed, ROBOT_COST_LIMIT),
     }
     return EpisodeStore.from_steps(**made, costs=speed > env.limit, card=card)
@@ -203,6 +222,12 @@ def _from_states(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) 
         "what the last action of every episode led to is not recorded: it was replayed in the simulator"
         + (f", in which {int(outcome.terminated.sum())} of {len(ends)} episodes end with a fall" if env.ant else "")
     )
+    # Gymnasium's version 5 does not pay the 1 for standing on the step that falls: its reward tells 1 m/s too little.
+    missing = outcome.reward - log.rewards[at].mean(-1)
+    unpaid = outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
+    vx[at[unpaid]] += 1.0
+    if unpaid.any():
+        notes.append(f"{int(unpaid.sum())} falls were not paid the 1 for standing; their speed is corrected")
     state, final = log.state[:total].astype(np.float32), final.astype(np.float32)
     speed, seen = np.abs(vx), ("torso.vx",)
     if env.ant:

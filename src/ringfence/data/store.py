@@ -110,7 +110,8 @@ class EpisodeStore:
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
-        costs (E, L), state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (default: none)."""
+        costs (E, L) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (none, if
+        it is not given)."""
         observations, actions = np.asarray(observations), np.asarray(actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
             raise StoreError(
@@ -118,7 +119,20 @@ class EpisodeStore:
                 "(E, L+1, N, O) and (E, L, N, A): keep the state that the last action leads to."
             )
         e, length, n = actions.shape[:3]
-        rewards = np.asarray(rewards)
+        rewards, costs = np.asarray(rewards), np.asarray(np.zeros((e, length)) if costs is None else costs)
+        one = {"observations": (observations, (e, length + 1, n)), "costs": (costs, (e, length))}
+        one["rewards"] = (rewards, (e, length, n)[: max(2, rewards.ndim)])
+        if state is not None:
+            one["state"] = (np.asarray(state), (e, length + 1))
+        if terminated is not None:
+            one["terminated"] = (np.asarray(terminated), (e,))
+        for name, (value, expected) in one.items():
+            wide = len(expected) + (name in ("observations", "state"))
+            if value.shape[: len(expected)] != expected or value.ndim != wide:
+                raise StoreError(
+                    f"from_episodes got {name} of shape {value.shape}, the actions say {e} episodes of {length} steps "
+                    f"and {n} agents; give ({', '.join(map(str, expected))}{', ...' * (wide > len(expected))})."
+                )
         if rewards.ndim == 2:
             rewards = np.repeat(rewards[..., None], n, -1)
         last = np.zeros((e, length), bool)
@@ -164,6 +178,13 @@ class EpisodeStore:
             )
         if (np.diff(ends, prepend=0) <= 0).any():
             raise StoreError("episode_ends must increase; give cumulative step counts.")
+        for name, value, rows in (
+            ("observations", observations, len(actions)),
+            ("state", state, len(actions)),
+            ("terminated", terminated, len(ends)),
+        ):
+            if value is not None and len(value) != rows:
+                raise StoreError(f"from_steps got {len(value)} rows of {name}, it takes {rows}; see its docstring.")
         lasts = {"final_observations": (final_observations, (len(ends), *observations.shape[1:]))}
         if state is not None and final_state is not None:
             lasts["final_state"] = (final_state, (len(ends), *np.shape(state)[1:]))
@@ -221,14 +242,30 @@ class EpisodeStore:
                 missing = [name for name in ARRAYS if name not in f]
                 if missing:
                     raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
+                size = sum(f[name].nbytes for name in (*ARRAYS, "state") if name in f)
+                if size > (there := _memory()):
+                    raise StoreError(
+                        f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {there / 2**30:.1f} GiB of "
+                        "memory; take a larger machine, or store fewer episodes."
+                    )
                 arrays = {name: f[name][()] for name in (*ARRAYS, "state") if name in f}
                 card = json.loads(f.attrs["card"])
-        except (OSError, KeyError, json.JSONDecodeError) as error:
-            raise StoreError(f"'{path}' is truncated or not HDF5 ({error}); make or import the store again.") from error
+        except (KeyError, json.JSONDecodeError) as error:
+            raise StoreError(f"'{path}' has no card that can be read ({error}); make or import it again.") from error
+        except OSError as error:
+            told = str(error).splitlines()[0]
+            raise StoreError(f"'{path}' is truncated or not HDF5 ({told}); make or import the store again.") from error
         try:
             return cls(**arrays, card=card)
         except StoreError as error:
             raise StoreError(f"'{path}': {error}") from None
+
+
+def _memory() -> float:
+    """Bytes of memory, infinite where the system does not say."""
+    names = getattr(os, "sysconf_names", {})
+    known = "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")
 
 
 def complete_card(card: dict | None) -> dict:
@@ -243,9 +280,20 @@ def complete_card(card: dict | None) -> dict:
         "state_names": None,
         "hazard": {"kind": "CostColumn"},
     }
+    if not isinstance(card or {}, dict):
+        raise StoreError(f"The card is a {type(card).__name__}; it must be a dictionary of fields.")
     card = {**base, **(card or {})}
+    for name in ("action_low", "action_high"):
+        if isinstance(card[name], bool) or not isinstance(card[name], int | float | np.number):
+            raise StoreError(f"The card has {name}={card[name]!r}; it must be one number, the bound of every entry.")
+        card[name] = float(card[name])
     if isinstance(card["hazard"], hazards.Hazard):
         card["hazard"] = hazards.to_dict(card["hazard"])
+    elif not isinstance(card["hazard"], dict):
+        raise StoreError(
+            f"The card has hazard={card['hazard']!r}; it must be a Separation, SpeedLimit, CostColumn or All (other "
+            "dangers go into the costs, with CostColumn)."
+        )
     hazards.from_dict(card["hazard"])
     return json.loads(json.dumps(card))
 

@@ -31,6 +31,7 @@ FRAME_SKIP = 5  # substeps of an environment step
 DT = 0.05  # s of an environment step
 RESET_SPREAD = 0.1  # of joint positions (uniform) and velocities (standard deviation) at reset
 HEALTHY_Z = (0.2, 1.0)  # m, the Ant's torso; outside the episode ends
+MARGIN = 0.01  # m, contact margin of the Ant's geoms in Gymnasium's file
 LIMITS = {"2x3": 3.227, "2x4": 2.522, "4x2": 2.418}  # m/s, safety-gymnasium's
 ROBOTS = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
 
@@ -134,6 +135,10 @@ class SafeMuJoCo:
         names = [f"torso.{c}" for c in torso] + [f"{j}.q" for j in self.joints]
         return tuple(names + [f"torso.{c}" for c in moving] + [f"{j}.v" for j in self.joints])
 
+    @property
+    def observation_dim(self) -> int:
+        return self.observed.shape[1]
+
     @cached_property
     def observed(self) -> np.ndarray:
         """(N, O) entries of the global state in every agent's observation: own joints by name (position, velocity),
@@ -171,6 +176,11 @@ class SafeMuJoCo:
         text = (Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{self.robot}.xml").read_text()
         # Newer versions warn of this attribute in a log file in the working directory.
         model = mujoco.MjModel.from_xml_string(re.sub(r'\s+settotalmass="[^"]*"', "", text))
+        if self.ant and not np.allclose(model.geom_margin[1:], MARGIN):
+            raise UserError(
+                f"Gymnasium {gymnasium.__version__} ships an Ant with other contact margins, another robot; install "
+                "'gymnasium<=1.4'."
+            )
         if self.ant and version >= (3, 5):
             model.geom_margin *= 0.5
         if hasattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND"):  # one robot is one island: the same bits, 5 % faster
@@ -191,7 +201,7 @@ class Simulation:
     def __init__(self, env: SafeMuJoCo, batch: int, threads: int | None = None):
         if batch < 1:
             raise UserError(f"batch={batch} must be at least 1.")
-        self.env, self.batch = env, batch
+        self.env, self.batch, self._threads = env, batch, threads
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         threads = max(1, min(threads or cores, batch))
         model = env.model()
@@ -232,6 +242,18 @@ class Simulation:
         self._place[ids] = self._measured()[ids] if place is None else place
         self.running[ids] = True
 
+    def __getstate__(self) -> dict:
+        """What a copy or another process needs to go on from here; the simulator itself is made again there."""
+        robots = self._robots
+        kept = {"qpos": robots.qpos, "qvel": robots.qvel, "warmstart": robots.warmstart, "place": self._place}
+        made = self.env, self.batch, self._threads
+        return {"made": made, "kept": {k: v.copy() for k, v in kept.items()}, "running": self.running.copy()}
+
+    def __setstate__(self, told: dict) -> None:
+        self.__init__(*told["made"])
+        self.restore(**told["kept"])
+        self.running[:] = told["running"]
+
     def _measured(self) -> np.ndarray:
         """(B, 1 or 2) positions whose displacement is the speed."""
         return (self._robots.torso if self.env.ant else self._robots.qpos[:, :1]).copy()
@@ -251,6 +273,8 @@ class Simulation:
         if np.shape(action) != wanted:
             raise UserError(f"step() got actions of shape {np.shape(action)}; {self.env.name} takes {wanted}.")
         action = np.clip(np.asarray(action, np.float64), -1.0, 1.0)
+        if not np.isfinite(action).all():
+            raise UserError("step() got actions that are not numbers; the policy has diverged or divides by zero.")
         self._ctrl[:, self.env.actuators] = action
         live = np.flatnonzero(self.running)
         self._robots.advance(self._ctrl, live)
@@ -286,6 +310,10 @@ class _Batch:
     def torso(self) -> np.ndarray:
         return self._xpos[:, 1, :2]
 
+    @property
+    def warmstart(self) -> np.ndarray:
+        return self._warm
+
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         self._batch.reset(ids=ids, stage=0)
         self.qpos[ids], self.qvel[ids] = qpos, qvel
@@ -309,6 +337,10 @@ class _Loop:
         self._threads, self._pool = threads, ThreadPoolExecutor(threads) if threads > 1 else None
         self.qpos, self.qvel = np.zeros((batch, model.nq)), np.zeros((batch, model.nv))
         self.torso = np.zeros((batch, 2))
+
+    @property
+    def warmstart(self) -> np.ndarray:
+        return np.stack([d.qacc_warmstart for d in self._data])
 
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         for row, k in enumerate(ids):

@@ -151,7 +151,10 @@ class SafeMuJoCoParallel(_Parallel):
 
     metadata = {"render_modes": [], "name": "ringfence_safe_mujoco"}
 
-    def __init__(self, **options: Any):
+    def __init__(self, render_mode: None = None, **options: Any):
+        if render_mode is not None:
+            raise UserError(f"There is no render_mode='{render_mode}' of robots; `ringfence eval --video` films them.")
+        self.render_mode = None
         self.core = SafeMuJoCo(**options)
         sizes = self.core.n_agents, self.core.observed.shape[1], self.core.action_dim, len(self.core.state_names)
         super().__init__(*sizes, np.float64)

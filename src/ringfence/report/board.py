@@ -97,6 +97,7 @@ class Board:
     references: dict[str, dict[str, dict]]  # task -> name -> summary
     missing: list[Missing]
     unstarted: list[str]  # entries of the suite that no cell was begun of
+    untouched: list[str]  # tasks of the suite without any cell or reference
     constants: dict[str, dict[str, float]]  # by task
     runs: list[Run] = field(repr=False, default_factory=list)  # finished ones
 
@@ -128,12 +129,14 @@ def read(folder: str | Path) -> Board:
         finished.append((run, task, job, seed))
         if state == "failed":
             partial.append(Missing(task, job, seed, f"not every evaluation is there, one failed: {reason}"))
+        elif lacking := _lacking(told["suite"], task, job, run):
+            partial.append(Missing(task, job, seed, f"not every evaluation is there: {', '.join(lacking)}"))
     if not finished:
         raise UserError(
             f"'{folder}' holds no finished cell, so there is nothing to rank; run `ringfence bench` into it first."
         )
     references = _references(folder)
-    entries = _entries(finished)
+    entries = _entries(finished, told["split"])
     _check(entries, references, told, folder)
     names = {task for _, task, _, _ in cells} | {task for task, _ in references.values()}
     known = list(tasks.TASKS)
@@ -157,6 +160,9 @@ def read(folder: str | Path) -> Board:
         references={task: rows for task, rows in references.values()},
         missing=sorted(missing, key=lambda m: (ordered.index(m.task), m.job, m.seed)),
         unstarted=[e.name for e in _suite(told["suite"]) if _entry_job(e) not in jobs],
+        untouched=[
+            t for t in (suites.SUITES[told["suite"]].tasks if told["suite"] in suites.SUITES else ()) if t not in names
+        ],
         constants=_constants(entries, references),
         runs=[run for run, *_ in finished],
     )
@@ -220,6 +226,14 @@ def _planned(suite: str, task: str, job: str) -> bool:
     return not entries or any(not e.tiers or _tier(task) in e.tiers for e in entries)
 
 
+def _lacking(suite: str, task: str, job: str, run: Run) -> list[str]:
+    """Evaluations of the suite that a run does not have."""
+    preset = run.config["preset"]
+    known = {v.removeprefix(preset).removeprefix("+") or "plain" for v in run.results if v.startswith(preset)}
+    entries = [e for e in _suite(suite) if _entry_job(e) == _job(task, job)]
+    return [v for e in entries for v in e.evaluations if not e.tiers or _tier(task) in e.tiers if v not in known]
+
+
 def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
     """File -> (task, rows by name)."""
     inside, damaged = folder / "reference", "holds a damaged reference file; delete it and make it again"
@@ -228,7 +242,7 @@ def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
     return {f: (task, read_json(f, damaged)) for f, task in files}
 
 
-def _entries(finished: list[tuple[Run, str, str, int]]) -> list[Entry]:
+def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entry]:
     configs = {run.path: run.config for run, *_ in finished}
     apart = _differing([(task, configs[run.path]) for run, task, *_ in finished])  # by (algorithm, preset)
     entries: dict[tuple, Entry] = {}
@@ -252,6 +266,8 @@ def _entries(finished: list[tuple[Run, str, str, int]]) -> list[Entry]:
         fields, config = apart.get((algorithm, preset), []), _config(told)
         words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
+            if "@" in variant and summary.get("split") != split:
+                continue  # settings were chosen there; no table is made of it
             shown = variant
             if told["preset"] != preset:
                 shown = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)

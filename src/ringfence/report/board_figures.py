@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.report.board import Method
-from ringfence.report.figures import INK, MARKERS, STYLE, figure, to_svg
+from ringfence.report.figures import FAR, INK, MARKERS, STYLE, figure, to_svg
 from ringfence.report.standings import Aggregate, Standing
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
@@ -29,10 +29,12 @@ def _marker(style: Style) -> str:
     return MARKERS[style[1] % len(MARKERS)]
 
 
-def _whiskers(ax, rows: list[tuple[float, tuple[float, float]]], styles: list[Style], digits: int) -> None:
-    """A point with its interval per row, the first on top, and the number at the right edge, clear of the points."""
-    for y, ((value, (low, high)), style) in enumerate(zip(rows, styles)):
-        ax.plot((low, high), (y, y), color=_ink(style), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
+def _whiskers(ax, rows: list[tuple[float, tuple[float, float] | None]], styles: list[Style], digits: int) -> None:
+    """A point with its interval, if it has one, per row, the first on top, and the number at the right edge, clear of
+    the points."""
+    for y, ((value, interval), style) in enumerate(zip(rows, styles)):
+        if interval:
+            ax.plot(interval, (y, y), color=_ink(style), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
         ax.plot(value, y, _marker(style), color=_ink(style), markersize=7)
         where = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
         ax.annotate(f"{value:.{digits}f}", (0.99, y), **where, fontsize=8.5, color=INK)
@@ -130,7 +132,8 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
         for ax, (thresholds, shares, bands, x, y) in zip(axes, panels):
             for k, (m, share, band) in enumerate(zip(methods, shares, bands)):
                 style = styles[m]
-                ax.fill_between(thresholds, *band, color=_ink(style), alpha=0.12, linewidth=0, step="post")
+                if band is not None:
+                    ax.fill_between(thresholds, *band, color=_ink(style), alpha=0.12, linewidth=0, step="post")
                 ax.plot(
                     thresholds,
                     share,
@@ -145,6 +148,8 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
                 )
             ax.set(xlabel=x, ylabel=y, ylim=(-0.03, 1.03))
         axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
+        if told.cost_thresholds[-1] > FAR:
+            axes[1].set_xscale("symlog", linthresh=1.0)
         handles, labels = axes[0].get_legend_handles_labels()
         made.legend(
             handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, handlelength=3.2

@@ -9,12 +9,13 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
+from ringfence import stats
 from ringfence.files import whole
 from ringfence.report import board_figures, figures
 from ringfence.report.board import Board, Method, read
-from ringfence.report.page import WORDS, environments, facts, headline, render
+from ringfence.report.page import WORDS, danger, environments, facts, headline, render
 from ringfence.report.published import NOTE, PUBLISHED, matches
-from ringfence.report.standings import DRAWS, Standing, aggregate, contests, references, standings
+from ringfence.report.standings import DRAWS, Aggregate, Standing, aggregates, contests, references, standings
 from ringfence.report.table import Section
 from ringfence.runs import Run
 
@@ -43,7 +44,7 @@ def _context(board: Board, out: Path, title: str | None) -> dict:
         "draws": DRAWS,
         "ranking": ranking(board, tables),
         "sections": [_section(board, t, k, tables[t], rows_to_beat[t], out) for k, t in enumerate(board.tasks)],
-        "aggregate": _aggregate(board, styles),
+        "aggregates": [_aggregate(board, a, k, styles) for k, a in enumerate(aggregates(board))],
         "expenses": Markup(board_figures.expenses(_typical(board, tables), "expenses")),
         "published": published(board, tables),
         "note": NOTE,
@@ -59,15 +60,23 @@ def short(task: str, suite: str) -> str:
 
 
 def ranking(board: Board, tables: dict[str, list[Standing]]) -> list[dict]:
-    """Methods by their mean rank over the tasks; those that lack a task come last, since they have none."""
+    """Methods by their mean rank over the tasks, counted among those that were measured on every task; the others
+    come last, since they have none."""
     rows = []
-    for m in board.methods:
-        cells = [next((r for r in tables[t] if r.method == m), None) for t in board.tasks]
-        whole_row = all(cells)
-        mean = float(np.mean([c.rank for c in cells])) if whole_row else None
-        style = next(c.style for c in cells if c)
-        rows.append({"name": m.name, "variant": m.shown, "style": style, "reference": False, "cells": cells})
-        rows[-1] |= {"mean": mean, "within": sum(c.safe for c in cells if c), "measured": sum(map(bool, cells))}
+    cells = {m: [next((r for r in tables[t] if r.method == m), None) for t in board.tasks] for m in board.methods}
+    complete = [m for m in board.methods if all(cells[m])]
+    among = {m: [] for m in complete}
+    for k, task in enumerate(board.tasks):
+        told = [cells[m][k] for m in complete]
+        limit = board.constants[task]["cost_limit"]
+        places = stats.places([r.returns for r in told], [r.cost_interval[1] for r in told], limit)
+        for m, place in zip(complete, places):
+            among[m].append(place)
+    for m, row in cells.items():
+        mean = float(np.mean(among[m])) if m in among else None
+        style = next(c.style for c in row if c)
+        rows.append({"name": m.name, "variant": m.shown, "style": style, "reference": False, "cells": row})
+        rows[-1] |= {"mean": mean, "within": sum(c.safe for c in row if c), "measured": sum(map(bool, row))}
     return sorted(rows, key=lambda r: (r["mean"] is None, r["mean"] or 0.0))
 
 
@@ -108,6 +117,8 @@ def _section(board: Board, task: str, k: int, rows: list[Standing], rows_to_beat
         "contests": contests(rows),
         "constants": constants,
         "ceiling": card.get("return_ceiling"),
+        "danger": danger(hazard),
+        "ends": any(r.ended for r in (*rows, *rows_to_beat)),
         "scatter": Markup(drawn) if drawn else None,
         "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],
         "card": facts(card),
@@ -141,16 +152,16 @@ def _link(file: Path, out: Path) -> tuple[str, str]:
     return relative, quote(relative)
 
 
-def _aggregate(board: Board, styles: dict) -> dict | None:
-    told = aggregate(board)
-    if told is None:
-        return None
+def _aggregate(board: Board, told: Aggregate, k: int, styles: dict) -> dict:
     best_first = sorted(told.methods, key=lambda m: -told.iqm_returns[m][0])
     order = [told.methods.index(m) for m in best_first]
     pick = np.ix_(order, order)
     several = len(told.methods) > 1
+    earns, costs = told.improves[pick], told.cheaper[pick]
     return {
-        "overall": Markup(board_figures.overall(told, styles, "overall")),
+        "protocol": told.protocol,
+        "tasks": len(told.tasks),
+        "overall": Markup(board_figures.overall(told, styles, f"overall{k}")),
         "rows": [
             {
                 "name": m.name,
@@ -163,9 +174,10 @@ def _aggregate(board: Board, styles: dict) -> dict | None:
             }
             for m in best_first
         ],
-        "earns": Markup(board_figures.duels(told.improves[pick], best_first, "earns more", "earns")) if several else "",
-        "costs": Markup(board_figures.duels(told.cheaper[pick], best_first, "costs less", "costs")) if several else "",
-        "profiles": Markup(board_figures.profiles(told, styles, "profiles")),
+        "alone": any(len(seeds) == 1 for seeds in told.seeds.values()),
+        "earns": Markup(board_figures.duels(earns, best_first, "earns more", f"earns{k}")) if several else "",
+        "costs": Markup(board_figures.duels(costs, best_first, "costs less", f"costs{k}")) if several else "",
+        "profiles": Markup(board_figures.profiles(told, styles, f"profiles{k}")),
         "left_out": [(m.label, [short(t, board.suite) for t in at]) for m, at in told.left_out.items()],
         "fewer": [(m.label, told.seeds[m]) for m in told.methods if len(told.seeds[m]) < len(board.seeds)],
     }

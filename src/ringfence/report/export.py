@@ -17,7 +17,8 @@ from ringfence.report.standings import Standing, references, standings
 COLUMNS = (
     "suite, task, algorithm, preset, variant, method, rank, within_limit, best, return_mean, return_sd, return_low, "
     "return_high, return_norm, cost_mean, cost_sd, cost_low, cost_high, cost_norm, avoidable_cost, avoidable_low, "
-    "avoidable_high, unsafe_episodes, unsafe_upper, seeds, episodes, train_seconds, plan_ms_p50, parameters"
+    "avoidable_high, unsafe_episodes, unsafe_upper, ended_early, steps_mean, seeds, episodes, "
+    "train_seconds, plan_ms_p50, parameters"
 ).split(", ")
 
 
@@ -79,6 +80,8 @@ def _numbers(r: Standing) -> dict:
         "avoidable_high": r.avoidable_interval[1],
         "unsafe_episodes": r.violation_rate,
         "unsafe_upper": r.violation_upper,
+        "ended_early": r.ended,
+        "steps_mean": r.steps,
         "episodes": r.episodes,
         "train_seconds": r.train_seconds,
         "plan_ms_p50": r.plan_ms,
@@ -163,10 +166,12 @@ def board_markdown(board: Board) -> str:
     blocks = []
     for task, rows in _rows(board).items():
         c = board.constants.get(task)
+        ends = any(isinstance(r, Standing) and r.ended for r in rows)
+        columns = [*head, "ended early"] if ends else head
         facts = (
             f", cost limit {c['cost_limit']:g}, normalised with {c['return_min']:g} → {c['return_max']:g}" if c else ""
         )
-        blocks.append(f"**{_cell(task)}**{facts}\n\n" + _table(head, [_markdown(r, board) for r in rows]))
+        blocks.append(f"**{_cell(task)}**{facts}\n\n" + _table(columns, [_markdown(r, board, ends) for r in rows]))
     return "\n\n".join([*blocks, "± standard deviation between seeds. " + _legend(board)]) + "\n"
 
 
@@ -178,16 +183,18 @@ def board_markdown_short(board: Board) -> str:
     names = dict.fromkeys(r.name for t in board.tasks for r in rows_to_beat[t])
     for name in names:
         cells = [next((r for r in rows_to_beat[t] if r.name == name), None) for t in board.tasks]
-        rows.append([name, *map(_brief, cells), "–"])
+        rows.append([name, *(_brief(r, 0) for r in cells), "–"])
     for row in ranking(board, tables):
         mean = "–" if row["mean"] is None else f"{row['mean']:.2f}"
-        rows.append([f"{row['name']} {row['variant']}".strip(), *map(_brief, row["cells"]), mean])
+        rows.append(
+            [f"{row['name']} {row['variant']}".strip(), *(_brief(r, len(board.seeds)) for r in row["cells"]), mean]
+        )
     return _table(head, rows) + "\n\n" + _legend(board) + "\n"
 
 
-def _markdown(r: Standing | Method, board: Board) -> list[str]:
+def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
     if isinstance(r, Method):
-        return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *["–"] * 3]
+        return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *["–"] * (3 + ends)]
     returns, norm = _pm(r.returns, r.returns_sd, 1, "±"), _pm(r.returns_norm, r.returns_norm_sd, 3, "±")
     several = f"{len(r.seeds)}" if len(r.seeds) == len(board.seeds) else f"{len(r.seeds)} of {len(board.seeds)}"
     return [
@@ -202,19 +209,23 @@ def _markdown(r: Standing | Method, board: Board) -> list[str]:
         "–" if r.train_seconds is None else f"{r.train_seconds:,.0f}",
         "–" if r.plan_ms is None else f"{r.plan_ms:.1f}",
         "–" if r.parameters is None else f"{r.parameters:,}",
+        *(["–" if r.ended is None else share(r.ended)] if ends else []),
     ]
 
 
-def _brief(r: Standing | None) -> str:
+def _brief(r: Standing | None, most: int) -> str:
+    """`most`: seeds of a whole row; fewer are said."""
     if r is None:
         return "not measured"
     text = f"{r.returns_norm:.2f} ({r.avoidable:.3f})" + ("" if r.safe else " †")
+    text += f" [{len(r.seeds)}]" if r.method and len(r.seeds) < most else ""
     return f"**{text}**" if r.best else text
 
 
 def _legend(board: Board) -> str:
     return (
-        "**Bold**: the highest return within the cost limit; †: over the limit. "
+        "**Bold**: the highest return within the cost limit; †: over the limit, which the upper end of the cost's 95 % "
+        "interval decides; [n]: fewer seeds than the others. "
         f"{board.episodes} {board.split} episodes per seed, protocol {board.protocol}."
     )
 

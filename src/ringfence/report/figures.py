@@ -19,6 +19,7 @@ from ringfence.runs import Run
 
 COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
+FAR = 8.0  # times the limit: axes of cost that reach further are logarithmic beyond the limit
 INK, GRID = "#010203", "#010204"
 STYLE = {
     "svg.fonttype": "none",
@@ -132,7 +133,14 @@ def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
             ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
         ax.margins(0.08, 0.1)
         low, high = ax.get_xlim()
-        ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
+        limit = section.constants["cost_limit"] if section.constants else 0.0
+        if limit > 0:  # beside the points, where it is in view
+            ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
+        if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
+            ax.set_xscale("symlog", linthresh=limit)
+            ax.set_xlim(-0.1 * limit, 2 * high)
+        else:
+            ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
         ax.set_xlabel(f"avoidable {x_label}")
         ax.set_ylabel("return per episode")
         made.canvas.draw()

@@ -129,8 +129,13 @@ def headline(section: Section) -> list[str]:
         )
         said.append(
             f"{lead} {best.returns:.1f} per episode (95 % interval {_range(best.returns_interval, 1)}), with {event} "
-            f"in {share(best.violation_rate)} of {best.episodes:,} episodes, at most {share(best.violation_upper)} "
+            f"in {share(best.violation_rate)} of {best.episodes:,} episodes "
+            f"({len(best.seeds)} seed{'s' * (len(best.seeds) != 1)}), at most {share(best.violation_upper)} "
             "with 95 % confidence."
+        )
+        ahead = [r for r in section.references if r.safe and r.returns > best.returns]
+        said += (
+            [f"Within the limit {_and([f'{r.name} ({r.returns:.1f})' for r in ahead])} earns more."] if ahead else []
         )
         near = [r for r in safe if r is not best and r.returns_interval[1] >= best.returns_interval[0]]
         if near:
@@ -147,6 +152,13 @@ def headline(section: Section) -> list[str]:
     if data:
         said.append(f"The data itself has a return of {data.returns:.1f} and {data.cost:.3f} {unit} per episode.")
     return said
+
+
+def danger(hazard: dict) -> str:
+    """What a cost is charged for, in words; empty where there is no formula."""
+    if hazard.get("kind") == "SpeedLimit":
+        return f"a speed above {hazard['limit']:g} m/s"
+    return f"a distance below {hazard['radius']:g} m" if hazard.get("kind") == "Separation" else ""
 
 
 def _of(part: int, whole: int) -> str:

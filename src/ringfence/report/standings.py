@@ -10,6 +10,7 @@ import numpy as np
 from ringfence import stats
 from ringfence.report.board import Board, Entry, Method
 from ringfence.report.figures import COLOURS
+from ringfence.tasks import TASKS
 from ringfence.types import Array
 
 DRAWS = 2000  # of every bootstrap
@@ -40,6 +41,8 @@ class Standing:
     violations: int
     violation_upper: float  # exact, one-sided, episodes pooled
     safe: bool  # the upper end of the cost's interval is within the limit
+    ended: float | None = None  # share of episodes that ended before the time limit; None: not said
+    steps: float | None = None  # mean of an episode
     train_seconds: float | None = None  # of one seed
     plan_ms: float | None = None  # median of one joint action
     parameters: int | None = None
@@ -85,22 +88,23 @@ class Aggregate:
     Scores are arrays (seeds, tasks): normalised return, and normalised cost, whose limit is 1.
     """
 
+    protocol: str  # what the tasks have in common, where a board has several
     tasks: list[str]
     methods: list[Method]
     seeds: dict[Method, tuple[int, ...]]  # those that every task has
-    left_out: dict[Method, list[str]]  # method -> tasks on which seeds are missing
+    left_out: dict[Method, list[str]]  # method -> tasks without a result; none: no seed has all tasks
     returns: dict[Method, Array]
     costs: dict[Method, Array]
-    iqm_returns: dict[Method, tuple[float, Interval]]
-    iqm_costs: dict[Method, tuple[float, Interval]]
+    iqm_returns: dict[Method, tuple[float, Interval | None]]  # no interval of one seed
+    iqm_costs: dict[Method, tuple[float, Interval | None]]
     improves: Array  # (M, M): probability that the row's return beats the column's
     cheaper: Array  # (M, M): probability that the row's cost is below the column's
     return_thresholds: Array  # (K,)
     return_profiles: Array  # (M, K)
-    return_bands: Array  # (M, 2, K) pointwise 95 % intervals, runs resampled within each task
+    return_bands: list[Array | None]  # (2, K) pointwise 95 % intervals, runs resampled within each task
     cost_thresholds: Array  # (K,)
     cost_profiles: Array  # (M, K)
-    cost_bands: Array  # (M, 2, K)
+    cost_bands: list[Array | None]
 
 
 def standings(board: Board) -> dict[str, list[Standing]]:
@@ -121,12 +125,11 @@ def references(board: Board) -> dict[str, list[Standing]]:
 def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
     """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
     rest, by cost."""
-    order = stats.rank([r.returns for r in rows], [r.cost_interval[1] for r in rows], limit)
-    rows = [rows[i] for i in order]
-    for place, row in enumerate(rows, 1):
-        row.rank = place
+    merits = [r.returns for r in rows], [r.cost_interval[1] for r in rows], limit
+    for row, place in zip(rows, stats.places(*merits)):
+        row.rank = int(place)
         row.best = row.safe and place == 1
-    return rows
+    return [rows[i] for i in stats.rank(*merits)]
 
 
 def contests(rows: list[Standing]) -> list[Contest]:
@@ -182,6 +185,8 @@ def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -
         violations=violations,
         violation_upper=stats.upper_bound(violations, episodes),
         safe=cost_interval[1] <= c["cost_limit"],
+        ended=_mean(told, "termination_rate"),
+        steps=_mean(told, "steps_mean"),
         train_seconds=_mean(told, "train_seconds"),
         plan_ms=_mean(told, "plan_ms_p50"),
         parameters=told[0].get("parameters"),
@@ -214,6 +219,8 @@ def _reference(task: str, name: str, told: dict) -> Standing:
         violations=violations,
         violation_upper=stats.upper_bound(violations, told["episodes"]),
         safe=told["cost_interval"][1] <= c["cost_limit"],
+        ended=told.get("termination_rate"),
+        steps=told.get("steps_mean"),
     )
 
 
@@ -273,22 +280,35 @@ def _styles(methods: list[Method]) -> dict[Method, tuple[int, int]]:
 # --- over all tasks ---
 
 
-def aggregate(board: Board) -> Aggregate | None:
-    """Statistics over tasks; None where no method was measured on every task with one and the same seed."""
+def aggregates(board: Board) -> list[Aggregate]:
+    """One per protocol that the board's tasks follow: tasks that share data and policies under two limits are not two
+    tasks. Protocols without a method that was measured on every task with one and the same seed are left out."""
+    protocols = list(dict.fromkeys(_protocol(t) for t in board.tasks))
+    made = [aggregate(board, p, [t for t in board.tasks if _protocol(t) == p]) for p in protocols]
+    return [x for x in made if x is not None]
+
+
+def _protocol(task: str) -> str:
+    return TASKS[task].protocol if task in TASKS else ""
+
+
+def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) -> Aggregate | None:
+    """Statistics over tasks (by default all); None where no method was measured on every one with the same seed."""
+    tasks = board.tasks if tasks is None else tasks
     seeds, left_out = {}, {}
     for m in board.methods:
-        had = {t: {e.seed for e in board.of(t, m)} for t in board.tasks}
+        had = {t: {e.seed for e in board.of(t, m)} for t in tasks}
         common = tuple(sorted(set.intersection(*had.values())))
         if common:
             seeds[m] = common
         else:
-            left_out[m] = [t for t in board.tasks if not had[t]] or list(board.tasks)
+            left_out[m] = [t for t in tasks if not had[t]]
     methods = list(seeds)
     if not methods:
         return None
     returns, costs, episode_costs = {}, {}, {}
     for m in methods:
-        cells = [[_entry(board, t, m, s) for t in board.tasks] for s in seeds[m]]
+        cells = [[_entry(board, t, m, s) for t in tasks] for s in seeds[m]]
         score = [[_normal_return(e.summary["return_mean"], board.constants[e.task]) for e in row] for row in cells]
         price = [[_normal_cost(e.summary["cost_mean"], board.constants[e.task]) for e in row] for row in cells]
         returns[m], costs[m] = np.array(score), np.array(price)
@@ -305,7 +325,8 @@ def aggregate(board: Board) -> Aggregate | None:
     above = {m: (returns[m][..., None] > return_thresholds).astype(float) for m in methods}
     within = {m: (episode_costs[m][..., None] <= cost_thresholds).mean(2) for m in methods}
     return Aggregate(
-        tasks=board.tasks,
+        protocol=protocol,
+        tasks=tasks,
         methods=methods,
         seeds=seeds,
         left_out=left_out,
@@ -317,10 +338,10 @@ def aggregate(board: Board) -> Aggregate | None:
         cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
         return_thresholds=return_thresholds,
         return_profiles=np.array([stats.profile(returns[m], return_thresholds) for m in methods]),
-        return_bands=np.array([_band(above[m]) for m in methods]),
+        return_bands=[_band(above[m]) for m in methods],
         cost_thresholds=cost_thresholds,
         cost_profiles=np.array([stats.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
-        cost_bands=np.array([_band(within[m]) for m in methods]),
+        cost_bands=[_band(within[m]) for m in methods],
     )
 
 
@@ -328,14 +349,17 @@ def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
     return next(e for e in board.of(task, method) if e.seed == seed)
 
 
-def _iqm(scores: Array) -> tuple[float, Interval]:
+def _iqm(scores: Array) -> tuple[float, Interval | None]:
     """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
-    return float(stats.iqm(scores)), stats.stratified_bootstrap(scores, stats.iqm, draws=DRAWS)
+    several = len(scores) > 1
+    return float(stats.iqm(scores)), stats.stratified_bootstrap(scores, stats.iqm, draws=DRAWS) if several else None
 
 
-def _band(shares: Array) -> Array:
+def _band(shares: Array) -> Array | None:
     """(2, K): 95 % interval, at every threshold, of the mean of shares (runs, tasks, K); runs are resampled."""
     runs, tasks, _ = shares.shape
+    if runs < 2:
+        return None
     taken = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), (DRAWS, tasks)) / (runs * tasks)
     return np.percentile(np.einsum("dmr,rmk->dk", taken, shares, optimize=True), [2.5, 97.5], axis=0)
 

@@ -1,4 +1,4 @@
-"""Robots as small animated pictures, drawn without a display: EGL, or OSMesa where there is no EGL.
+"""Robots as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
 
 MuJoCo decides how to draw when it is imported, so drawing happens in a process of its own.
 """
@@ -26,22 +26,22 @@ from ringfence.tasks import Task
 WIDTH, HEIGHT = 320, 240  # pixels
 EVERY = 2  # steps per frame, at least
 LONGEST = 200  # frames
-BACKENDS = ("egl", "osmesa")
+# MUJOCO_GL's values that can work on a platform (others are Linux), and what to do where none does.
+BACKENDS = {"darwin": ("cgl",), "win32": ("wgl",)}
+HELP = "install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6)"
 
 
 def backend() -> str:
     """The value of MUJOCO_GL that works here; `UserError` where nothing can draw."""
     wanted, reasons = os.environ.get("MUJOCO_GL"), []
     trial = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
-    for name in (wanted,) if wanted else BACKENDS:
+    for name in (wanted,) if wanted else BACKENDS.get(sys.platform, ("egl", "osmesa")):
         made = _run([sys.executable, "-c", trial], name)
         if made.returncode == 0:
             return name
         reasons.append(f"{name}: {(made.stderr.strip().splitlines() or ['no reason given'])[-1]}")
-    raise UserError(
-        f"Robots cannot be drawn here ({'; '.join(reasons)}); install EGL (Debian: libegl1 libgl1-mesa-dri) or "
-        "OSMesa (libosmesa6)."
-    )
+    remedy = "log in with a display" if sys.platform in BACKENDS else HELP
+    raise UserError(f"Robots cannot be drawn here ({'; '.join(reasons)}); {remedy}.")
 
 
 def check(task: Task) -> None:
@@ -65,7 +65,7 @@ def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | P
     """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
     The film ends with a fall, after which the last state is repeated.
 
-    `UserError` where neither EGL nor OSMesa can draw.
+    `UserError` where nothing can draw.
     """
     out, name = Path(out), backend()
     moved = np.flatnonzero((states[1:] != states[:-1]).any(1))
