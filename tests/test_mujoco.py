@@ -176,6 +176,25 @@ def test_pettingzoo_face():
         SafeMuJoCoParallel(render_mode="human")
 
 
+def test_a_fall_is_a_termination_behind_pettingzoo(monkeypatch):
+    monkeypatch.setattr(simulator, "HEALTHY_Z", (0.6, 1.0))  # it soon comes to rest below
+    env = SafeMuJoCoParallel(parts="2x4")
+    env.reset(seed=0)
+    for _ in range(150):
+        *_, fallen, over, _ = env.step(dict.fromkeys(env.agents, np.zeros(4, np.float32)))
+        if not env.agents:
+            break
+    assert fallen == {"agent_0": True, "agent_1": True} and not any(over.values()) and env.agents == []
+
+
+def test_no_log_file_is_left_where_one_works(tmp_path, monkeypatch):
+    """Newer versions of MuJoCo complain of an attribute of Gymnasium's file in MUJOCO_LOG.TXT."""
+    monkeypatch.chdir(tmp_path)
+    for parts in ROBOTS:
+        SafeMuJoCo(parts).simulate(1, threads=1)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_copy_goes_on_like_the_original(engine):
     """Tools that run several environments copy them, or send them to other processes."""
     env = SafeMuJoCoParallel(parts="4x2", episode_length=30)
