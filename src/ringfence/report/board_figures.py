@@ -142,7 +142,7 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
                     linewidth=1.6,
                     marker=_marker(style),
                     markersize=5,
-                    markevery=(3 * k % 20, 20),  # apart, so that markers of lines that coincide can be seen
+                    markevery=(0.02 * (k % 8), 0.16),  # apart, so that markers of lines that coincide can be seen
                     drawstyle="steps-post",
                     label=m.label,
                 )
@@ -150,6 +150,7 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
         axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
         if told.cost_thresholds[-1] > FAR:
             axes[1].set_xscale("symlog", linthresh=1.0)
+            axes[1].set_xlim(-0.05, told.cost_thresholds[-1])
         handles, labels = axes[0].get_legend_handles_labels()
         made.legend(
             handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, handlelength=3.2
