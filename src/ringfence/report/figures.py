@@ -19,7 +19,7 @@ from ringfence.runs import Run
 
 COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
-FAR = 8.0  # times the limit: axes of cost that reach further are logarithmic beyond the limit
+FAR = 8.0  # times the limit: axes of cost that reach further are not linear
 INK, GRID = "#010203", "#010204"
 STYLE = {
     "svg.fonttype": "none",
@@ -137,8 +137,10 @@ def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
         if limit > 0:  # beside the points, where it is in view
             ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
         if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
-            ax.set_xscale("symlog", linthresh=limit)
-            ax.set_xlim(-0.1 * limit, 2 * high)
+            root = lambda x: np.sign(x) * np.sqrt(np.abs(x))  # noqa: E731
+            ax.set_xscale("function", functions=(root, lambda y: np.sign(y) * y**2))
+            ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
+            ax.set_xlim(-0.002 * high, 1.1 * high)
         else:
             ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
         ax.set_xlabel(f"avoidable {x_label}")
