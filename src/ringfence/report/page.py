@@ -135,7 +135,9 @@ def headline(section: Section) -> list[str]:
         )
         ahead = [r for r in section.references if r.safe and r.returns > best.returns]
         said += (
-            [f"Within the limit {_and([f'{r.name} ({r.returns:.1f})' for r in ahead])} earns more."] if ahead else []
+            [f"References within the limit that earn more: {_and([f'{r.name} ({r.returns:.1f})' for r in ahead])}."]
+            if ahead
+            else []
         )
         near = [r for r in safe if r is not best and r.returns_interval[1] >= best.returns_interval[0]]
         if near:
