@@ -67,7 +67,6 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+steady", "`split`, steady"),
     ("icbf", "mujoco+shielded", "**`split`, shielded**"),
 )
-NONE = "–"  # not played yet
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.
 IN_README = (
@@ -128,10 +127,8 @@ def robots_short(groups: dict) -> str:
         cells = []
         for algorithm, variant, _ in IN_README:
             rows = groups.get((name, algorithm, variant), [])
-            if not rows and variant == "reference":
-                cells.append("none")
-                continue
-            cells.append(" / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) + fallen(rows) if rows else NONE)
+            numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else absent(variant)
+            cells.append(numbers + fallen(rows))
             seeds[len(rows)] += bool(rows) and variant != "reference"
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     told = ", ".join(f"{n} of {k} seed{'s' * (k > 1)}" for k, n in sorted(seeds.items()) if n)
@@ -149,8 +146,7 @@ def robots(groups: dict, ending: str) -> str:
         bound = variant.replace("mujoco", "mujoco-quantile", 1)  # preset of whoever has one for the quantile limits
         found = [groups.get((n, algorithm, variant)) or groups.get((n, algorithm, bound), []) for n in names]
         if any(found):
-            empty = "none" if variant == "reference" else NONE
-            cells = (cell(rows, "cost_mean", 1) if rows else empty for rows in found)
+            cells = (cell(rows, "cost_mean", 1) if rows else absent(variant) for rows in found)
             lines.append(f"| {label} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -279,6 +275,11 @@ def cell(rows: list[dict], cost: str = "avoidable_cost", digits: int = 3) -> str
     spread += f" [{made} seed{'s' * (made > 1)}]" if 0 < made < SEEDS else ""
     text = f"{returns.mean():.0f}{spread} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
     return text + fallen(rows)
+
+
+def absent(variant: str) -> str:
+    """Where there is no row: no logged episode is of that kind, or nothing was played yet."""
+    return "none" if variant == "reference" else "–"
 
 
 def fallen(rows: list[dict]) -> str:

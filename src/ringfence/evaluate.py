@@ -24,7 +24,7 @@ from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
-from ringfence.types import Array, Key, Policy, Spec
+from ringfence.types import Array, Key, Policy, PyTree, Spec
 
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
@@ -96,8 +96,7 @@ def _rollout_native(
     and costs are 0 and its state stays."""
     sim = env.simulate(episodes)
     sim.reset([(root, k) for k in range(episodes)])
-    act = lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key)  # noqa: E731
-    act = act if _foreign(policy) else jax.jit(act)
+    act = _act if _foreign(policy) else jax.jit(_act)
     memory = policy.start(episodes)
     states = [sim.state().astype(np.float32)]
     steps, info, lengths = [], [], np.zeros(episodes, int)
@@ -121,6 +120,11 @@ def _rollout_native(
         [kept["states"], np.repeat(kept["states"][:, -1:], env.episode_length + 1 - len(states), 1)], 1
     )
     return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
+
+
+def _act(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
+    """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
+    return policy.act(memory, observations, state, key)
 
 
 def _foreign(policy: Policy) -> bool:
@@ -242,7 +246,7 @@ class Controller:
     def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
         self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(seed)
-        self._act = jax.jit(lambda policy, memory, seen, state, key: policy.act(memory, seen, state, key))
+        self._act = jax.jit(_act)
         self.reset()
 
     def reset(self) -> None:

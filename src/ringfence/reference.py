@@ -45,8 +45,7 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     else:
         starts = np.zeros(store.episodes, bool)
     kept = np.ones(store.episodes, bool) if kept is None else kept
-    ended = store.terminated[store.episode_ends - 1]
-    told = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": ended}
+    told = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
     result = summarise({k: v[kept] for k, v in told.items()}, task, starts[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
@@ -73,7 +72,7 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
     once costs nothing, too. Where there is none, its row is missing.
     """
     file = Path(out) / task.name / FILE
-    safe = (store.episode_costs <= task.cost_limit) & ~store.terminated[store.episode_ends - 1]
+    safe = (store.episode_costs <= task.cost_limit) & ~store.episode_terminated
     if file.exists():
         known = read_json(file, "is damaged; delete it")
         same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()

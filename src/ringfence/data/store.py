@@ -75,6 +75,11 @@ class EpisodeStore:
         return self._per_episode(self.rewards.mean(1))
 
     @property
+    def episode_terminated(self) -> np.ndarray:
+        """(E,) bool: the task itself ended the episode."""
+        return self.terminated[self.episode_ends - 1]
+
+    @property
     def episode_costs(self) -> np.ndarray:
         """(E,) undiscounted episode cost."""
         return self._per_episode(self.costs)

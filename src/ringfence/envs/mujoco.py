@@ -303,22 +303,18 @@ class _Batch:
 
         self._batch = Batch(model, batch, threads)
         bind = self._batch.bind
-        self.qpos, self.qvel, self._ctrl, self._warm = (bind(x) for x in ("qpos", "qvel", "ctrl", "qacc_warmstart"))
+        self.qpos, self.qvel, self._ctrl, self.warmstart = (bind(x) for x in ("qpos", "qvel", "ctrl", "qacc_warmstart"))
         self._xpos = bind("xpos")
 
     @property
     def torso(self) -> np.ndarray:
         return self._xpos[:, 1, :2]
 
-    @property
-    def warmstart(self) -> np.ndarray:
-        return self._warm
-
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         self._batch.reset(ids=ids, stage=0)
         self.qpos[ids], self.qvel[ids] = qpos, qvel
         self._batch.forward(ids=ids)
-        self._warm[ids] = warmstart
+        self.warmstart[ids] = warmstart
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
         if len(live):

@@ -156,7 +156,7 @@ class SafeMuJoCoParallel(_Parallel):
             raise UserError(f"There is no render_mode='{render_mode}' of robots; `ringfence eval --video` films them.")
         self.render_mode = None
         self.core = SafeMuJoCo(**options)
-        sizes = self.core.n_agents, self.core.observed.shape[1], self.core.action_dim, len(self.core.state_names)
+        sizes = self.core.n_agents, self.core.observation_dim, self.core.action_dim, len(self.core.state_names)
         super().__init__(*sizes, np.float64)
         self._sim = self.core.simulate(1, threads=1)
         self._seeds: np.random.SeedSequence | None = None

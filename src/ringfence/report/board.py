@@ -160,9 +160,7 @@ def read(folder: str | Path) -> Board:
         references={task: rows for task, rows in references.values()},
         missing=sorted(missing, key=lambda m: (ordered.index(m.task), m.job, m.seed)),
         unstarted=[e.name for e in _suite(told["suite"]) if _entry_job(e) not in jobs],
-        untouched=[
-            t for t in (suites.SUITES[told["suite"]].tasks if told["suite"] in suites.SUITES else ()) if t not in names
-        ],
+        untouched=[t for t in _suite_tasks(told["suite"]) if t not in names],
         constants=_constants(entries, references),
         runs=[run for run, *_ in finished],
     )
@@ -213,6 +211,10 @@ def _presets(task: str) -> tuple[str, ...]:
 
 def _suite(name: str) -> tuple[suites.Entry, ...]:
     return suites.SUITES[name].entries if name in suites.SUITES else ()
+
+
+def _suite_tasks(name: str) -> tuple[str, ...]:
+    return suites.SUITES[name].tasks if name in suites.SUITES else ()
 
 
 def _entry_job(entry: suites.Entry) -> str:

@@ -134,11 +134,9 @@ def headline(section: Section) -> list[str]:
             "with 95 % confidence."
         )
         ahead = [r for r in section.references if r.safe and r.returns > best.returns]
-        said += (
-            [f"References within the limit that earn more: {_and([f'{r.name} ({r.returns:.1f})' for r in ahead])}."]
-            if ahead
-            else []
-        )
+        if ahead:
+            named = _and([f"{r.name} ({r.returns:.1f})" for r in ahead])
+            said.append(f"References within the limit that earn more: {named}.")
         near = [r for r in safe if r is not best and r.returns_interval[1] >= best.returns_interval[0]]
         if near:
             verb = "overlaps" if len(near) == 1 else "overlap"
