@@ -16,6 +16,7 @@ from ringfence import evaluate, features, hazards, tasks
 from ringfence.data import matd3, robots
 from ringfence.data.make import make
 from ringfence.data.matd3 import MATD3Config
+from ringfence.data.store import ARRAYS
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.policies import Constant
@@ -238,6 +239,22 @@ def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
     np.testing.assert_array_equal(native.actions, store.actions)  # limits change labels alone
     assert native.costs.mean() > store.costs.mean()
     assert card["return_ceiling"] >= 60
+
+
+def test_another_limit_counts_anew_what_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
+    names = "halfcheetah_2x3-good", "halfcheetah_2x3-good-quantile"
+    native, quantile = (replace(t, env=replace(t.env, episode_length=60)) for t in map(tasks.get, names))
+    make(native, 300)
+    with monkeypatch.context() as m:
+        m.setattr(robots, "collect", lambda *_: pytest.fail("it was simulated again"))
+        counted, path = make(quantile, 300)
+    simulated, _ = make(quantile, 300, fresh=True)
+    for name in (*ARRAYS, "state", "speed"):
+        np.testing.assert_array_equal(getattr(counted, name), getattr(simulated, name), err_msg=name)
+    assert counted.card == simulated.card and path.name.startswith(names[1])
+    part = counted.select(np.arange(counted.episodes) == 1)
+    np.testing.assert_array_equal(part.costs, part.speed > quantile.env.limit)
 
 
 def test_what_the_limit_allows_to_earn():

@@ -163,6 +163,12 @@ def twin(name: str) -> str | None:
     return other if other != name else None
 
 
+def siblings(name: str) -> list[str]:
+    """The tasks whose data are the same steps with costs of another limit."""
+    root = twin(name) or name
+    return [t for t in TASKS if t != name and root in (t, twin(t))]
+
+
 def simulated(name: str, hazard: hazards.Hazard) -> Task | None:
     """The task of that name with the danger that its data defines; None where there is no simulator that counts it.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
 
@@ -12,10 +13,10 @@ import numpy as np
 
 from ringfence import __version__, hazards
 from ringfence.data import behaviour, robots
-from ringfence.data.store import EpisodeStore
+from ringfence.data.store import EpisodeStore, complete_card
 from ringfence.envs import SafeMuJoCo, SimpleSpread
 from ringfence.errors import UserError
-from ringfence.tasks import Task
+from ringfence.tasks import Task, siblings
 
 COLLECTION = 271_828  # root of the collection keys, far from those of evaluation
 
@@ -37,7 +38,7 @@ def make(
         raise UserError(f"size={transitions} and seed={seed} must be a positive size and a seed of 0 or more.")
     if isinstance(task.env, SimpleSpread):  # whose episodes all have one length
         transitions = -(-transitions // task.env.episode_length) * task.env.episode_length
-    path = Path(out) if out else cache_dir() / "data" / f"{task.name}-{transitions}-seed{seed}-v{__version__}.h5"
+    path = Path(out) if out else _kept(task.name, transitions, seed)
     env, danger = task.env, hazards.to_dict(task.hazard)
     if isinstance(env, SafeMuJoCo) and getattr(task.hazard, "limit", None) != env.limit:
         raise UserError(f"Task '{task.name}' has the danger {task.hazard}, its simulator counts above {env.limit} m/s.")
@@ -53,8 +54,16 @@ def make(
         "hazard": danger,
         "seed": seed,
     }
-    store = (_robot if isinstance(task.env, SafeMuJoCo) else _spread)(task, transitions, seed, card)
+    if isinstance(env, SimpleSpread):
+        store = _spread(task, transitions, seed, card)
+    else:
+        card["simulator"] = f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}"
+        store = (None if fresh else _relabelled(task, transitions, seed, card)) or _robot(task, transitions, seed, card)
     return store, store.save(path)
+
+
+def _kept(name: str, transitions: int, seed: int) -> Path:
+    return cache_dir() / "data" / f"{name}-{transitions}-seed{seed}-v{__version__}.h5"
 
 
 def _spread(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
@@ -83,7 +92,6 @@ def _robot(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
     policies = robots.shipped_policies(env, task.tier)
     played = robots.collect(env, policies, transitions, COLLECTION + seed)
     card |= {
-        "simulator": f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}",
         "protocol": task.protocol,
         "size": transitions,  # asked for; episodes are whole
         "transitions": len(played["rewards"]),
@@ -104,5 +112,21 @@ def _robot(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
         state=played["state"],
         final_state=played["final_state"],
         terminated=played["terminated"],
+        speed=played["speed"],
         card=card,
     )
+
+
+def _relabelled(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore | None:
+    """The kept steps of a task that differs in its speed limit alone, where there are some: the same episodes, and no
+    simulation. Speeds are kept in double precision, so every cost is the one that a simulation would count."""
+    for name in (task.name, *siblings(task.name)):
+        path = _kept(name, transitions, seed)
+        if path.exists():
+            other = EpisodeStore.load(path)
+            if other.speed is not None and other.card["simulator"] == card["simulator"]:
+                told = other.card | card | {"protocol": task.protocol}
+                told |= task.env.describe(other.speed, task.cost_limit)
+                costs = (other.speed > task.env.limit).astype(np.float32)
+                return replace(other, costs=costs, card=complete_card(told))
+    return None

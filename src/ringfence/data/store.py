@@ -5,6 +5,7 @@ Time runs along the first axis, episodes one after another. T is the number of s
     observations (T+E, N, O)   one more row than steps in every episode: the last state is kept
     state        (T+E, S)      global state, when known
     actions      (T, N, A)     rewards (T, N)     costs (T,)
+    speed        (T,)          m/s, of robots whose simulator told it: what another speed limit would count
     terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
     episode_ends (E,)          cumulative number of steps
 
@@ -27,6 +28,7 @@ from ringfence.files import whole
 
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
+OPTIONAL = ("state", "speed")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,7 @@ class EpisodeStore:
     episode_ends: np.ndarray
     state: np.ndarray | None = None
     card: dict = field(default_factory=dict)
+    speed: np.ndarray | None = None
 
     def __post_init__(self):
         validate(self)
@@ -109,6 +112,7 @@ class EpisodeStore:
             np.cumsum(self.lengths[keep]),
             None if self.state is None else self.state[rows],
             self.card,
+            None if self.speed is None else self.speed[steps],
         )
 
     # --- making ---
@@ -169,11 +173,12 @@ class EpisodeStore:
         state=None,
         final_state=None,
         terminated=None,
+        speed=None,
         card=None,
     ):
         """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,), state (T, S);
         `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
-        episode ended in; `terminated` (E,) bool, default all false (ended by a time limit)."""
+        episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
         ends = np.asarray(episode_ends, np.int64)
         observations, actions = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
         if len(ends) == 0 or ends[-1] != len(actions):
@@ -218,6 +223,7 @@ class EpisodeStore:
             ends,
             None if state is None else np.insert(np.asarray(state, np.float32), ends, final_state, axis=0),
             complete_card(card),
+            None if speed is None else np.asarray(speed),
         )
 
     # --- disk ---
@@ -227,7 +233,7 @@ class EpisodeStore:
         with whole(path) as temporary, h5py.File(temporary, "w") as f:
             f.attrs["ringfence_store"] = FORMAT
             f.attrs["card"] = json.dumps(self.card)
-            for name in (*ARRAYS, "state"):
+            for name in (*ARRAYS, *OPTIONAL):
                 if getattr(self, name) is not None:
                     f.create_dataset(name, data=getattr(self, name))
         return path
@@ -247,13 +253,13 @@ class EpisodeStore:
                 missing = [name for name in ARRAYS if name not in f]
                 if missing:
                     raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
-                size = sum(f[name].nbytes for name in (*ARRAYS, "state") if name in f)
+                size = sum(f[name].nbytes for name in (*ARRAYS, *OPTIONAL) if name in f)
                 if size > (there := _memory()):
                     raise StoreError(
                         f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {there / 2**30:.1f} GiB of "
                         "memory; take a larger machine, or store fewer episodes."
                     )
-                arrays = {name: f[name][()] for name in (*ARRAYS, "state") if name in f}
+                arrays = {name: f[name][()] for name in (*ARRAYS, *OPTIONAL) if name in f}
                 card = json.loads(f.attrs["card"])
         except (KeyError, json.JSONDecodeError) as error:
             raise StoreError(f"'{path}' has no card that can be read ({error}); make or import it again.") from error
@@ -337,7 +343,9 @@ def validate(store: EpisodeStore) -> None:
             s.state.ndim == 2 and len(s.state) == t + e,
             f"state has shape {s.state.shape}, expected ({t + e}, S); keep the state each episode ended in.",
         )
-    for name in ("observations", "actions", "rewards", "costs", "state"):
+    if s.speed is not None:
+        demand(s.speed.shape == (t,), f"speed has shape {s.speed.shape}, expected ({t},); give one of every step.")
+    for name in ("observations", "actions", "rewards", "costs", *OPTIONAL):
         array = getattr(s, name)
         if array is not None and not np.isfinite(array).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
