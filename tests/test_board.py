@@ -21,7 +21,7 @@ from ringfence.report.board_page import published
 from ringfence.report.export import escape
 from ringfence.report.page import danger
 from ringfence.report.published import PUBLISHED, matches
-from ringfence.report.standings import aggregate, aggregates, contests, interval, references, standings
+from ringfence.report.standings import aggregate, aggregates, contests, references, standings
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation
@@ -348,19 +348,6 @@ def test_nobody_within_the_limit_means_no_best(folder):
         .split(f'<h2 id="task0-title">{EXPERT}')[1]
         .split("</section>")[0]
     )
-
-
-def test_interval_resamples_seeds_and_episodes():
-    assert interval(np.full((3, 5), 2.0)) == (2.0, 2.0)
-    apart = interval(np.array([[0.0] * 50, [1.0] * 50]))  # all the spread is between the two seeds
-    assert apart == (0.0, 1.0)
-    rng = np.random.default_rng(0)
-    x = rng.normal(size=(1, 400))
-    low, high = interval(x)
-    half = 1.96 * x.std() / 20  # one seed: the usual interval of the mean
-    assert low == pytest.approx(x.mean() - half, abs=0.02) and high == pytest.approx(x.mean() + half, abs=0.02)
-    only = interval(np.array([[1.0, 99.0, 1.0]]), np.array([[True, False, True]]))
-    assert only == (1.0, 1.0)
 
 
 def test_references_keep_their_own_numbers(folder):

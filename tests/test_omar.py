@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ringfence import hazards, tasks
+from ringfence.cli import main
 from ringfence.data.omar import import_omar
 from ringfence.data.store import EpisodeStore
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
@@ -107,6 +108,18 @@ def test_without_next_obs_the_last_steps_are_dropped(tmp_path, few):
 )
 def test_the_path_names_the_tier(tmp_path, few, path, task):
     assert import_omar(write(tmp_path / "x" / "y" / path, few)).card["task"] == task
+
+
+def test_another_danger_from_the_command_line_needs_a_name(tmp_path, few, capsys):
+    folder, out = write(tmp_path / "expert", few), tmp_path / "mine.h5"
+    arguments = ["data", "import-omar", str(folder), "--out", str(out), "--radius", "0.5"]
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "give the data a name with --task" in capsys.readouterr().err and not out.exists()
+    main([*arguments, "--task", "mine"])
+    wide = EpisodeStore.load(out)
+    assert wide.card["task"] == "mine" and wide.hazard == hazards.Separation(0.5, 0.125)
+    assert wide.costs.sum() > import_omar(folder).costs.sum()
 
 
 def test_dones_that_are_set_cut_episodes(tmp_path, few):

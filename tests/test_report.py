@@ -132,10 +132,11 @@ def test_seeds_are_pooled(runs):
     bc, plain, chosen = section.tables["test"]
     assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+plans4"]
     told = [r.results["split"]["per_episode"] for r in runs[:2]]
-    returns, costs = (np.concatenate([t[k] for t in told]) for k in ("return", "cost"))
+    returns, costs = (np.array([t[k] for t in told]) for k in ("return", "cost"))
     assert plain.seeds == (0, 1) and plain.episodes == 40
     assert plain.returns == pytest.approx(returns.mean())
-    assert plain.returns_interval == stats.bootstrap_mean(returns, strata=np.repeat([0, 1], 20))
+    low, high = plain.returns_interval
+    assert high - low > abs(returns[0].mean() - returns[1].mean())  # two seeds know little of a third
     assert plain.cost == pytest.approx(costs.mean()) and plain.avoidable == 0.0
     assert plain.violations == int(costs.sum())
     assert plain.violation_upper == stats.upper_bound(plain.violations, 40)

@@ -30,8 +30,26 @@ def test_interquartile_mean():
     np.testing.assert_allclose(stats.iqm(several), stats.iqm(SCORES) + np.array([0, 1]))
 
 
-def test_optimality_gap_ignores_what_exceeds_the_target():
-    assert stats.optimality_gap(np.array([[0.5, 3.0]])) == pytest.approx(0.25)
+@pytest.mark.parametrize("runs", [2, 3, 5])
+def test_interval_of_few_runs_covers_what_it_says(runs):
+    """Runs of deviation 1, resets of deviation 3 that all runs share, noise of 1; the true mean is 0."""
+    rng, n, resets = np.random.default_rng(runs), 400, 30
+    x = rng.normal(size=(n, runs, 1)) + 3 * rng.normal(size=(n, 1, resets)) + rng.normal(size=(n, runs, resets))
+    found = np.array([stats.mean_of_runs(one, draws=300) for one in x])
+    covered = ((found[:, 0] <= 0) & (found[:, 1] >= 0)).mean()
+    assert covered > 0.92
+
+
+def test_interval_of_runs_that_agree_is_that_of_the_resets():
+    x = np.random.default_rng(0).normal(size=200)
+    low, high = stats.mean_of_runs(np.stack([x, x, x]))
+    assert (high - low) / 2 == pytest.approx(1.96 * x.std() / 200**0.5, rel=0.1)
+    assert stats.mean_of_runs(x[None]) == pytest.approx((low, high))  # one run: of its episodes alone
+    assert stats.mean_of_runs(np.full((3, 5), 2.0)) == (2.0, 2.0)
+    costs = np.array([[0.0] * 9 + [1.0], [0.0] * 10])
+    assert stats.mean_of_runs(costs)[0] < 0 == stats.mean_of_runs(costs, least=0.0)[0]
+    only = stats.mean_of_runs(np.array([[1.0, 99.0, 1.0]]), np.array([[True, False, True]]))
+    assert only == (1.0, 1.0)
 
 
 def test_bootstrap_of_the_mean_agrees_with_scipy():

@@ -57,16 +57,27 @@ def make(
     out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
 
 
-def import_omar(directory: Positional[Path], out_file: Annotated[Path, tyro.conf.arg(name="out")]) -> None:
+def import_omar(
+    directory: Positional[Path],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    radius: float | None = None,
+    task: str | None = None,
+) -> None:
     """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
 
     Args:
         directory: e.g. simple_spread/expert/seed_0_data.
         out_file: the store to write.
+        radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
+        task: a name for the data; that of the tier in the directory's path by default.
     """
     from ringfence.data.omar import import_omar
+    from ringfence.hazards import Separation
 
-    _imported(import_omar(directory), out_file)
+    if radius is not None and task is None:
+        raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
+    hazard = None if radius is None else Separation(radius, radius / 4)
+    _imported(import_omar(directory, hazard, task), out_file)
 
 
 def import_ogmarl(

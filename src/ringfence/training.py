@@ -48,6 +48,7 @@ class Job:
         """What config.json holds."""
         return {
             "algorithm": self.algorithm.name,
+            "revision": self.algorithm.revision,
             "preset": self.preset,
             "config": dataclasses.asdict(self.config),
             "task": self.task.name,
@@ -310,8 +311,9 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     mine = json.loads(json.dumps(job.describe(seed, data.card)))
     if (run.path / "config.json").exists():
-        there = run.config
-        different = [k for k in mine if there.get(k) != mine[k]]
+        there = {"revision": 1} | run.config
+        different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
+        different += _other_data(there.get("data") or {}, mine["data"])
         if different:
             what = different[0]
             if what == "config":
@@ -323,6 +325,15 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
         write_json(run.path / "config.json", mine)
         write_json(run.path / "env.json", environment())
     return run
+
+
+# What a data card says of where its steps come from; the rest describes them, and later versions describe more.
+_ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard")
+
+
+def _other_data(there: dict, here: dict) -> list[str]:
+    """In which respects two cards are of other data."""
+    return [f"data's {k}" for k in _ORIGIN if k in there and k in here and there[k] != here[k]]
 
 
 def _trim_metrics(run: Run, step: int) -> None:

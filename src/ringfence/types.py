@@ -109,6 +109,7 @@ class Algorithm:
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
     heeds_danger: bool = True  # False: training reads neither costs nor the hazard
+    revision: int = 1  # raised when the same settings come to train another policy; results tell theirs
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:
         """The first of the wanted presets that exists, else the algorithm's first one."""

@@ -35,7 +35,8 @@ def fit_critic(
     """
     targets = jnp.stack([rewards, togo], -1)
     value = jnp.stack([targets.mean(0), jnp.maximum(targets.std(0), 1e-6)], -1)
-    flat = np.asarray(features.reshape(-1, features.shape[-1])[:: max(1, len(features) // 20_000)], np.float64)
+    some = features[:: max(1, len(features) // 20_000)]  # of states, with every agent's view of them
+    flat = np.asarray(some.reshape(-1, features.shape[-1]), np.float64)
     mean = flat.mean(0)
     critic = {
         "net": MLP(key, (features.shape[-1], WIDTH, WIDTH, 2)),
@@ -84,7 +85,7 @@ def values_of(critic: dict[str, Array], features: Array) -> np.ndarray:
 
 
 def plan_value(critic: dict[str, Array], rows: Array, discount: float) -> Array:
-    """Σ_h γ^h r̂(row_h) + γ^H V̂(last row) of plans (..., H, N, D) without their present row, in the data's units."""
+    """Σ_{h<H} γ^h r̂(row_h) + γ^H V̂(row_{H−1}) of plans (..., H, N, D) without their present row, in data units."""
     reward, togo = state_values(critic, rows)
     weight = discount ** jnp.arange(reward.shape[-1])
     return (reward * weight).sum(-1) + weight[-1] * discount * togo[..., -1]

@@ -554,7 +554,8 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     )
 
 
-ICBF = Algorithm("icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS)
+REVISION = 2  # 1: the scale of the critic that ranks plans was of every other agent's view of states, or of one's
+ICBF = Algorithm("icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, revision=REVISION)
 MADIFF = Algorithm(
     "madiff",
     Config,
@@ -569,4 +570,5 @@ MADIFF = Algorithm(
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
     heeds_danger=False,
+    revision=REVISION,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,37 +9,25 @@ import numpy as np
 from ringfence import stats
 from ringfence.report.board import Board, Entry, Method
 from ringfence.report.figures import COLOURS
+from ringfence.report.pooling import Interval, Numbers, mean_of, normal_cost, normal_return, pool
 from ringfence.tasks import TASKS
 from ringfence.types import Array
 
 DRAWS = 2000  # of every bootstrap
-Interval = tuple[float, float]
 
 
-@dataclass
-class Standing:
-    """A method on a task over its seeds, or a reference policy. Intervals are 95 %; all numbers are per episode."""
+@dataclass(kw_only=True)
+class Standing(Numbers):
+    """A method on a task over its seeds, or a reference policy."""
 
     task: str
     name: str
     variant: str
     method: Method | None  # None: a reference
     seeds: tuple[int, ...]
-    episodes: int  # over all seeds
-    returns: float
-    returns_sd: float | None  # between seeds; None with fewer than two
-    returns_interval: Interval
-    returns_norm: float
-    returns_norm_sd: float | None
-    cost: float
-    cost_sd: float | None
-    cost_interval: Interval
-    cost_norm: float
-    avoidable: float
-    avoidable_interval: Interval
-    violations: int
-    violation_upper: float  # exact, one-sided, episodes pooled
-    safe: bool  # the upper end of the cost's interval is within the limit
+    returns_sd: float | None = None  # between seeds; None with fewer than two
+    returns_norm_sd: float | None = None
+    cost_sd: float | None = None
     ended: float | None = None  # share of episodes that ended before the time limit; None: not said
     steps: float | None = None  # mean of an episode
     train_seconds: float | None = None  # of one seed
@@ -54,10 +41,6 @@ class Standing:
     @property
     def reference(self) -> bool:
         return self.method is None
-
-    @property
-    def violation_rate(self) -> float:
-        return self.violations / self.episodes
 
     @property
     def label(self) -> str:
@@ -155,114 +138,34 @@ def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -
     entries = board.of(task, method)
     told = [e.summary for e in entries]
     c = board.constants[task]
-    means = {k: np.array([s[k] for s in told]) for k in ("return_mean", "cost_mean", "avoidable_cost")}
-    each = {k: np.array([s["per_episode"][k] for s in told], float) for k in ("return", "cost", "unsafe_start")}
-    fine = each["unsafe_start"] == 0
-    fine = fine if fine.any() else np.ones_like(fine)
-    avoidable = each["cost"] if not each["unsafe_start"].all() else np.zeros_like(each["cost"])
-    cost_interval = interval(each["cost"])
-    sd = _deviation(means["return_mean"])
-    episodes = sum(s["episodes"] for s in told)
-    violations = sum(round(s["violation_rate"] * s["episodes"]) for s in told)
+    sd = _deviation(told, "return_mean")
     return Standing(
         task=task,
         name=method.name,
         variant=method.shown,
         method=method,
         seeds=tuple(e.seed for e in entries),
-        episodes=episodes,
-        returns=float(means["return_mean"].mean()),
         returns_sd=sd,
-        returns_interval=interval(each["return"]),
-        returns_norm=float(_normal_return(means["return_mean"].mean(), c)),
         returns_norm_sd=None if sd is None else sd / (c["return_max"] - c["return_min"]),
-        cost=float(means["cost_mean"].mean()),
-        cost_sd=_deviation(means["cost_mean"]),
-        cost_interval=cost_interval,
-        cost_norm=float(_normal_cost(means["cost_mean"].mean(), c)),
-        avoidable=float(means["avoidable_cost"].mean()),
-        avoidable_interval=interval(avoidable, fine),
-        violations=violations,
-        violation_upper=stats.upper_bound(violations, episodes),
-        safe=cost_interval[1] <= c["cost_limit"],
-        ended=_mean(told, "termination_rate"),
-        steps=_mean(told, "steps_mean"),
-        train_seconds=_mean(told, "train_seconds"),
-        plan_ms=_mean(told, "plan_ms_p50"),
+        cost_sd=_deviation(told, "cost_mean"),
+        ended=mean_of(told, "termination_rate"),
+        steps=mean_of(told, "steps_mean"),
+        train_seconds=mean_of(told, "train_seconds"),
+        plan_ms=mean_of(told, "plan_ms_p50"),
         parameters=told[0].get("parameters"),
         style=style,
         entries=entries,
+        **pool(told),
     )
 
 
 def _reference(task: str, name: str, told: dict) -> Standing:
-    violations = round(told["violation_rate"] * told["episodes"])
-    c = told["constants"]
-    return Standing(
-        task=task,
-        name=name,
-        variant="",
-        method=None,
-        seeds=(),
-        episodes=told["episodes"],
-        returns=told["return_mean"],
-        returns_sd=None,
-        returns_interval=tuple(told["return_interval"]),
-        returns_norm=_normal_return(told["return_mean"], c),
-        returns_norm_sd=None,
-        cost=told["cost_mean"],
-        cost_sd=None,
-        cost_interval=tuple(told["cost_interval"]),
-        cost_norm=_normal_cost(told["cost_mean"], c),
-        avoidable=told["avoidable_cost"],
-        avoidable_interval=tuple(told["avoidable_interval"]),
-        violations=violations,
-        violation_upper=stats.upper_bound(violations, told["episodes"]),
-        safe=told["cost_interval"][1] <= c["cost_limit"],
-        ended=told.get("termination_rate"),
-        steps=told.get("steps_mean"),
-    )
+    ended, steps = told.get("termination_rate"), told.get("steps_mean")
+    return Standing(task=task, name=name, variant="", method=None, seeds=(), ended=ended, steps=steps, **pool([told]))
 
 
-def interval(x: np.ndarray, counted: np.ndarray | None = None, level: float = 0.95) -> Interval:
-    """Percentile bootstrap interval of the mean of x (seeds, episodes), over the entries that are `counted`.
-
-    Seeds and episodes are both resampled. All seeds play the same resets, so an episode is drawn for all of them at
-    once; with a single seed what is left is the bootstrap over episodes (two-way: Owen 2007, The pigeonhole bootstrap).
-    """
-    seeds, episodes = _weights(*x.shape)
-    counted = np.ones_like(x) if counted is None else counted.astype(float)
-    total = ((seeds @ (x * counted)) * episodes).sum(1)
-    number = ((seeds @ counted) * episodes).sum(1)
-    tail = (1 - level) / 2 * 100
-    low, high = np.percentile(total[number > 0] / number[number > 0], [tail, 100 - tail])
-    return float(low), float(high)
-
-
-@functools.lru_cache(maxsize=32)
-def _weights(seeds: int, episodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """How often each draw takes each seed (DRAWS, seeds) and each episode (DRAWS, episodes). All rows share them."""
-    rng = np.random.default_rng(0)
-    return tuple(rng.multinomial(n, np.full(n, 1 / n), DRAWS).astype(float) for n in (seeds, episodes))
-
-
-def _normal_return(x, c: dict[str, float]):
-    """0 at return_min, 1 at return_max."""
-    return (x - c["return_min"]) / (c["return_max"] - c["return_min"])
-
-
-def _normal_cost(x, c: dict[str, float]):
-    """1 at the limit."""
-    return (x + c["cost_offset"]) / (c["cost_limit"] + c["cost_offset"])
-
-
-def _deviation(x: np.ndarray) -> float | None:
-    return float(x.std(ddof=1)) if len(x) > 1 else None
-
-
-def _mean(results: list[dict], key: str) -> float | None:
-    values = [r[key] for r in results if r.get(key) is not None]
-    return float(np.mean(values)) if values else None
+def _deviation(results: list[dict], key: str) -> float | None:
+    return float(np.std([r[key] for r in results], ddof=1)) if len(results) > 1 else None
 
 
 def _styles(methods: list[Method]) -> dict[Method, tuple[int, int]]:
@@ -309,12 +212,12 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
     returns, costs, episode_costs = {}, {}, {}
     for m in methods:
         cells = [[_entry(board, t, m, s) for t in tasks] for s in seeds[m]]
-        score = [[_normal_return(e.summary["return_mean"], board.constants[e.task]) for e in row] for row in cells]
-        price = [[_normal_cost(e.summary["cost_mean"], board.constants[e.task]) for e in row] for row in cells]
+        score = [[normal_return(e.summary["return_mean"], board.constants[e.task]) for e in row] for row in cells]
+        price = [[normal_cost(e.summary["cost_mean"], board.constants[e.task]) for e in row] for row in cells]
         returns[m], costs[m] = np.array(score), np.array(price)
         episode_costs[m] = np.array(
             [
-                [_normal_cost(np.array(e.summary["per_episode"]["cost"]), board.constants[e.task]) for e in row]
+                [normal_cost(np.array(e.summary["per_episode"]["cost"]), board.constants[e.task]) for e in row]
                 for row in cells
             ]
         )

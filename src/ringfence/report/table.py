@@ -8,10 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from ringfence import stats
 from ringfence.errors import UserError
+from ringfence.report.pooling import Numbers, mean_of, pool
 from ringfence.runs import Run, read_json
 
 SPLITS = ("test", "validation")
@@ -31,9 +29,9 @@ ORDER = list(NAMES)  # rows of the table; algorithms that are not named here com
 NEEDED = ("episodes", "return_mean", "cost_mean", "avoidable_cost", "violation_rate", "constants", "protocol", "task")
 
 
-@dataclass
-class Row:
-    """An algorithm and variant over its seeds, or a reference policy. Intervals are 95 %."""
+@dataclass(kw_only=True)
+class Row(Numbers):
+    """An algorithm and variant over its seeds, or a reference policy."""
 
     name: str  # in plain words
     variant: str  # as in results.json; empty for references
@@ -42,29 +40,11 @@ class Row:
     reference: bool
     split: str
     seeds: tuple[int, ...]
-    episodes: int
-    returns: float
-    returns_interval: tuple[float, float]
-    cost: float
-    cost_interval: tuple[float, float]
-    avoidable: float
-    avoidable_interval: tuple[float, float]
-    violations: int
-    violation_upper: float  # exact, one-sided
-    unsafe_starts: int
-    cvar: float
-    returns_norm: float
-    cost_norm: float
-    safe: bool  # the upper end of the cost's interval is within the limit
     parameters: int | None = None
     train_seconds: float | None = None
     plan_ms: float | None = None
     members: list[tuple[Run, dict]] = field(default_factory=list)
     style: tuple[int, int] = (0, 0)  # colour, marker
-
-    @property
-    def violation_rate(self) -> float:
-        return self.violations / self.episodes
 
     @property
     def label(self) -> str:
@@ -180,7 +160,7 @@ def _references(runs: list[Run], task: str, leader: dict, first: Run) -> list[Ro
         for name, result in read_json(file, "holds a damaged reference file; delete it and make it again").items():
             _check(f"'{file}' row '{name}'", result, task)
             _agree(f"'{file}' row '{name}'", result, leader, f"'{first.path}'")
-            rows.setdefault(name, _numbers([result]) | {"split": result.get("split", "test")})
+            rows.setdefault(name, pool([result]) | {"split": result.get("split", "test")})
     return [
         Row(name=name, variant="", algorithm="", preset="", reference=True, seeds=(), **numbers)
         for name, numbers in rows.items()
@@ -221,68 +201,16 @@ def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
         split=results[0]["split"],
         seeds=tuple(sorted(seeds)),
         parameters=results[0].get("parameters"),
-        train_seconds=_mean(results, "train_seconds"),
-        plan_ms=_mean(results, "plan_ms_p50"),
+        train_seconds=mean_of(results, "train_seconds"),
+        plan_ms=mean_of(results, "plan_ms_p50"),
         members=members,
-        **_numbers(results),
+        **pool(results, f"The runs of '{shown}'"),
     )
 
 
 def plain_variant(variant: str) -> str:
     """A variant's name without what a table says elsewhere: `default+plans4@validation` -> `plans4`."""
     return re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
-
-
-def _mean(results: list[dict], key: str) -> float | None:
-    values = [r[key] for r in results if r.get(key) is not None]
-    return float(np.mean(values)) if values else None
-
-
-def _numbers(results: list[dict]) -> dict:
-    """Pooled numbers of several seeds; intervals resample episodes within each seed."""
-    first = results[0]
-    c = first["constants"]
-    if len(results) == 1:
-        n = first["episodes"]
-        violations = round(first["violation_rate"] * n)
-        numbers = {
-            "episodes": n,
-            "returns": first["return_mean"],
-            "returns_interval": tuple(first["return_interval"]),
-            "cost": first["cost_mean"],
-            "cost_interval": tuple(first["cost_interval"]),
-            "avoidable": first["avoidable_cost"],
-            "avoidable_interval": tuple(first["avoidable_interval"]),
-            "violations": violations,
-            "unsafe_starts": first["unsafe_starts"],
-            "cvar": first["cost_cvar10"],
-        }
-    else:
-        seed = np.concatenate([np.full(len(r["per_episode"]["cost"]), k) for k, r in enumerate(results)])
-        returns, cost, unsafe = (
-            np.concatenate([np.asarray(r["per_episode"][k], kind) for r in results])
-            for k, kind in (("return", float), ("cost", float), ("unsafe_start", bool))
-        )
-        fine = ~unsafe if not unsafe.all() else np.ones_like(unsafe)
-        avoidable = cost[fine] * (not unsafe.all())
-        numbers = {
-            "episodes": len(cost),
-            "returns": float(returns.mean()),
-            "returns_interval": stats.bootstrap_mean(returns, strata=seed),
-            "cost": float(cost.mean()),
-            "cost_interval": stats.bootstrap_mean(cost, strata=seed),
-            "avoidable": float(avoidable.mean()),
-            "avoidable_interval": stats.bootstrap_mean(avoidable, strata=seed[fine]),
-            "violations": int((cost > 0).sum()),
-            "unsafe_starts": int(unsafe.sum()),
-            "cvar": stats.cvar(cost),
-        }
-    return numbers | {
-        "violation_upper": stats.upper_bound(numbers["violations"], numbers["episodes"]),
-        "returns_norm": (numbers["returns"] - c["return_min"]) / (c["return_max"] - c["return_min"]),
-        "cost_norm": (numbers["cost"] + c["cost_offset"]) / (c["cost_limit"] + c["cost_offset"]),
-        "safe": numbers["cost_interval"][1] <= c["cost_limit"],
-    }
 
 
 def _place(row: Row) -> tuple:
