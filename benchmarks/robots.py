@@ -30,7 +30,7 @@ import json, resource, sys, time
 begun = time.perf_counter()
 from ringfence import tasks
 from ringfence.data.make import make
-store, _ = make(tasks.get(sys.argv[1]), int(sys.argv[2]), out=sys.argv[3])
+store, _ = make(tasks.get(sys.argv[1]), int(sys.argv[2]), out=sys.argv[3], fresh=True)
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 print(json.dumps([time.perf_counter() - begun, peak, store.steps]))
 """

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import evaluate, reference, tasks
+from ringfence import evaluate, reference, tasks, training
 from ringfence.bench import cells as grid
 from ringfence.bench import local, make_grid, paper, rows, run_local, suites, write_csv
 from ringfence.errors import UserError
+from ringfence.hazards import Separation, to_dict
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run
 
@@ -142,14 +143,18 @@ def test_one_cell_under_two_settings_is_no_table(made):
 
 def test_reference_rows_follow_the_size_of_the_data(made, tmp_path):
     task, place = tasks.get("simple_spread-random"), made.out / "reference"
-    assert reference.there(task, place, 500)
-    assert not reference.there(task, place, 600) and not reference.there(task, place)
-    assert not reference.there(tasks.get("simple_spread-expert"), place, 500)
+    n = made.episodes
+    assert reference.there(task, place, n, 500)
+    assert not reference.there(task, place, n, 600) and not reference.there(task, place, n)
+    assert not reference.there(task, place, n + 1, 500)
+    assert not reference.there(dataclasses.replace(task, hazard=Separation(0.4)), place, n, 500)
+    assert not reference.there(tasks.get("simple_spread-expert"), place, n, 500)
     # a card that tells no size asked for: whole episodes, a little more
     file = tmp_path / task.name / "reference.json"
     file.parent.mkdir()
-    file.write_text(json.dumps({"behaviour data": {"data": {"transitions": 1_000_988}}}))
-    assert reference.there(task, tmp_path) and not reference.there(task, tmp_path, 900_000)
+    card = {"transitions": 1_000_988, "hazard": to_dict(task.hazard)}
+    file.write_text(json.dumps({"behaviour data": {"data": card}, "do-nothing": {"episodes": n}}))
+    assert reference.there(task, tmp_path, n) and not reference.there(task, tmp_path, n, 900_000)
 
 
 def test_references_that_cannot_be_made_stop_nobody(tmp_path, capfd):
@@ -295,7 +300,7 @@ def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
         assert same[0] == same[1]
 
 
-def test_what_reads_no_danger_is_trained_once(tmp_path):
+def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     names = ["halfcheetah_2x3-medium", "halfcheetah_2x3-medium-quantile"]
     few = dict(seeds=1, episodes=1, only_tasks=names, only=["bc"], steps=20, transitions=1000)
     g = make_grid("mujoco", tmp_path / "out", **few)
@@ -304,15 +309,38 @@ def test_what_reads_no_danger_is_trained_once(tmp_path):
     assert grid.Cell(names[1], "bc-safe", "mujoco", 0).twin() is None
     g.open()
     grid.run_group([native], g.out, 1, lambda event, cell: None)
-    grid.adopt(other, g.out)
+    with monkeypatch.context() as m:
+        m.setattr(training, "_loop", lambda *_: pytest.fail("it was trained again"))
+        grid.run_group([other], g.out, 1, lambda event, cell: None)
+    assert other.status(g.out)["adopted"] == str(native.folder(g.out).relative_to(g.out))
     weights = {c.task: Run(c.folder(g.out)).checkpoints()[-1][1].read_bytes() for c in g.cells}
     assert weights[names[0]] == weights[names[1]]
-    grid.run_group([other], g.out, 1, lambda event, cell: None)
     found = {r["task"]: r for r in rows(g.out)}
     assert len(found) == 2 and found[names[0]]["return_mean"] == found[names[1]]["return_mean"]
     grid.make_reference(names[0], g.out, 1, 1000)
     told = [Run(c.folder(g.out)).config for c in g.cells]
     assert [t["task"] for t in told] == names and told[0]["hazard"]["limit"] > told[1]["hazard"]["limit"]
+    for cell in g.cells:  # results alone, as a copied folder has them, teach nobody
+        shutil.rmtree(cell.folder(g.out) / "ckpt")
+    assert grid.adopt(other, g.out) is None
+
+
+def test_a_stale_cell_is_named_and_stops_no_other(tmp_path):
+    g = make_grid("simple_spread", tmp_path / "out", seeds=2, episodes=2, only_tasks=["simple_spread-random"],
+                  only=["bc"], steps=20, transitions=1000)  # fmt: skip
+    g.open()
+    stale = g.cells[1].folder(g.out)
+    grid.run_group([g.cells[1]], g.out, 2, lambda event, cell: None)
+    told = json.loads((stale / "config.json").read_text())
+    (stale / "config.json").write_text(json.dumps(told | {"revision": 0}))
+    (stale / "results.json").unlink()
+    grid.run_group(list(g.cells), g.out, 2, lambda event, cell: None)
+    assert [c.status(g.out)["state"] for c in g.cells] == ["done", "failed"]
+    assert "its revision differs" in g.cells[1].status(g.out)["error"]
+    # a card that has come to tell more is of the same data
+    (stale / "config.json").write_text(json.dumps(told | {"data": told["data"] | {"more": 1}}))
+    grid.run_group([g.cells[1]], g.out, 2, lambda event, cell: None)
+    assert g.cells[1].status(g.out)["state"] == "done"
 
 
 def test_reference_rows_tell_the_data_from_its_safe_part(small_store, tmp_path):

@@ -198,6 +198,7 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     vault.rename(tmp_path / "replay")
     store = import_vault(tmp_path / "replay", "halfcheetah_2x3")
     task = tasks.from_store(store)
+    assert import_vault(tmp_path / "replay", "halfcheetah_2x3", tier="mine").card["task"] == "halfcheetah_2x3-mine"
     assert task.name == "halfcheetah_2x3-replay" and task.env == SafeMuJoCo("2x3", 3.227)
     assert (task.cost_limit, task.return_max, task.presets) == (25.0, 9132.25, ("mujoco",))
     small = {"steps": 2, "batch": 4, "width": 8}
@@ -209,6 +210,14 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     # a store of that name without the robot's states is anybody's own data
     own = replace(store, state=None, card={**store.card, "state_names": []})
     assert tasks.from_store(own).env is None
+
+
+def test_a_tier_is_named_by_its_own_folder_alone(tmp_path, monkeypatch):
+    vault = write_vault(tmp_path / "poor", recorded("2x3"))
+    monkeypatch.chdir(vault)
+    assert import_vault(".", "halfcheetah_2x3").card["task"] == "halfcheetah_2x3-good"
+    vault.rename(tmp_path / "poor" / "Mixed")
+    assert import_vault(tmp_path / "poor" / "Mixed", "halfcheetah_2x3").card["task"] == "halfcheetah_2x3-imported"
 
 
 def test_contact_forces_are_found_where_they_were_charged(tmp_path):

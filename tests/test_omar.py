@@ -104,6 +104,7 @@ def test_without_next_obs_the_last_steps_are_dropped(tmp_path, few):
         ("medium_replay", "simple_spread-medium-replay"),
         ("expert/random/d", "simple_spread-random"),
         ("randomised/d", "simple_spread-imported"),
+        ("expert/random_seed_3", "simple_spread-expert"),
     ],
 )
 def test_the_path_names_the_tier(tmp_path, few, path, task):

@@ -41,6 +41,7 @@ def make(
     size: int | None = None,
     seed: int = 0,
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    fresh: bool = False,
 ) -> None:
     """Regenerate a task's data set (cached).
 
@@ -49,11 +50,12 @@ def make(
         size: transitions; the full data set by default.
         seed: of the collection.
         out_file: write here instead of the cache.
+        fresh: simulate again, whatever the cache holds.
     """
     from ringfence import tasks
     from ringfence.data.make import make
 
-    store, path = make(tasks.get(task), size, seed, out_file)
+    store, path = make(tasks.get(task), size, seed, out_file, fresh)
     out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
 
 
@@ -86,6 +88,7 @@ def import_ogmarl(
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
     speed_limit: float | None = None,
     quantile: bool = False,
+    tier: str | None = None,
 ) -> None:
     """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
 
@@ -95,10 +98,11 @@ def import_ogmarl(
         out_file: the store to write.
         speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
         quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
     """
     from ringfence.data.ogmarl import import_vault
 
-    _imported(import_vault(vault, task, _limit(speed_limit, quantile)), out_file)
+    _imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), out_file)
 
 
 def import_madiff(
@@ -107,6 +111,7 @@ def import_madiff(
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
     speed_limit: float | None = None,
     quantile: bool = False,
+    tier: str | None = None,
 ) -> None:
     """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
 
@@ -116,10 +121,11 @@ def import_madiff(
         out_file: the store to write.
         speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
         quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
     """
     from ringfence.data.ogmarl import import_madiff
 
-    _imported(import_madiff(directory, task, _limit(speed_limit, quantile)), out_file)
+    _imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), out_file)
 
 
 def _limit(speed_limit: float | None, quantile: bool):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class UserError(ValueError):
@@ -16,6 +17,14 @@ class StoreError(UserError):
 
 class CheckpointError(UserError):
     """A checkpoint is truncated, foreign or incomplete."""
+
+
+class RunConflict(UserError):
+    """A run folder holds another job than the one that is to be trained there."""
+
+    def __init__(self, message: str, folder: Path):
+        super().__init__(message)
+        self.folder = folder
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:

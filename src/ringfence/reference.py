@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import equinox as eqx
 import numpy as np
 
+from ringfence import hazards
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
@@ -51,8 +53,9 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
 
 
-def there(task: Task, out: str | Path, transitions: int | None = None) -> bool:
-    """Whether complete reference rows of a data set of that size are there."""
+def there(task: Task, out: str | Path, episodes: int, transitions: int | None = None) -> bool:
+    """Whether complete reference rows of a data set of that size under the task's danger are there, and of as many
+    episodes."""
     file = Path(out) / task.name / FILE
     if not file.exists():
         return False
@@ -60,9 +63,16 @@ def there(task: Task, out: str | Path, transitions: int | None = None) -> bool:
     if not all(complete(r, task) for r in known.values()):
         return False
     card = known.get("behaviour data", {}).get("data", {})
+    if known.get("do-nothing", {}).get("episodes") != episodes or card.get("hazard") != _plain(task.hazard):
+        return False
     wanted = task.transitions if transitions is None else transitions
     # A card without the size that was asked for tells that of its whole episodes.
     return card.get("size") == wanted or ("size" not in card and wanted <= card.get("transitions", 0) < 1.01 * wanted)
+
+
+def _plain(hazard: hazards.Hazard) -> dict:
+    """As a card has it."""
+    return json.loads(json.dumps(hazards.to_dict(hazard)))
 
 
 def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:

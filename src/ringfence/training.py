@@ -23,7 +23,7 @@ import numpy as np
 
 from ringfence import algos, features, hazards, tasks
 from ringfence.data.store import EpisodeStore
-from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.files import whole
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config, environment, write_json
@@ -110,10 +110,27 @@ def train(
     if not seeds or min(seeds) < 0:
         raise UserError(f"seeds={tuple(seeds)} must be one or more numbers of 0 or more.")
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
+    steps = job.config.steps
+    left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
+    windows = _windows(job, data, quiet) if left else None  # a finished run needs no critic fitted to its data again
+    chunk = chunk or max(1, steps // 40)
+    options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
+    if together and left:
+        _loop(job, windows, runs, seeds, options)
+    program = None
+    for run, seed in zip(runs, seeds):
+        if run in left and not together:
+            program = _loop(job, windows, [run], [seed], options, program)
+        if on_finish:
+            on_finish(run)
+    return runs
+
+
+def _windows(job: Job, data: EpisodeStore, quiet: bool) -> WindowData:
     updates = getattr(job.config, "critic_updates", 0)
     if updates and not quiet:
         print(f"{data.card['task']}: what its states are worth, {updates} updates of a critic first", file=sys.stderr)
-    windows = windows_of(
+    return windows_of(
         data,
         job.task,
         job.config.view,
@@ -123,21 +140,6 @@ def train(
         job.config.horizon,
         updates,
     )
-    steps = job.config.steps
-    chunk = chunk or max(1, steps // 40)
-    options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
-    if together:
-        _loop(job, windows, runs, seeds, options)
-        for run in runs:
-            if on_finish:
-                on_finish(run)
-    else:
-        program = None
-        for run, seed in zip(runs, seeds):
-            program = _loop(job, windows, [run], [seed], options, program)
-            if on_finish:
-                on_finish(run)
-    return runs
 
 
 @functools.lru_cache(maxsize=1)
@@ -318,8 +320,9 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
             what = different[0]
             if what == "config":
                 what = next(k for k in mine["config"] if there["config"].get(k) != mine["config"][k])
-            raise UserError(
-                f"'{run.path}' holds another run (its {what} differs); give another --out or delete that folder."
+            raise RunConflict(
+                f"'{run.path}' holds another run (its {what} differs); give another --out or delete that folder.",
+                run.path,
             )
     else:
         write_json(run.path / "config.json", mine)

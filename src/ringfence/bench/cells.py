@@ -22,7 +22,7 @@ from ringfence import __version__, algos, evaluate, hazards, reference, tasks, t
 from ringfence.bench.suites import EVALUATIONS, SUITES
 from ringfence.data.make import make
 from ringfence.data.store import EpisodeStore
-from ringfence.errors import UserError, unknown
+from ringfence.errors import RunConflict, UserError, unknown
 from ringfence.files import whole
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run, build_config, read_json, write_json
@@ -255,8 +255,11 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
                 quiet=True,
             )
         except Exception as error:
+            if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
+                current = next(c for c in left if c.folder(out) == error.folder)
             record_failure(current, out, f"{type(error).__name__}: {error}", traceback.format_exc())
-            tell("failed", left.pop(0))
+            left.remove(current)
+            tell("failed", current)
 
 
 @functools.lru_cache(maxsize=1)
@@ -273,7 +276,10 @@ def adopt(cell: Cell, out: Path) -> Cell | None:
     if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
         return None
     there, here = Run(twin.folder(out)), Run(cell.folder(out))
-    for file in (there.path / "metrics.jsonl", *(f for _, f in there.checkpoints()[-1:])):
+    learned = [file for _, file in there.checkpoints()[-1:]]
+    if not learned:  # results without what was learned, as a copied folder has them
+        return None
+    for file in (there.path / "metrics.jsonl", *learned):
         with whole(here.path / file.relative_to(there.path)) as temporary:
             shutil.copyfile(file, temporary)
     return twin

@@ -70,7 +70,7 @@ def _references(grid: Grid) -> list[dict]:
     return [
         {"reference": t, "transitions": n, "out": str(grid.out), "episodes": grid.episodes}
         for t, n in sizes.items()
-        if not reference.there(tasks.get(t), grid.out / "reference", n)
+        if not reference.there(tasks.get(t), grid.out / "reference", grid.episodes, n)
     ]
 
 

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,7 +35,7 @@ from ringfence.tasks import QUANTILE_LIMITS, ROBOT_COST_LIMIT
 
 ROBOTS = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
-TIER = re.compile(r"(?<![a-z])(good|medium|poor|expert|replay)(?![a-z])", re.IGNORECASE)
+TIERS = ("good", "medium", "poor", "expert", "replay")
 REPLAYED = 256  # steps that are replayed to find the order of actions
 AGREES = 0.05  # median over replayed steps of the largest error in the state; the wrong order has errors of 1 to 10
 STRAY, STRAYS = 1.0, 0.05  # a replayed step that misses by more is a stray; the share of them that is allowed
@@ -58,13 +57,16 @@ class Log:
     last: np.ndarray  # (T,) bool: the step ended an episode
 
 
-def import_vault(vault: str | os.PathLike, task: str, speed_limit: Limit = None) -> EpisodeStore:
+def import_vault(
+    vault: str | os.PathLike, task: str, speed_limit: Limit = None, tier: str | None = None
+) -> EpisodeStore:
     """The store of a Vault, e.g. `2halfcheetah.vlt/Good`; `task`: halfcheetah_2x3, ant_2x4 or ant_4x2.
 
     `speed_limit`: safety-gymnasium's (None), that of the tier's `-quantile` task ("quantile"), or any other (m/s).
+    `tier`: a word for the data; the folder's name, where it is good, medium, poor, expert or replay.
     """
     env, vault = _robot(task), Path(vault)
-    env, called, protocol = _limited(env, f"{task}-{_tier(vault)}", speed_limit)
+    env, called, protocol = _limited(env, f"{task}-{tier or _tier(vault)}", speed_limit)
     wanted = ("actions", "rewards", "terminals", "truncations", "infos.state")
     arrays = _read_vault(vault, wanted)
     where = f"Vault '{vault}'"
@@ -102,11 +104,13 @@ def import_vault(vault: str | os.PathLike, task: str, speed_limit: Limit = None)
     return _store(log, env, called, protocol, f"imported from an OG-MARL Vault, '{vault}'", notes)
 
 
-def import_madiff(directory: str | os.PathLike, task: str, speed_limit: Limit = None) -> EpisodeStore:
-    """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` as
-    of `import_vault`."""
+def import_madiff(
+    directory: str | os.PathLike, task: str, speed_limit: Limit = None, tier: str | None = None
+) -> EpisodeStore:
+    """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` and
+    `tier` as of `import_vault`."""
     env, directory = _robot(task), Path(directory)
-    env, called, protocol = _limited(env, f"{task}-{_tier(directory)}", speed_limit)
+    env, called, protocol = _limited(env, f"{task}-{tier or _tier(directory)}", speed_limit)
     where = f"'{directory}'"
     obs, actions, rewards, lengths = (_load(directory, f) for f in ("obs", "actions", "rewards", "path_lengths"))
     n, wide = env.n_agents, OLD_OBSERVATION[env.parts]
@@ -346,8 +350,8 @@ def _robot(task: str) -> SafeMuJoCo:
 
 
 def _tier(path: Path) -> str:
-    found = TIER.findall(str(path))
-    return found[-1].lower() if found else "imported"
+    name = path.resolve().name.lower()
+    return name if name in TIERS else "imported"
 
 
 def _shape(where: str, name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:

@@ -26,7 +26,7 @@ from ringfence.envs import SimpleSpread
 from ringfence.errors import StoreError
 
 REQUIRED = ("obs", "acs", "rews", "dones")  # next_obs may be absent
-TIER = re.compile(r"(?<![a-z])(medium[-_]replay|medium|expert|random)(?![a-z])")
+TIER = re.compile(r"(?:simple_spread[-_])?(medium[-_]replay|medium|expert|random)")
 ACTION_SLACK = 1e-3  # rounding beyond the bounds that is clipped; more is an error
 STATE_SLACK = 1e-3  # m or m/s; two records of the same state differ by rounding alone
 CHUNK = 50_000  # rows at a time
@@ -271,7 +271,7 @@ def _observation_names(n: int) -> tuple[str, ...]:
 def _task_name(directory: Path, n: int) -> str:
     """`simple_spread-<tier>` if one of the last three folders names a tier and such a task exists."""
     for part in reversed(directory.resolve().parts[-3:]):
-        match = TIER.search(part.lower())
+        match = TIER.fullmatch(part.lower())
         name = match and f"simple_spread-{match[1].replace('_', '-')}"
         if name in tasks.TASKS and tasks.TASKS[name].env.n_agents == n:
             return name
