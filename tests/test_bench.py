@@ -370,7 +370,7 @@ def test_the_table_of_the_paper_keeps_others_data_apart(made, tmp_path):
     table = paper.lines([made.out, tmp_path / "nothing"])
     assert len(table) == 13 * 3
     ours = [x for x in table if x.ours]
-    assert [(x.task, x.method, x.seeds) for x in ours] == [("simple_spread-random", "MA-TD3BC", 2)]
+    assert [(x.task, x.method, x.seeds) for x in ours] == [("simple_spread-random", "MA-TD3+BC", 2)]
     assert ours[0].printed == (0.23, 0.01, 0.00, 0.00)
     measured = [r["return_norm"] for r in rows(made.out) if r["algorithm"] == "ma-td3bc"]
     assert ours[0].ours[0] == pytest.approx(sum(measured) / 2)

@@ -17,7 +17,7 @@ from ringfence import algos, cli, evaluate, tasks
 from ringfence.errors import UserError
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
 from ringfence.report.board import Method, read
-from ringfence.report.board_page import published
+from ringfence.report.board_page import published, rankings
 from ringfence.report.export import escape
 from ringfence.report.page import danger
 from ringfence.report.published import PUBLISHED, matches
@@ -255,7 +255,7 @@ def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
     with pytest.raises(UserError, match="seed-0-b2/config.json' names seed 5, its folder 0"):
         read(folder)
     write(twin / "config.json", told | {"data": {"provenance": "public"}, "config": {"steps": 1}})
-    with pytest.raises(UserError, match=r"seed-0-b2' was trained on other data \(public\)"):
+    with pytest.raises(UserError, match=r"seed-0-b2' was trained on other data \(its provenance is public\)"):
         read(folder)
 
 
@@ -315,12 +315,19 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
     names = [f"halfcheetah_2x3-{tier}{limit}" for limit in ("", "-quantile") for tier in ("good", "poor")]
     for task in names:
         cell(root, {"mujoco": summary([300] * 4, [3] * 4, task)}, preset="mujoco", task=task)
-    native, quantile = aggregates(read(root))
+    cell(root, {"mujoco": summary([400] * 4, [0] * 4, names[0])}, "icbf", preset="mujoco", task=names[0])
+    board = read(root)
+    first, second = rankings(board, standings(board))
+    assert [(r["name"], r["mean"]) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
+    assert second.tasks == names[2:] and [r["name"] for r in second.rows] == ["BC"]  # who has no result has no row
+    native, quantile = aggregates(board)
     assert (native.protocol, native.tasks, quantile.tasks) == ("native", names[:2], names[2:])
     (told,) = native.iqm_returns.values()
     assert told[1] is None and native.return_bands == native.cost_bands == [None]
     page = text_of(build_board(root, tmp_path / "p.html").read_text())
-    assert "The 2 tasks with quantile limits" in page and "nothing is known of its spread between runs" in page
+    assert page.count("The 2 tasks with quantile limits") == 2 and "Older revisions" in page
+    assert f"{names[0]}, ICBF-Diffuser, seed 0" in page  # whose run tells no revision, so it is of the first
+    assert "1 seed; 4 episodes" in page and "nothing is known of its spread between runs" in page
     assert "A step costs 1 for a distance below 0.3 m. Cost limit l = 25" in page
     assert danger({"kind": "SpeedLimit", "limit": 1.026}) == "a speed above 1.026 m/s"
 

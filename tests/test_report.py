@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from ringfence import stats
+from ringfence.algos import ICBF
 from ringfence.errors import UserError
 from ringfence.report import animation, build_report
 from ringfence.report.table import sections
@@ -125,6 +126,28 @@ def test_page_is_whole_and_self_contained(runs, tmp_path):
 
 def test_page_goes_into_a_folder(runs, tmp_path):
     assert build_report(map(lambda r: str(r.path), runs), tmp_path) == tmp_path / "report.html"
+
+
+def test_what_is_no_row_is_refused(runs):
+    told = json.loads((runs[1].path / "config.json").read_text())
+    write = lambda more: (runs[1].path / "config.json").write_text(json.dumps(told | more))  # noqa: E731
+    write({"data": told["data"] | {"seed": 3}})
+    with pytest.raises(UserError, match="its seed is 3"):
+        sections(runs)
+    write({})
+    results = json.loads((runs[1].path / "results.json").read_text())
+    results["split"] = result([1.0, 2.0], [0, 1], options={"plans": 1})
+    (runs[1].path / "results.json").write_text(json.dumps(results))
+    with pytest.raises(UserError, match="'split' were played for 2 and for 20 episodes"):
+        sections(runs)
+
+
+def test_a_run_that_is_older_than_a_field_had_its_default(runs):
+    told = json.loads((runs[0].path / "config.json").read_text())
+    whole = told["config"] | {"barrier_width": ICBF.Config().barrier_width}
+    (runs[0].path / "config.json").write_text(json.dumps(told | {"config": whole}))
+    (section,) = sections(runs)
+    assert [r.seeds for r in section.tables["test"] if r.label == "ICBF-Diffuser split"] == [(0, 1)]
 
 
 def test_seeds_are_pooled(runs):

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import algos, features, hazards, tasks
+from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.files import whole
@@ -315,7 +316,7 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     if (run.path / "config.json").exists():
         there = {"revision": 1} | run.config
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
-        different += _other_data(there.get("data") or {}, mine["data"])
+        different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:
             what = different[0]
             if what == "config":
@@ -328,15 +329,6 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
         write_json(run.path / "config.json", mine)
         write_json(run.path / "env.json", environment())
     return run
-
-
-# What a data card says of where its steps come from; the rest describes them, and later versions describe more.
-_ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard")
-
-
-def _other_data(there: dict, here: dict) -> list[str]:
-    """In which respects two cards are of other data."""
-    return [f"data's {k}" for k in _ORIGIN if k in there and k in here and there[k] != here[k]]
 
 
 def _trim_metrics(run: Run, step: int) -> None:

@@ -23,7 +23,7 @@ from ringfence.files import whole
 FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
 SEEDS = 5  # of the paper
 METHODS = ("ma-td3bc", "omar", "icbf")
-# The paper's rows: its name of a task, ours, and (reward, deviation, cost, deviation) of MA-TD3BC, OMAR and its own
+# The paper's rows: its name of a task, ours, and (reward, deviation, cost, deviation) of MA-TD3+BC, OMAR and its own
 # method. "md" is the one tier of Simple Spread that is left: medium-replay.
 PRINTED: dict[str, tuple[str, tuple[tuple[float, float, float, float], ...]]] = {
     "ant_2x4-good": ("2ant-good", ((0.73, 0.11, 2.39, 0.08), (0.34, 0.09, 1.25, 0.07), (1.05, 0.10, 0.44, 0.04))),
@@ -63,7 +63,7 @@ PRINTED: dict[str, tuple[str, tuple[tuple[float, float, float, float], ...]]] = 
 }
 # Which of our rows stands for a method: algorithm and the endings that its variant may have, the best planner first.
 OURS = {
-    "MA-TD3BC": ("ma-td3bc", ("",)),
+    "MA-TD3+BC": ("ma-td3bc", ("",)),
     "OMAR": ("omar", ("",)),
     "ICBF": ("icbf", ("+guarded", "+shielded", "")),
 }

@@ -11,16 +11,15 @@ tasks.
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringfence import algos, tasks
+from ringfence import tasks
 from ringfence.bench import suites
+from ringfence.data.origin import other_data
 from ringfence.errors import UserError
-from ringfence.report.table import NAMES, NEEDED, ORDER, plain_variant
+from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
 from ringfence.runs import Run, read_json
 
 FORMAT = 1  # of the folder
@@ -53,10 +52,8 @@ class Method:
 
     @property
     def place(self) -> tuple:
-        """Order in tables: that of NAMES, then by name, numbers by size."""
-        rank = ORDER.index(self.algorithm) if self.algorithm in ORDER else len(ORDER)
-        parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", self.shown)]
-        return rank, self.algorithm, self.preset != "paper", [(isinstance(p, str), p) for p in parts]
+        """Order in tables."""
+        return place(self.algorithm, self.preset, self.shown)
 
 
 @dataclass(frozen=True)
@@ -248,7 +245,7 @@ def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entr
     configs = {run.path: run.config for run, *_ in finished}
     apart = _differing([(task, configs[run.path]) for run, task, *_ in finished])  # by (algorithm, preset)
     entries: dict[tuple, Entry] = {}
-    data: dict[str, tuple[str, Path]] = {}
+    data: dict[str, tuple[dict, Path]] = {}
     for run, task, _, seed in finished:
         told = configs[run.path]
         for name, here in (("task", task), ("seed", seed)):
@@ -257,15 +254,16 @@ def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entr
                     f"'{run.path / 'config.json'}' names {name} {told.get(name)}, its folder {here}; a cell was moved: "
                     "put it back or delete it."
                 )
-        provenance = (told.get("data") or {}).get("provenance")
-        first = data.setdefault(task, (provenance, run.path))
-        if provenance != first[0]:
+        card = told.get("data") or {}
+        first, path = data.setdefault(task, (card, run.path))
+        if unlike := other_data(card, first):
+            name, here, there = unlike[0]
             raise UserError(
-                f"'{run.path}' was trained on other data ({provenance}) than '{first[1]}' ({first[0]}); "
+                f"'{run.path}' was trained on other data (its {name} is {here}) than '{path}' ({there}); "
                 "keep one results folder for each data set."
             )
         algorithm, preset = told["algorithm"], _preset(task, told)
-        fields, config = apart.get((algorithm, preset), []), _config(told)
+        fields, config = apart.get((algorithm, preset), []), config_of(told)
         words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
             if "@" in variant and summary.get("split") != split:
@@ -288,27 +286,17 @@ def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[st
     A setting that is one thing on one task and another on the next is no reason for two rows."""
     groups: dict[tuple, list[dict]] = {}
     for task, told in configs:
-        groups.setdefault((told["algorithm"], _preset(task, told), task), []).append(_config(told))
+        groups.setdefault((told["algorithm"], _preset(task, told), task), []).append(config_of(told))
     found: dict[tuple[str, str], list[str]] = {}
     for (algorithm, preset, _), several in groups.items():
         names = found.setdefault((algorithm, preset), [])
-        fields = dict.fromkeys(k for c in several for k in c)
-        names += [k for k in fields if k not in names and len({json.dumps(c.get(k)) for c in several}) > 1]
+        names += [k for k in differing(several) if k not in names]
     return found
 
 
 def _preset(task: str, told: dict) -> str:
     """A run's preset, where one made for the task counts as the default."""
     return "default" if told["preset"] in _presets(task) else told["preset"]
-
-
-def _config(told: dict) -> dict:
-    """A run's config; a field that is younger than the run had its default then."""
-    try:
-        fields = dataclasses.fields(algos.get(told["algorithm"]).Config)
-    except UserError:  # an algorithm of somebody else's
-        return dict(told["config"])
-    return {f.name: f.default for f in fields} | told["config"]
 
 
 def _check(entries: list[Entry], references: dict[Path, tuple[str, dict[str, dict]]], told: dict, folder: Path) -> None:

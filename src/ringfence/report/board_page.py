@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
@@ -10,12 +11,22 @@ import numpy as np
 from markupsafe import Markup
 
 from ringfence import stats
+from ringfence.algos import ALGORITHMS
 from ringfence.files import whole
 from ringfence.report import board_figures, figures
 from ringfence.report.board import Board, Method, read
 from ringfence.report.page import WORDS, danger, environments, facts, headline, render
 from ringfence.report.published import NOTE, PUBLISHED, matches
-from ringfence.report.standings import DRAWS, Aggregate, Standing, aggregates, contests, references, standings
+from ringfence.report.standings import (
+    DRAWS,
+    Aggregate,
+    Standing,
+    aggregates,
+    by_protocol,
+    contests,
+    references,
+    standings,
+)
 from ringfence.report.table import Section
 from ringfence.runs import Run
 
@@ -42,7 +53,9 @@ def _context(board: Board, out: Path, title: str | None) -> dict:
         "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
         "board": board,
         "draws": DRAWS,
-        "ranking": ranking(board, tables),
+        "rankings": rankings(board, tables),
+        "seeds": _seeds(tables),
+        "older": _older(tables),
         "sections": [_section(board, t, k, tables[t], rows_to_beat[t], out) for k, t in enumerate(board.tasks)],
         "aggregates": [_aggregate(board, a, k, styles) for k, a in enumerate(aggregates(board))],
         "expenses": Markup(board_figures.expenses(_typical(board, tables), "expenses")),
@@ -50,7 +63,6 @@ def _context(board: Board, out: Path, title: str | None) -> dict:
         "note": NOTE,
         "missing": _missing(board),
         "environments": environments(board.runs),
-        "several_seeds": len(board.seeds) > 1,
     }
 
 
@@ -59,25 +71,62 @@ def short(task: str, suite: str) -> str:
     return task.removeprefix(f"{suite}-") or task
 
 
-def ranking(board: Board, tables: dict[str, list[Standing]]) -> list[dict]:
-    """Methods by their mean rank over the tasks, counted among those that were measured on every task; the others
-    come last, since they have none."""
+@dataclass(frozen=True)
+class Ranking:
+    """Methods by their mean rank over the tasks that follow one protocol."""
+
+    protocol: str  # empty where a board has one kind of tasks
+    tasks: list[str]
+    rows: list[dict]  # name, variant, style, cells (a Standing or None per task), mean, within, measured
+
+
+def rankings(board: Board, tables: dict[str, list[Standing]]) -> list[Ranking]:
+    """One per protocol: tasks that share data and policies under two limits are not two tasks."""
+    return [Ranking(p, tasks, _ranks(board, tasks, tables)) for p, tasks in by_protocol(board).items()]
+
+
+def _ranks(board: Board, tasks: list[str], tables: dict[str, list[Standing]]) -> list[dict]:
+    """Mean ranks are counted among the methods that were measured on every task; the others come last, since they have
+    none."""
     rows = []
-    cells = {m: [next((r for r in tables[t] if r.method == m), None) for t in board.tasks] for m in board.methods}
+    cells = {m: [next((r for r in tables[t] if r.method == m), None) for t in tasks] for m in board.methods}
     complete = [m for m in board.methods if all(cells[m])]
     among = {m: [] for m in complete}
-    for k, task in enumerate(board.tasks):
+    for k, task in enumerate(tasks):
         told = [cells[m][k] for m in complete]
         limit = board.constants[task]["cost_limit"]
         places = stats.places([r.returns for r in told], [r.cost_interval[1] for r in told], limit)
         for m, place in zip(complete, places):
             among[m].append(place)
     for m, row in cells.items():
-        mean = float(np.mean(among[m])) if m in among else None
-        style = next(c.style for c in row if c)
-        rows.append({"name": m.name, "variant": m.shown, "style": style, "reference": False, "cells": row})
-        rows[-1] |= {"mean": mean, "within": sum(c.safe for c in row if c), "measured": sum(map(bool, row))}
+        if any(row):
+            mean = float(np.mean(among[m])) if m in among else None
+            style = next(c.style for c in row if c)
+            rows.append({"name": m.name, "variant": m.shown, "style": style, "reference": False, "cells": row})
+            rows[-1] |= {"mean": mean, "within": sum(c.safe for c in row if c), "measured": sum(map(bool, row))}
     return sorted(rows, key=lambda r: (r["mean"] is None, r["mean"] or 0.0))
+
+
+def _seeds(tables: dict[str, list[Standing]]) -> str:
+    """How many seeds the rows have, in words."""
+    counts = [len(r.seeds) for rows in tables.values() for r in rows]
+    low, high = min(counts), max(counts)
+    if low == high:
+        return f"{high} seed{'s' * (high > 1)}"
+    most = max(set(counts), key=counts.count)
+    return f"{low} to {high} seeds ({counts.count(most)} of {len(counts)} rows of {most})"
+
+
+def _older(tables: dict[str, list[Standing]]) -> list[tuple[str, str, list[int]]]:
+    """(task, method, seeds) trained by an older revision of their algorithm than this package has."""
+    found = []
+    for task, rows in tables.items():
+        for r in rows:
+            told = {e.seed: Run(e.path).config.get("revision", 1) for e in r.entries}
+            now = ALGORITHMS[r.method.algorithm].revision if r.method.algorithm in ALGORITHMS else 1
+            if seeds := [seed for seed, revision in told.items() if revision < now]:
+                found.append((task, r.label, seeds))
+    return found
 
 
 def published(board: Board, tables: dict[str, list[Standing]]) -> dict | None:

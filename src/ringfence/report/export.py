@@ -9,7 +9,7 @@ from pathlib import Path
 from ringfence.errors import unknown
 from ringfence.files import whole
 from ringfence.report.board import Board, Method, read
-from ringfence.report.board_page import ranking, short
+from ringfence.report.board_page import rankings, short
 from ringfence.report.page import share
 from ringfence.report.standings import Standing, references, standings
 
@@ -176,20 +176,22 @@ def board_markdown(board: Board) -> str:
 
 
 def board_markdown_short(board: Board) -> str:
-    """One table, methods by tasks: normalised return and avoidable cost, by mean rank."""
+    """One table per protocol, methods by tasks: normalised return and avoidable cost, by mean rank."""
     tables, rows_to_beat = standings(board), references(board)
-    head = ["norm. return (avoidable cost)", *(short(t, board.suite) for t in board.tasks), "mean rank"]
-    rows = []
-    names = dict.fromkeys(r.name for t in board.tasks for r in rows_to_beat[t])
-    for name in names:
-        cells = [next((r for r in rows_to_beat[t] if r.name == name), None) for t in board.tasks]
-        rows.append([name, *(_brief(r, 0) for r in cells), "–"])
-    for row in ranking(board, tables):
-        mean = "–" if row["mean"] is None else f"{row['mean']:.2f}"
-        rows.append(
-            [f"{row['name']} {row['variant']}".strip(), *(_brief(r, len(board.seeds)) for r in row["cells"]), mean]
-        )
-    return _table(head, rows) + "\n\n" + _legend(board) + "\n"
+    blocks = []
+    for ranking in rankings(board, tables):
+        head = ["norm. return (avoidable cost)", *(short(t, board.suite) for t in ranking.tasks), "mean rank"]
+        rows = []
+        names = dict.fromkeys(r.name for t in ranking.tasks for r in rows_to_beat[t])
+        for name in names:
+            cells = [next((r for r in rows_to_beat[t] if r.name == name), None) for t in ranking.tasks]
+            rows.append([name, *(_brief(r, 0) for r in cells), "–"])
+        for row in ranking.rows:
+            mean = "–" if row["mean"] is None else f"{row['mean']:.2f}"
+            cells = (_brief(r, len(board.seeds)) for r in row["cells"])
+            rows.append([f"{row['name']} {row['variant']}".strip(), *cells, mean])
+        blocks.append(_table(head, rows))
+    return "\n\n".join([*blocks, _legend(board)]) + "\n"
 
 
 def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:

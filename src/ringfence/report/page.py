@@ -269,7 +269,7 @@ def commands(section: Section, out: Path) -> list[str]:
         jobs.setdefault((told["algorithm"], told["preset"], tuple(sorted(changed.items())), root), []).append(run)
     for (algorithm, preset, changed, root), members in jobs.items():
         line = ["ringfence", "train", algorithm, data]
-        if preset != "default":
+        if preset != _usual_preset(algorithm, section.task):
             line += ["--preset", preset]
         for first, count in _stretches(sorted(r.config["seed"] for r in members)):
             tail = [f"--seeds {count}"] + ([f"--first-seed {first}"] if first else [])
@@ -294,6 +294,12 @@ def commands(section: Section, out: Path) -> list[str]:
     roots = dict.fromkeys(shlex.quote(str(r.path.parent.parent)) for r in section.runs)
     lines.append(f"ringfence report {' '.join(roots)} --out {shlex.quote(str(out))}")
     return lines
+
+
+def _usual_preset(algorithm: str, task: str) -> str:
+    """The preset that training takes without being told one; no name where that is not known."""
+    known = algos.ALGORITHMS.get(algorithm)
+    return known.preset_for(tasks.TASKS[task].presets if task in tasks.TASKS else ()) if known else ""
 
 
 def _stretches(seeds: list[int]) -> list[tuple[int, int]]:

@@ -186,13 +186,16 @@ def _styles(methods: list[Method]) -> dict[Method, tuple[int, int]]:
 def aggregates(board: Board) -> list[Aggregate]:
     """One per protocol that the board's tasks follow: tasks that share data and policies under two limits are not two
     tasks. Protocols without a method that was measured on every task with one and the same seed are left out."""
-    protocols = list(dict.fromkeys(_protocol(t) for t in board.tasks))
-    made = [aggregate(board, p, [t for t in board.tasks if _protocol(t) == p]) for p in protocols]
+    made = [aggregate(board, protocol, tasks) for protocol, tasks in by_protocol(board).items()]
     return [x for x in made if x is not None]
 
 
-def _protocol(task: str) -> str:
-    return TASKS[task].protocol if task in TASKS else ""
+def by_protocol(board: Board) -> dict[str, list[str]]:
+    """The board's tasks by what their limit follows."""
+    found: dict[str, list[str]] = {}
+    for task in board.tasks:
+        found.setdefault(TASKS[task].protocol if task in TASKS else "", []).append(task)
+    return found
 
 
 def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) -> Aggregate | None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ringfence.algos import ALGORITHMS
+from ringfence.data.origin import other_data
 from ringfence.errors import UserError
 from ringfence.report.pooling import Numbers, mean_of, pool
 from ringfence.runs import Run, read_json
@@ -16,8 +19,8 @@ SPLITS = ("test", "validation")
 NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
-    "ma-td3bc": "MA-TD3BC",
-    "ma-td3bc-lag": "MA-TD3BC with a cost multiplier",
+    "ma-td3bc": "MA-TD3+BC",
+    "ma-td3bc-lag": "MA-TD3+BC, Lagrange",
     "fisor": "FISOR",
     "ma-cql": "MA-CQL",
     "ma-icq": "MA-ICQ",
@@ -107,24 +110,24 @@ def _section(task: str, runs: list[Run]) -> Section:
         _agree(f"'{run.path}' variant '{name}'", result, leader, f"'{first.path}'")
     card = first.config.get("data") or {}
     for run in runs:
-        told = (run.config.get("data") or {}).get("provenance")
-        if told != card.get("provenance"):
+        if apart := other_data(run.config.get("data") or {}, card):
+            name, here, there = apart[0]
             raise UserError(
-                f"'{run.path}' was trained on other data ({told}) than '{first.path}' ({card.get('provenance')}); "
+                f"'{run.path}' was trained on other data (its {name} is {here}) than '{first.path}' ({there}); "
                 "make one report for each data set."
             )
     references = _references(runs, task, leader, first)
     tables = {}
-    differing = _differing(runs)
+    fields = _differing(runs)
     for split in SPLITS:
         groups: dict[tuple, list[tuple[Run, dict]]] = {}
         for run, name, result in entries:
             if result["split"] == split:
-                config = json.dumps(run.config["config"], sort_keys=True)
+                config = json.dumps(config_of(run.config), sort_keys=True)
                 groups.setdefault((run.config["algorithm"], name, config), []).append((run, result))
-        rows = [_row(name, members, differing) for (_, name, _), members in groups.items()]
+        rows = [_row(name, members, fields) for (_, name, _), members in groups.items()]
         if rows:
-            tables[split] = sorted(rows, key=_place)
+            tables[split] = sorted(rows, key=lambda r: place(r.algorithm, r.preset, r.variant))
     section = Section(
         task, first.config.get("hazard") or {}, card, leader["constants"], leader["protocol"], runs, tables, references
     )
@@ -167,18 +170,28 @@ def _references(runs: list[Run], task: str, leader: dict, first: Run) -> list[Ro
     ]
 
 
+def config_of(told: dict) -> dict:
+    """The config in a run's config.json; a field that is younger than the run had its default then."""
+    if told["algorithm"] not in ALGORITHMS:  # one of somebody else's
+        return dict(told["config"])
+    return {f.name: f.default for f in dataclasses.fields(ALGORITHMS[told["algorithm"]].Config)} | told["config"]
+
+
+def differing(configs: list[dict]) -> list[str]:
+    """Fields in which configs differ: their runs get rows of their own."""
+    fields = dict.fromkeys(k for c in configs for k in c)
+    return [k for k in fields if len({json.dumps(c.get(k)) for c in configs}) > 1]
+
+
 def _differing(runs: list[Run]) -> dict[tuple[str, str], list[str]]:
-    """Config fields in which runs of the same algorithm and preset differ: they get rows of their own."""
+    """Differing fields by algorithm and preset."""
     configs: dict[tuple[str, str], list[dict]] = {}
-    for run in runs:
-        configs.setdefault((run.config["algorithm"], run.config["preset"]), []).append(run.config["config"])
-    return {
-        key: [k for k in several[0] if any(c.get(k) != several[0][k] for c in several)]
-        for key, several in configs.items()
-    }
+    for told in (run.config for run in runs):
+        configs.setdefault((told["algorithm"], told["preset"]), []).append(config_of(told))
+    return {key: differing(several) for key, several in configs.items()}
 
 
-def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
+def _row(variant: str, members: list[tuple[Run, dict]], fields: dict) -> Row:
     told = members[0][0].config
     seeds = [run.config["seed"] for run, _ in members]
     for k, seed in enumerate(seeds):
@@ -188,9 +201,9 @@ def _row(variant: str, members: list[tuple[Run, dict]], differing: dict) -> Row:
                 f"seed {seed}; give only one of them."
             )
     shown = plain_variant(variant)
-    apart = differing.get((told["algorithm"], told["preset"]), [])
-    if apart:
-        shown += " [" + ", ".join(f"{k}={told['config'][k]}" for k in apart) + "]"
+    if apart := fields.get((told["algorithm"], told["preset"])):
+        config = config_of(told)
+        shown += " [" + ", ".join(f"{k}={config.get(k)}" for k in apart) + "]"
     results = [result for _, result in members]
     return Row(
         name=NAMES.get(told["algorithm"], told["algorithm"]),
@@ -213,10 +226,11 @@ def plain_variant(variant: str) -> str:
     return re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
 
 
-def _place(row: Row) -> tuple:
-    rank = ORDER.index(row.algorithm) if row.algorithm in ORDER else len(ORDER)
-    numbers_as_numbers = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", row.variant)]
-    return rank, row.algorithm, row.preset != "paper", [(isinstance(p, str), p) for p in numbers_as_numbers]
+def place(algorithm: str, preset: str, variant: str) -> tuple:
+    """Order of rows: that of NAMES, then by variant, numbers by size."""
+    rank = ORDER.index(algorithm) if algorithm in ORDER else len(ORDER)
+    parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", variant)]
+    return rank, algorithm, preset != "paper", [(isinstance(p, str), p) for p in parts]
 
 
 def _paint(section: Section) -> None:

@@ -1,0 +1,11 @@
+"""Whether two data cards are of the same steps."""
+
+from __future__ import annotations
+
+# What a card says of where its steps come from; the rest describes them, and later versions describe more.
+ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard")
+
+
+def other_data(here: dict, there: dict) -> list[tuple[str, object, object]]:
+    """(name, here, there) of what two cards contradict each other in; a field that one of them lacks says nothing."""
+    return [(k, here[k], there[k]) for k in ORIGIN if k in here and k in there and here[k] != there[k]]
