@@ -120,19 +120,23 @@ def grouped(suite: str) -> dict:
 
 
 def robots_short(groups: dict) -> str:
-    """One line per task, one column per method: return / cost, and how many seeds they are of."""
+    """One line per task, one column per method: return / cost, and how many seeds they are of where that is not the
+    usual number."""
     lines = ["| | " + " | ".join(label for *_, label in IN_README) + " |", "|---|" + "---|" * len(IN_README)]
-    seeds: dict[int, int] = defaultdict(int)
-    for name in (f"{robot}-{level}" for robot in ROBOTS for level in LEVELS):
+    names = [f"{robot}-{level}" for robot in ROBOTS for level in LEVELS]
+    found = {(n, a, v): groups.get((n, a, v), []) for n in names for a, v, _ in IN_README}
+    counts = [len(rows) for (_, _, variant), rows in found.items() if rows and variant != "reference"]
+    usual = max(set(counts), key=counts.count)
+    for name in names:
         cells = []
         for algorithm, variant, _ in IN_README:
-            rows = groups.get((name, algorithm, variant), [])
+            rows = found[name, algorithm, variant]
             numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else absent(variant)
-            cells.append(numbers + fallen(rows))
-            seeds[len(rows)] += bool(rows) and variant != "reference"
+            unusual = rows and variant != "reference" and len(rows) != usual
+            cells.append(numbers + fallen(rows) + f" [{len(rows)}]" * bool(unusual))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    told = ", ".join(f"{n} of {k} seed{'s' * (k > 1)}" for k, n in sorted(seeds.items()) if n)
-    return "\n".join([*lines, "", f"Cells: {told}."])
+    others = " [n]: of n." if len(set(counts)) > 1 else ""
+    return "\n".join([*lines, "", f"Methods' cells are of {usual} seed{'s' * (usual > 1)}.{others}"])
 
 
 def robots(groups: dict, ending: str) -> str:
@@ -173,6 +177,8 @@ def spent(folder: Path) -> str:
     seconds = defaultdict(list)
     for file in sorted((folder / "cells").glob("*/*/*/status.json")):
         told, name = json.loads(file.read_text()), file.parent.parent.name
+        if told["state"] != "done":
+            continue
         if "adopted" in told or (tasks.twin(file.parts[-4]) and not algos.get(_algorithm(name)).heeds_danger):
             trained, name = told.get("train_seconds", 0.0), f"{name}, trained before"
         else:  # of a cell that was played again the last attempt trained nothing
@@ -215,16 +221,22 @@ def spread(groups: dict) -> str:
 MARKS = {  # colour-blind-safe, and told apart by shape as well
     "behaviour data": ("s", "#777777"),
     "BC": ("v", "#999933"),
+    "BC on episodes without a collision": ("1", "#999933"),
     "MA-TD3+BC": ("<", "#AA3377"),
+    "MA-CQL": ("2", "#AA3377"),
     "OMAR": (">", "#DDAA33"),
     "MA-TD3+BC, Lagrange": ("p", "#EE3377"),
     "FISOR per agent": ("X", "#004488"),
     "MADIFF (no barrier)": ("^", "#0077BB"),
+    "MADIFF, guarded planner": ("H", "#0077BB"),
     "ICBF-Diffuser `paper`": ("D", "#CC3311"),
     "ICBF-Diffuser `split`": ("o", "#33BBEE"),
     "`split`, best of 8 plans": ("P", "#EE7733"),
     "**`split`, guarded planner**": ("*", "#009988"),
+    "`long`: `split` for 6000 updates": ("3", "#33BBEE"),
+    "**`long`, guarded planner**": ("4", "#009988"),
 }
+UNDRAWN = ("its episodes within the limit", "do nothing", "random actions")
 
 
 def draw(groups: dict, path: Path) -> None:
@@ -233,7 +245,7 @@ def draw(groups: dict, path: Path) -> None:
     for panel, tier in zip(panels, TIERS):
         for algorithm, variant, name in ROWS:
             rows = of(groups, tier, algorithm, variant)
-            if not rows or name not in MARKS:
+            if not rows or name in UNDRAWN:
                 continue
             mark, colour = MARKS[name]
             x = np.array([float(r["avoidable_cost"]) for r in rows])
@@ -241,8 +253,8 @@ def draw(groups: dict, path: Path) -> None:
             panel.errorbar(
                 x.mean(),
                 y.mean(),
-                y.std(),
-                x.std(),
+                y.std(ddof=len(y) > 1),
+                x.std(ddof=len(x) > 1),
                 mark,
                 color=colour,
                 ms=9 if mark != "*" else 14,
@@ -251,7 +263,6 @@ def draw(groups: dict, path: Path) -> None:
             )
         panel.set_xscale("symlog", linthresh=0.01)
         panel.set_xlim(-0.003, 20)
-        panel.axvline(0.02, color="#bbbbbb", lw=0.8, ls=":")
         panel.set_title(f"simple_spread-{tier}", fontsize=10)
         panel.grid(alpha=0.25)
         panel.set_xlabel("avoidable collision steps per episode")

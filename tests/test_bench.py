@@ -212,7 +212,8 @@ def test_a_worker_that_outgrows_its_memory_is_stopped_and_said_so(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
     (tmp_path / "out" / "reference" / "simple_spread-random").mkdir(parents=True)
     grid.write_json(g.out / "bench.json", grid.about(g.suite, g.episodes))
-    known = {"behaviour data": {"data": {"size": 500}}}
+    card = {"size": 500, "hazard": to_dict(tasks.get("simple_spread-random").hazard)}
+    known = {"behaviour data": {"data": card}, "do-nothing": {"episodes": g.episodes}}
     (tmp_path / "out" / "reference" / "simple_spread-random" / "reference.json").write_text(json.dumps(known))
     assert run_local(g, workers=1, memory=0.05, quiet=True) == {"done": 0, "failed": 1, "to do": 0}
     assert "grew beyond 0.05 GiB" in g.cells[0].status(g.out)["error"]

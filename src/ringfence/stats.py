@@ -106,17 +106,6 @@ def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
     return float(_improvement(x[None], y[None])[0])
 
 
-def improvement_interval(
-    x: np.ndarray, y: np.ndarray, level: float = 0.95, draws: int = 2000, seed: int = 0
-) -> tuple[float, float]:
-    """Stratified bootstrap interval of `probability_of_improvement`; both sides are resampled."""
-    probability_of_improvement(x, y)
-    rng = np.random.default_rng(seed)
-    x, y = _several(x), _several(y)
-    pairs = zip(_resamples(x, draws, rng, 200), _resamples(y, draws, rng, 200))
-    return _percentiles(np.concatenate([_improvement(a, b) for a, b in pairs]), level)
-
-
 def profile(scores: np.ndarray, thresholds: np.ndarray) -> np.ndarray:
     """(..., T) share of (..., R, M) scores above each threshold: a performance profile."""
     x = np.asarray(scores, np.float64)
@@ -180,9 +169,9 @@ def _several(scores: np.ndarray) -> np.ndarray:
     return x
 
 
-def _resamples(x: np.ndarray, draws: int, rng: np.random.Generator, block: int = 0) -> Iterator[np.ndarray]:
+def _resamples(x: np.ndarray, draws: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
     """Resampled copies (block, R, M), `draws` in all."""
-    block = block or max(1, BLOCK // x.size)
+    block = max(1, BLOCK // x.size)
     for first in range(0, draws, block):
         rows = rng.integers(0, len(x), (min(block, draws - first), *x.shape))
         yield np.take_along_axis(x[None], rows, 1)

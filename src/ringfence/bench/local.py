@@ -83,7 +83,7 @@ class _Pool:
         self.guard = threading.Lock()
         self.stopping = False
         self.running: set[subprocess.Popen] = set()
-        self.failed = 0
+        self.too_big: set[int] = set()  # process numbers of workers that were stopped for it
 
     def serve(self, cores: list[int]) -> None:
         """Keep one worker busy until no job is left."""
@@ -128,13 +128,11 @@ class _Pool:
         if cores and hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(worker.pid, cores)
         self.running.add(worker)
+        threading.Thread(target=self._weigh, args=(worker,), daemon=True).start()
         return worker
 
     def _work(self, worker: subprocess.Popen, job: dict) -> None:
         current, left = None, [decode(c) for c in job.get("cells", [])]
-        too_big = threading.Event()
-        watch = threading.Thread(target=self._weigh, args=(worker, too_big), daemon=True)
-        watch.start()
         try:
             worker.stdin.write(json.dumps(job) + "\n")
             worker.stdin.flush()
@@ -153,22 +151,23 @@ class _Pool:
             current = cell
             if told["event"] in ("done", "failed"):
                 left = [c for c in left if c != cell]
-                self._count(told["event"] == "failed")
+                self._count()
         worker.wait()
         if self.stopping:
             return
-        self._died(worker, current if current in left else (left[0] if left else None), left, job, too_big.is_set())
+        self._died(worker, current if current in left else (left[0] if left else None), left, job)
 
-    def _died(self, worker, cell: Cell | None, left: list[Cell], job: dict, too_big: bool) -> None:
+    def _died(self, worker, cell: Cell | None, left: list[Cell], job: dict) -> None:
         """The worker is gone before its job was done: retry the cell once, hand the others back."""
         if cell is None:
             if "reference" in job and self._again(("reference", job["reference"])):
                 self.jobs.put(job)
             return
+        too_big = worker.pid in self.too_big
         if too_big or not self._again((cell.task, cell.algorithm, cell.preset, cell.seed)):
             why = f"its worker grew beyond {self.memory:g} GiB" if too_big else f"its worker died {DEATHS} times"
             record_failure(cell, self.grid.out, f"{why} (exit status {worker.returncode})")
-            self._count(True)
+            self._count()
             left = [c for c in left if c != cell]
         if left:
             self.jobs.put({**job, "cells": [encode(c) for c in left]})
@@ -178,15 +177,14 @@ class _Pool:
             self.deaths[name] = self.deaths.get(name, 0) + 1
             return self.deaths[name] < DEATHS
 
-    def _count(self, failed: bool) -> None:
+    def _count(self) -> None:
         with self.guard:
-            self.failed += failed
             self.bar.advance(1)
 
-    def _weigh(self, worker: subprocess.Popen, too_big: threading.Event) -> None:
+    def _weigh(self, worker: subprocess.Popen) -> None:
         while self.memory and worker.poll() is None:
             if resident(worker.pid) > self.memory:
-                too_big.set()
+                self.too_big.add(worker.pid)
                 worker.kill()
             time.sleep(0.5)
 
