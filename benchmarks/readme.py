@@ -241,7 +241,7 @@ UNDRAWN = ("its episodes within the limit", "do nothing", "random actions")
 
 def draw(groups: dict, path: Path) -> None:
     """Normalised return against avoidable cost, one panel per tier, means over seeds with their spread."""
-    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.6), sharey=True, layout="constrained")
+    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.8), sharey=True, layout="constrained")
     for panel, tier in zip(panels, TIERS):
         for algorithm, variant, name in ROWS:
             rows = of(groups, tier, algorithm, variant)
@@ -257,7 +257,8 @@ def draw(groups: dict, path: Path) -> None:
                 x.std(ddof=len(x) > 1),
                 mark,
                 color=colour,
-                ms=9 if mark != "*" else 14,
+                ms=14 if mark in "*H" else 9,
+                fillstyle="none" if mark == "H" else "full",  # it lies where the star does
                 label=name.replace("`", "").replace("*", ""),
                 elinewidth=1,
             )
@@ -268,7 +269,7 @@ def draw(groups: dict, path: Path) -> None:
         panel.set_xlabel("avoidable collision steps per episode")
     panels[0].set_ylabel("normalised return")
     handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=(len(labels) + 1) // 2, fontsize=8, frameon=False)
+    figure.legend(handles, labels, loc="outside lower center", ncols=-(-len(labels) // 3), fontsize=8, frameon=False)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=130)
     print(path)
