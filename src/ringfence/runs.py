@@ -85,10 +85,13 @@ class Run:
     def load_checkpoint(self, template: PyTree, step: int | None = None) -> tuple[int, PyTree]:
         """(step, state) of the last checkpoint, or of `step`; arrays must match the template in name and shape."""
         found = self.checkpoints()
-        if step is not None:
-            found = [c for c in found if c[0] == step]
         if not found:
             raise CheckpointError(f"'{self.path}' holds no checkpoint; train it with `ringfence train` first.")
+        if step is not None:
+            there = ", ".join(str(at) for at, _ in found)
+            found = [c for c in found if c[0] == step]
+            if not found:
+                raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
         at, file = found[-1]
         try:
             arrays = load_file(file)

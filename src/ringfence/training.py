@@ -43,6 +43,7 @@ class Job:
     spec: Spec
     feature_map: Any
     hazard: hazards.BoundHazard
+    widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
 
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
@@ -55,6 +56,7 @@ class Job:
             "spec": dataclasses.asdict(self.spec),
             "hazard": hazards.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
+            "widths": None if self.task.env is not None else list(self.widths),
             "seed": seed,
             "data": card,
         }
@@ -72,7 +74,16 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     spec = task.spec(feature_map, store)
     hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
     a.check(config, hazard)
-    return Job(a, preset, config, task, spec, feature_map, hazard)
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
+
+
+def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:
+    """How many entries an observation and the global state have (0: there is none): the simulator's, or the data's."""
+    if task.env is not None:
+        return task.env.observation_dim, len(task.env.state_names)
+    if store is None:
+        return None, None
+    return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]
 
 
 def train(
@@ -313,7 +324,7 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     mine = json.loads(json.dumps(job.describe(seed, data.card)))
     if (run.path / "config.json").exists():
-        there = {"revision": 1} | run.config
+        there = {"revision": 1, "widths": mine["widths"]} | run.config  # older runs tell neither
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += _other_data(there.get("data") or {}, mine["data"])
         if different:
