@@ -588,6 +588,10 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(1)
+    except OSError as error:  # of a path that nobody looked at before
+        what = f"'{error.filename}': {error.strerror}" if error.filename else str(error)
+        _complain(f"{what}; check that the path is what you mean and that you may use it.")
+        sys.exit(2)
 
 
 def _complain(message: str) -> None:

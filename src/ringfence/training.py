@@ -13,6 +13,7 @@ import operator
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ import numpy as np
 from ringfence import algos, features, hazards, tasks
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
-from ringfence.files import whole
+from ringfence.files import owned, whole
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config, environment, write_json
 from ringfence.tasks import Task
@@ -238,6 +239,14 @@ def make_program(job: Job):
 
 
 def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program=None):
+    """Train runs that nobody else trains at this time, in one program."""
+    with ExitStack() as locks:
+        for run in runs:
+            locks.enter_context(owned(run.path, f"Another process trains '{run.path}'; wait for it or stop it."))
+        return _advance(job, windows, runs, seeds, options, program)
+
+
+def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program):
     program = program or make_program(job)
     advance, diagnose = program
     roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
