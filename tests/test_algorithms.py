@@ -394,6 +394,26 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
         evaluate.evaluate(run, episodes=2, step=7)
 
 
+def test_damaged_run_folders_are_refused(tmp_path):
+    run = Run(tmp_path)
+    for content, said in (
+        (b"[]", "is no run folder.*config.json holds a list"),
+        (b"{}", "config.json' says no algorithm"),
+        (b'{"algorithm": 3}', "config.json' says no algorithm"),
+        (b"\xff\xfe{", "is no run folder.*UnicodeDecodeError"),
+    ):
+        (tmp_path / "config.json").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            evaluate.evaluate(run)
+    for content, said in ((b"[]", "is damaged.*holds a list"), (b"\xff", "is damaged.*UnicodeDecodeError")):
+        (tmp_path / "results.json").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            run.results  # noqa: B018 (reading is what fails)
+    rows = b'{"step": 1, "seconds": 0.5}\n3\n{"step": 1}\nnull\n{"step": 2, "seconds": 0.5}\n{"step": 3, "se\xff'
+    (tmp_path / "metrics.jsonl").write_bytes(rows)
+    assert [r["step"] for r in run.metrics] == [1, 2]
+
+
 def test_no_more_is_recorded_than_was_played(trained):
     with pytest.raises(UserError, match="record=-1 must be 0 or more"):
         evaluate.evaluate(trained["madiff"], episodes=2, record=-1)
@@ -427,7 +447,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
         (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
         (["--set", "steps=3", "--set", "plans=2", "prefix=x"], "prefix='x' cannot be read as int"),
         (["--record", "-1"], "record=-1 must be 0 or more"),
-        (["--step", "3"], "no checkpoint of step 3; take one of: 12"),
+        (["--step", "3"], "no checkpoint of step 3; take one of: 10, 12"),
     ],
 )
 def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsys):
