@@ -420,6 +420,9 @@ def test_no_more_is_recorded_than_was_played(trained):
     evaluate.evaluate(trained["madiff"], episodes=2, steps=2, record=4)
     with np.load(trained["madiff"].path / "rollout-default+steps2.npz") as kept:
         assert {len(kept[k]) for k in kept} == {2}
+    _, policy = evaluate.load(trained["madiff"], steps=2)  # more than are played in one batch
+    played = evaluate.rollout(policy, tasks.get("simple_spread-random").env, evaluate.CHUNK + 3, record=51)
+    assert len(played["plans"]) == 51 and len(played["states"]) == evaluate.CHUNK + 3
 
 
 def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trained, tmp_path, capsys, monkeypatch):

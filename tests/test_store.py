@@ -92,6 +92,8 @@ def test_a_group_is_no_array(tmp_path, name):
         ('{"hazard": "near"}', "hazard='near'; it must be"),
         ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
         ('{"hazard": {"kind": []}}', "which is none"),
+        ('{"hazard": {"kind": "Separation", "radius": null}}', "which is none"),
+        ('{"hazard": {"kind": "SpeedLimit", "limit": 1, "features": 3}}', "which is none"),
         ('{"task": 3}', "task=3; it must be a name without slashes"),
         ('{"task": null}', "task=None"),
         ('{"observation_names": 3}', "observation_names=3; it must be a list of words"),

@@ -76,17 +76,17 @@ def rollout(
             "act() uses jax.numpy."
         )
     compiled = jax.jit(play, static_argnums=(2, 3))
-    chunks, done, recorded = [], 0, {}
+    chunks, done = [], 0
     with Progress(label or "evaluating", episodes, 0, quiet) as bar:
         while done < episodes:
             # Always whole chunks, so that the first n episodes are the same ones whatever number is asked for.
-            kept = jax.device_get(compiled(policy, done // CHUNK, CHUNK, min(record, CHUNK) if not done else 0))
-            if not done:
-                recorded = {k: v for k, v in kept.items() if k not in ("reward", "cost", "state")}
-            chunks.append({k: kept[k] for k in ("reward", "cost", "state")})
+            keep = min(max(record - done, 0), CHUNK)
+            chunks.append(jax.device_get(compiled(policy, done // CHUNK, CHUNK, keep)))
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
-    out = {k: np.concatenate([c[k] for c in chunks])[:episodes] for k in chunks[0]}
+    out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
+    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state")}
+    recorded = {k: v for k, v in out.items() if k not in ("reward", "cost", "state")}
     whole_length = {"steps": np.full(episodes, env.episode_length), "terminated": np.zeros(episodes, bool)}
     return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | whole_length | recorded
 
@@ -267,13 +267,13 @@ class Controller:
     def act(self, observations: np.ndarray, state: np.ndarray | None = None) -> np.ndarray:
         """(N, A) joint action within the task's bounds. Arrays of another shape than the run's are refused, and so is
         what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow NaN."""
-        wide, told = self.job.widths
-        seen = _given("observations", observations, (self.job.spec.n_agents, wide))
-        if state is not None and told == 0:
+        width, state_width = self.job.widths
+        seen = _given("observations", observations, (self.job.spec.n_agents, width))
+        if state is not None and state_width == 0:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."
             )
-        whole = None if state is None else _given("state", state, (told,))
+        whole = None if state is None else _given("state", state, (state_width,))
         if None in self.job.widths:
             self._reaches(seen, whole)
         self._key, key = jax.random.split(self._key)
@@ -306,7 +306,7 @@ def _given(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np
     if not np.isfinite(array).all():
         where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
         raise UserError(
-            f"{name}{where} is {array[tuple(where)]}; a policy takes finite numbers alone, repair the sensor."
+            f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
         )
     return array
 
@@ -398,8 +398,7 @@ def evaluate(
     }
     run.add_result(variant, result)
     if record:
-        kept = min(record, *map(len, played.values()))  # every array tells the same episodes
-        keep = {k: v[:kept] for k, v in played.items()}
+        keep = {k: v[:record] for k, v in played.items()}
         (run.path / f"rollout-{variant}.gif").unlink(missing_ok=True)  # it would show another recording
         with whole(run.path / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, **keep)

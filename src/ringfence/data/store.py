@@ -355,11 +355,14 @@ def complete_card(card: dict) -> dict:
             "dangers go into the costs, with CostColumn)."
         )
     try:
-        hazards.from_dict(card["hazard"])
+        told = hazards.from_dict(card["hazard"])
+        sound = all(_is_sound(h) for h in getattr(told, "hazards", (told,)))
     except UserError:
         raise
     except (TypeError, ValueError):  # a field of a kind that no hazard has
-        raise StoreError(f"The card has hazard={card['hazard']!r}, which is none; see docs/data.md.") from None
+        sound = False
+    if not sound:
+        raise StoreError(f"The card has hazard={card['hazard']!r}, which is none; see docs/data.md.")
     try:
         return json.loads(json.dumps(card, default=lambda x: x.tolist()))  # NumPy's arrays and numbers become plain
     except (AttributeError, TypeError, ValueError) as error:
@@ -368,6 +371,14 @@ def complete_card(card: dict) -> dict:
 
 def _is_number(x) -> bool:
     return isinstance(x, int | float | np.number) and not isinstance(x, bool) and bool(np.isfinite(x))
+
+
+def _is_sound(hazard: hazards.Hazard) -> bool:
+    """Whether a hazard has the sizes that define it, and names its features with words."""
+    features = getattr(hazard, "features", ())
+    sizes = ("radius", "safe_margin") if isinstance(hazard, hazards.Separation) else ("limit",)
+    sized = all(getattr(hazard, name, 0.0) is not None for name in sizes)
+    return sized and isinstance(features, tuple) and all(isinstance(name, str) for name in features)
 
 
 def _check_name(task) -> None:
