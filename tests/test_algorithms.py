@@ -1,6 +1,7 @@
 """One contract for every algorithm, and what is special about the flagship."""
 
 import dataclasses
+import json
 
 import jax
 import jax.numpy as jnp
@@ -166,6 +167,40 @@ def test_a_controller_acts_like_the_policy(trained, small_store):
 
 
 @pytest.mark.parametrize(
+    ("seen", "state", "said"),
+    [
+        (np.zeros((2, 18)), np.zeros(18), r"observations has shape \(2, 18\), this run takes \(3, 18\)"),
+        (np.zeros((4, 18)), np.zeros(18), r"observations has shape \(4, 18\)"),
+        (np.zeros((3, 17)), np.zeros(18), r"observations has shape \(3, 17\)"),
+        (np.zeros((1, 3, 18)), np.zeros(18), r"observations has shape \(1, 3, 18\)"),
+        (np.zeros((3, 18)), np.zeros(19), r"state has shape \(19,\), this run takes \(18\)"),
+        (np.zeros((3, 18)), np.full(18, np.nan), r"state\[0\] is nan"),
+        (np.full((3, 18), np.inf), np.zeros(18), r"observations\[0, 0\] is inf"),
+        ([[0.0], [0.0, 1.0]], np.zeros(18), "observations is no array of numbers"),
+        (np.zeros((3, 18)), None, "needs the global state"),
+    ],
+)
+def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said):
+    pilot = evaluate.Controller(trained["madiff"], steps=2)
+    with pytest.raises(UserError, match=said):
+        pilot.act(seen, state)
+
+
+def test_names_of_variants_follow_values(trained):
+    """Neither the order nor the spelling of options makes another variant; those that results hold keep their names."""
+    run = Run(trained["icbf"].path)
+    for options, name in (
+        ({"plans": 8}, "split+plans8"),
+        ({"planner": "guarded", "steps": 2}, "split+guarded+steps2"),
+        ({"margin": 0, "plans": "2"}, "split+plans2+margin0.0"),
+        ({"ascent": "1e1"}, "split+ascent10.0"),
+    ):
+        assert evaluate.evaluate(run, episodes=1, **{"steps": 2, **options})["variant"].replace("+steps2", "") == (
+            name.replace("+steps2", "")
+        )
+
+
+@pytest.mark.parametrize(
     ("changes", "said"),
     [
         ({"steps": -3}, "steps=-3 of bc must be at least 1"),
@@ -324,6 +359,106 @@ def test_own_data_without_a_simulator(played, tmp_path):
     assert out.action.shape == (4, 3, 2)
     with pytest.raises(UserError, match="only as data"):
         evaluate.evaluate(run)
+    pilot = evaluate.Controller(run, steps=2)
+    assert pilot.act(store.observations[0]).shape == (3, 2)
+    wide = store.observations.shape[2]
+    for seen, state, said in (
+        (store.observations[0][:, :-1], None, rf"shape \(3, {wide - 1}\), this run takes \(3, {wide}\)"),
+        (store.observations[0], np.zeros(4), "has no global state, but act"),
+    ):
+        with pytest.raises(UserError, match=said):
+            pilot.act(seen, state)
+    told = json.loads((run.path / "config.json").read_text())
+    del told["widths"], told["data"]["observation_names"]  # as older versions wrote it
+    (run.path / "config.json").write_text(json.dumps(told))
+    pilot = evaluate.Controller(run, steps=2)
+    assert pilot.act(store.observations[0]).shape == (3, 2)
+    with pytest.raises(UserError, match="has 3 entries, this run reads entry"):
+        pilot.act(store.observations[0][:, :3])
+    training.train("icbf", store, out=tmp_path, changes={**TINY["icbf"], "steps": 2}, quiet=True)  # is still that run
+
+
+def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, capsys):
+    def stop(step, _):
+        if step >= 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        training.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True, chunk=5, on_chunk=stop)
+    run = Run(next(tmp_path.rglob("config.json")).parent)
+    assert evaluate.evaluate(run, episodes=2)["step"] == 5
+    assert "is at step 5 of 12; its training is unfinished" in capsys.readouterr().err
+    assert evaluate.evaluate(trained["bc"], episodes=2)["step"] == 12
+    assert not capsys.readouterr().err
+    with pytest.raises(CheckpointError, match="no checkpoint of step 7; take one of: 5"):
+        evaluate.evaluate(run, episodes=2, step=7)
+
+
+def test_damaged_run_folders_are_refused(tmp_path):
+    run = Run(tmp_path)
+    for content, said in (
+        (b"[]", "is no run folder.*config.json holds a list"),
+        (b"{}", "config.json' says no algorithm"),
+        (b'{"algorithm": 3}', "config.json' says no algorithm"),
+        (b"\xff\xfe{", "is no run folder.*UnicodeDecodeError"),
+    ):
+        (tmp_path / "config.json").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            evaluate.evaluate(run)
+    for content, said in ((b"[]", "is damaged.*holds a list"), (b"\xff", "is damaged.*UnicodeDecodeError")):
+        (tmp_path / "results.json").write_bytes(content)
+        with pytest.raises(UserError, match=said):
+            run.results  # noqa: B018 (reading is what fails)
+    rows = b'{"step": 1, "seconds": 0.5}\n3\n{"step": 1}\nnull\n{"step": 2, "seconds": 0.5}\n{"step": 3, "se\xff'
+    (tmp_path / "metrics.jsonl").write_bytes(rows)
+    assert [r["step"] for r in run.metrics] == [1, 2]
+
+
+def test_no_more_is_recorded_than_was_played(trained):
+    with pytest.raises(UserError, match="record=-1 must be 0 or more"):
+        evaluate.evaluate(trained["madiff"], episodes=2, record=-1)
+    evaluate.evaluate(trained["madiff"], episodes=2, steps=2, record=4)
+    with np.load(trained["madiff"].path / "rollout-default+steps2.npz") as kept:
+        assert {len(kept[k]) for k in kept} == {2}
+    _, policy = evaluate.load(trained["madiff"], steps=2)  # more than are played in one batch
+    played = evaluate.rollout(policy, tasks.get("simple_spread-random").env, evaluate.CHUNK + 3, record=51)
+    assert len(played["plans"]) == 51 and len(played["states"]) == evaluate.CHUNK + 3
+
+
+def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trained, tmp_path, capsys, monkeypatch):
+    from rich.console import Console
+
+    from ringfence import cli
+
+    monkeypatch.setattr(cli, "out", Console(width=300))
+    own = dataclasses.replace(small_store, card={**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}})
+    dark = training.train("bc", own, out=tmp_path, changes={**TINY["bc"], "steps": 2}, quiet=True)[0]
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["eval", str(dark.path), str(trained["bc"].path), "--episodes", "2"])
+    told = capsys.readouterr()
+    assert stop.value.code == 2 and "Task 'mine' exists only as data" in told.err
+    assert str(trained["bc"].path) in told.out and str(dark.path) not in told.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--set", "planner=guarded"], "write --planner guarded"),
+        (["--set", "step=12"], "write --step 12"),
+        (["--set", "quiet=1"], "Unknown config field of the planner 'quiet'"),
+        (["--steps", "3", "--set", "steps=2"], "--steps 3 and --set steps=2 both set steps"),
+        (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
+        (["--set", "steps=3", "--set", "plans=2", "prefix=x"], "prefix='x' cannot be read as int"),
+        (["--record", "-1"], "record=-1 must be 0 or more"),
+        (["--step", "3"], "no checkpoint of step 3; take one of: 10, 12"),
+    ],
+)
+def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsys):
+    from ringfence.cli import main
+
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", str(trained["madiff"].path), "--episodes", "2", *words])
+    assert stop.value.code == 2 and said in capsys.readouterr().err
 
 
 def test_trained_config_round_trip(trained):

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import evaluate, reference, tasks, training
+from ringfence import evaluate, files, reference, tasks, training
 from ringfence.bench import cells as grid
-from ringfence.bench import local, make_grid, paper, rows, run_local, suites, write_csv
+from ringfence.bench import make_grid, paper, rows, run_local, suites, write_csv
 from ringfence.errors import UserError
 from ringfence.hazards import Separation, to_dict
 from ringfence.policies import PLANNERS, PlanOptions
@@ -241,12 +241,45 @@ def test_a_killed_runner_loses_no_finished_cell(tmp_path):
 
 
 def test_one_runner_per_folder(tmp_path):
-    with local.owned(tmp_path):
-        code = f"import pathlib, ringfence.bench.local as x\nwith x.owned(pathlib.Path({str(tmp_path)!r})): pass"
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
+    g.open()
+    with files.owned(g.out, "not said"):
+        code = f"import pathlib, ringfence.files as x\nwith x.owned(pathlib.Path({str(g.out)!r}), {g.taken!r}): pass"
         second = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "Another runner works on" in second.stderr
-    with local.owned(tmp_path):
+    with files.owned(g.out, "not said"):
         pass
+
+
+def test_one_training_per_run_folder(small_store, tmp_path):
+    told = dict(out=tmp_path, changes={"steps": 2, "batch": 4, "width": 8, "depth": 1}, quiet=True)
+    folder = tmp_path / "simple_spread-random" / "bc" / "seed-0"
+    with files.owned(folder, "not said"):
+        with pytest.raises(UserError, match="Another process trains '.*seed-0'; wait for it or stop it"):
+            training.train("bc", small_store, preset="default", **told)
+    assert not (folder / "metrics.jsonl").exists()
+
+
+def test_what_a_grid_cannot_be_is_refused(tmp_path):
+    with pytest.raises(UserError, match="plays icbf:long on none of simple_spread-random; choose other"):
+        make_grid("simple_spread", tmp_path, only=["icbf:long"], only_tasks=["simple_spread-random"])
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
+    for wrong in ({"threads": 0}, {"workers": 0}, {"memory": 0.0}, {"memory": -1.0}):
+        with pytest.raises(UserError, match="must be"):
+            run_local(g, quiet=True, **wrong)
+    (tmp_path / "file").write_text("mine")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(UserError, match="is a file|Not a directory"):
+            make_grid("simple_spread", place, only=["bc"], **QUICK).open()
+    with pytest.raises(UserError, match="could not be locked"), files.owned(tmp_path / "file", "not said"):
+        pass
+
+
+def test_a_cell_that_failed_before_it_began_is_told(tmp_path):
+    g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
+    g.open()
+    grid.record_failure(g.cells[0], g.out, "RuntimeError: no data")
+    assert [(s["state"], s["error"]) for s in grid.statuses(g.out)] == [("failed", "RuntimeError: no data")]
 
 
 def test_an_unreachable_cluster_is_refused(tmp_path):

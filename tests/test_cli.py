@@ -34,6 +34,7 @@ def test_makes_and_describes_data(tmp_path, capsys):
         (["train", "icbf", "simple_spread-medum"], "did you mean 'simple_spread-medium'"),
         (["train", "icbf", "simple_spread-medium", "--set", "barier_weight=3"], "did you mean 'barrier_weight'"),
         (["train", "icbf", "simple_spread-medium", "--set", "steps"], "name=value"),
+        (["train", "icbf", "simple_spread-medium", "--set", "lr=1", "--set", "lr=2"], "gives lr twice, 1 and 2"),
         (["train", "icbf", "simple_spread-medium", "--set", "steps=many"], "cannot be read as int"),
         (["train", "icbf", "simple_spread-medium", "--set", "net=unit"], "did you mean 'unet'"),
         (["train", "icbf", "nowhere.h5"], "No episode store"),
@@ -50,6 +51,48 @@ def test_refuses_in_one_sentence(arguments, message, capsys, tmp_path, monkeypat
     told = capsys.readouterr().err
     assert stop.value.code == 2 and message in told and "Traceback" not in told
     assert not list(tmp_path.iterdir())
+
+
+def test_places_that_cannot_be_written_are_refused(tmp_path, monkeypatch, capsys):
+    (tmp_path / "file").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    make = ["data", "make", "simple_spread-random", "--size", "25"]
+    bench = ["bench", "simple_spread", "--tasks", "simple_spread-random", "--algorithms", "bc"]
+    told = [
+        ([*make, "--out", "file/x.h5"], "'file/x.h5' could not be written"),
+        ([*make, "--out", ""], "names no file"),
+        (["bench", "status", "file"], "no results folder"),
+        ([*bench, "--out", "file"], "'file' is a file"),
+        ([*bench, "--out", "new", "--threads", "0"], "threads=0 must be at least 1"),
+        (["report", "file/x"], "does not exist"),
+    ]
+    for words, said in told:
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 2 and said in capsys.readouterr().err, words
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "file"))
+    for words in (make, ["demo", "--quick", "--out", "demo"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 2 and "error:" in capsys.readouterr().err
+
+
+def test_errors_of_the_system_are_told_in_one_sentence(monkeypatch, capsys, tmp_path):
+    def refuses(self):
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr("pathlib.Path.exists", refuses)
+    with pytest.raises(SystemExit) as stop:
+        main(["eval", str(tmp_path)])
+    assert stop.value.code == 2 and "Permission denied; check that the path" in capsys.readouterr().err
+
+
+def test_every_set_counts(monkeypatch):
+    heard = []
+    monkeypatch.setattr("ringfence.training.train", lambda *_, changes, **__: heard.append(changes) or [])
+    monkeypatch.setattr("ringfence.cli._store", lambda data: None)
+    main(["train", "bc", "mine.h5", "--set", "steps=3", "batch=4", "--set", "width=8", "--seeds", "2"])
+    assert heard == [{"steps": "3", "batch": "4", "width": "8"}]
 
 
 def test_info_says_where_cost_and_hazard_disagree(small_store, tmp_path, capsys):

@@ -264,6 +264,20 @@ def test_madiffs_cheetah_has_its_state_back(tmp_path):
     assert store.card["task"] == "halfcheetah_2x3-good"
 
 
+def test_lengths_of_madiffs_paths_are_whole_numbers(tmp_path):
+    log = recorded("2x3", episodes=2, length=4)
+    folder = write_madiff(tmp_path / "good", log, "2x3")
+    np.save(folder / "path_lengths.npy", log["lengths"].astype(float))
+    assert import_madiff(folder, "halfcheetah_2x3").episodes == 2
+    for lengths in (log["lengths"] + 0.5, log["lengths"] * 0, log["lengths"][None], log["lengths"] > 0):
+        np.save(folder / "path_lengths.npy", lengths)
+        with pytest.raises(StoreError, match="path_lengths.npy must hold the steps of every episode"):
+            import_madiff(folder, "halfcheetah_2x3")
+    np.save(folder / "path_lengths.npy", log["lengths"].astype(str))
+    with pytest.raises(StoreError, match="no .npy file of numbers"):
+        import_madiff(folder, "halfcheetah_2x3")
+
+
 def test_madiffs_ant_says_what_it_lacks(tmp_path):
     log = recorded("4x2")
     store = import_madiff(write_madiff(tmp_path / "medium", log, "4x2", reverse=False), "ant_4x2")

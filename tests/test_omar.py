@@ -160,6 +160,9 @@ def test_missing_files_are_named(tmp_path, few):
         import_omar(tmp_path / "empty")
     with pytest.raises(StoreError, match="There is no directory"):
         import_omar(tmp_path / "absent")
+    for task in ("", "..", "a/b"):
+        with pytest.raises(StoreError, match="it must be a name without slashes"):
+            import_omar(folder, task=task)
 
 
 def test_a_parent_directory_lists_its_data_sets(tmp_path, few):

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 import ringfence.data.store as store_module
 from ringfence.data.store import ARRAYS, EpisodeStore
 from ringfence.errors import StoreError, UserError
+from ringfence.hazards import CostColumn
 from ringfence.windows import WindowData, at, return_scores, returns_to_go
 
 
@@ -68,6 +69,61 @@ def test_truncated_file_is_refused(tmp_path, small_store, share):
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(StoreError, match=r"s\.h5.*truncated or not HDF5"):
         EpisodeStore.load(path)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_a_group_is_no_array(tmp_path, name):
+    path = logs().save(tmp_path / "s.h5")
+    with h5py.File(path, "a") as f:
+        del f[name]
+        f.create_group(name)
+    with pytest.raises(StoreError, match=f"holds a group where the array '{name}' belongs"):
+        EpisodeStore.load(path)
+
+
+@pytest.mark.parametrize(
+    ("card", "said"),
+    [
+        ("null", "card is a NoneType"),
+        ("[]", "card is a list"),
+        ("{", "no card that can be read"),
+        (3, "no card that can be read"),
+        ('{"hazard": null}', "hazard=None; it must be a Separation"),
+        ('{"hazard": "near"}', "hazard='near'; it must be"),
+        ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
+        ('{"hazard": {"kind": []}}', "which is none"),
+        ('{"hazard": {"kind": "Separation", "radius": null}}', "which is none"),
+        ('{"hazard": {"kind": "SpeedLimit", "limit": 1, "features": 3}}', "which is none"),
+        ('{"task": 3}', "task=3; it must be a name without slashes"),
+        ('{"task": null}', "task=None"),
+        ('{"observation_names": 3}', "observation_names=3; it must be a list of words"),
+        ('{"warnings": 3}', "warnings=3; it must be a list of words"),
+        ('{"action_low": NaN}', "action_low=nan"),
+        ('{"action_low": 2}', "the first must be the smaller one"),
+        ('{"cost_limit": "few"}', "cost_limit='few'"),
+    ],
+)
+def test_a_card_written_by_hand_is_checked(tmp_path, card, said):
+    path = logs().save(tmp_path / "s.h5")
+    with h5py.File(path, "a") as f:
+        f.attrs["card"] = card
+    with pytest.raises(StoreError, match=said) as refused:
+        EpisodeStore.load(path)
+    assert str(path) in str(refused.value)
+
+
+def test_a_card_that_says_nothing_is_completed(tmp_path):
+    path = logs().save(tmp_path / "s.h5")
+    with h5py.File(path, "a") as f:
+        f.attrs["card"] = "{}"
+    loaded = EpisodeStore.load(path)
+    assert loaded.card["task"] == "custom" and loaded.hazard == CostColumn()
+
+
+@pytest.mark.parametrize("task", ["", " ", ".", "..", "a/b", "../x", "/x", "a\\b", None, 3])
+def test_names_of_tasks_are_names_of_folders(task):
+    with pytest.raises(StoreError, match="it must be a name without slashes"):
+        logs(task=task)
 
 
 @pytest.mark.parametrize("name", ARRAYS)
@@ -163,6 +219,14 @@ RULES = {
         lambda s: {"card": {**s.card, "observation_names": ["a"]}},
         "names 1 observation entries, the data has 5",
     ),
+    "kind of ends": (lambda s: {"episode_ends": s.episode_ends.astype(float)}, "type float64; it must hold whole"),
+    "words": (lambda s: {"rewards": s.rewards.astype(str)}, "rewards holds entries of type <U.*; it must hold real"),
+    "flags of numbers": (lambda s: {"truncated": s.truncated * 1.0}, "truncated holds .*; it must hold true or false"),
+    "lists": (lambda s: {"costs": s.costs.tolist()}, "costs is a list; give a NumPy array"),
+    "nobody": (
+        lambda s: {k: getattr(s, k)[:, :0] for k in ("observations", "actions", "rewards")},
+        "at least one agent and one action entry",
+    ),
     "state names": (lambda s: {"card": {**s.card, "state_names": ["a"]}}, "names 1 state entries, not 6"),
 }
 
@@ -239,6 +303,21 @@ def test_makers_refuse_incomplete_logs(played):
         EpisodeStore.from_steps(**steps, episode_ends=[9, 4], final_observations=np.zeros((2, 1, 2)))
     with pytest.raises(StoreError, match="final_observations has shape"):
         EpisodeStore.from_steps(**steps, episode_ends=[2, 4], final_observations=np.zeros((1, 1, 2)))
+    whole = dict(**steps, episode_ends=[4], final_observations=np.zeros((1, 1, 2)))
+    assert EpisodeStore.from_steps(**whole).episodes == 1
+    for name, value, said in (
+        ("actions", np.zeros(4), r"actions has shape \(4,\), which is not 3 axes"),
+        ("episode_ends", [[4]], r"episode_ends has shape \(1, 1\), which is not 1 axes"),
+        ("episode_ends", [3.5, 4], "episode_ends holds fractions"),
+        ("episode_ends", [], "ends at nothing"),
+        ("observations", None, "observations holds nothing"),
+        ("rewards", [[1.0], [1.0, 2.0], [0.0], [0.0]], "rewards is no array .*; give every row the same length"),
+        ("rewards", ["1", "2", "3", "4"], "rewards holds entries that are no real numbers"),
+    ):
+        with pytest.raises(StoreError, match=said):
+            EpisodeStore.from_steps(**{**whole, name: value})
+    named = EpisodeStore.from_steps(**whole, card={"observation_names": np.array(["a", "b"])})
+    assert named.card["observation_names"] == ["a", "b"]
 
 
 def test_one_reward_for_the_team_is_everybodys():

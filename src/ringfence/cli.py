@@ -17,6 +17,9 @@ from ringfence.errors import UserError
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
 Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
+# --set a=1 b=2 and --set a=1 --set b=2 mean the same, and so do --tasks a b and --tasks a --tasks b.
+Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
+Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]
 
 
 def tasks() -> None:
@@ -172,7 +175,7 @@ def train(
     seeds: int = 1,
     first_seed: int = 0,
     preset: str | None = None,
-    set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
     out: Path = Path("runs"),
     together: bool = False,
     tensorboard: bool = False,
@@ -213,6 +216,7 @@ def evaluate(
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
     record: int = 4,
+    step: int | None = None,
     planner: Literal["plain", "guarded", "steady", "shielded"] = "plain",
     plans: int | None = None,
     steps: int | None = None,
@@ -226,7 +230,7 @@ def evaluate(
     replan: int | None = None,
     execution: str | None = None,
     video: bool = False,
-    set: Annotated[list[str], tyro.conf.arg(metavar="NAME=VALUE")] = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
 ) -> None:
     """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
 
@@ -235,6 +239,7 @@ def evaluate(
         episodes: at least 200 for a table.
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
+        step: of the checkpoint that is played; the last one by default.
         planner: plain follows one drawn plan; guarded steers eight and follows the best safe one; steady and shielded
             are for robots.
         plans: drawn per step; the best safe one is followed.
@@ -254,7 +259,7 @@ def evaluate(
     from ringfence.evaluate import evaluate as run_evaluation
 
     given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
-    given |= _assignments(set)
+    given |= _planner_options(_assignments(set), given)
     names = ("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
     table = Table(*names, "ended early")
     if not runs:
@@ -266,11 +271,17 @@ def evaluate(
 
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
-        record = max(record, 1)
+        record = record or 1
+    told = dict(episodes=episodes, split=split, planner=planner, record=record, step=step, quiet=False)
+    refused: dict[str, None] = {}  # what several runs are refused for is said once
     for run in found:
-        r = run_evaluation(run, episodes=episodes, split=split, planner=planner, record=record, quiet=False, **given)
-        if video:
-            print(film(run, r["variant"]))
+        try:
+            r = run_evaluation(run, **told, **given)
+            if video:
+                print(film(run, r["variant"]))
+        except UserError as error:
+            refused[str(error)] = None
+            continue
         table.add_row(
             escape(str(run.path)),
             r["variant"],
@@ -282,7 +293,26 @@ def evaluate(
             f"{r['cost_norm']:.3f}",
             f"{100 * r['termination_rate']:.0f} %",
         )
-    out.print(table)
+    if table.row_count:
+        out.print(table)
+    for message in refused:
+        _complain(message)
+    if refused:
+        sys.exit(2)
+
+
+def _planner_options(assigned: dict[str, str], given: dict) -> dict[str, str]:
+    """What --set says of the planner; refused where a flag said it already, or where it is no option of the planner."""
+    from ringfence.policies import PlanOptions
+    from ringfence.runs import build_config
+
+    for name, value in assigned.items():
+        if name in ("episodes", "split", "record", "step", "planner"):
+            raise UserError(f"--set {name}={value} is no option of the planner; write --{name} {value}.")
+        if name in given:
+            raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
+    build_config(PlanOptions, assigned, "the planner")  # an unknown name is refused before any run is played
+    return assigned
 
 
 PLAN_OPTIONS = (
@@ -370,8 +400,8 @@ def bench(
     seeds: int = 5,
     episodes: int | None = None,
     out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-    tasks: list[str] = [],  # noqa: B006
-    algorithms: list[str] = [],  # noqa: B006
+    tasks: Names = [],  # noqa: B006
+    algorithms: Names = [],  # noqa: B006
     steps: int | None = None,
     engine: Literal["local", "ray"] = "local",
     workers: int | None = None,
@@ -400,15 +430,16 @@ def bench(
     """
     from ringfence.bench import make_grid, paper
 
-    root, parts = out_dir or Path("results"), {suite: tasks}
+    only_tasks, only = sum(tasks, []), sum(algorithms, [])
+    root, parts = out_dir or Path("results"), {suite: only_tasks}
     if suite == "paper":
-        parts, algorithms = paper.parts(tasks), algorithms or list(paper.METHODS)
+        parts, only = paper.parts(only_tasks), only or list(paper.METHODS)
     elif out_dir is None:
         root = root / suite
     complete, idle = True, True
     for part, names in parts.items():
         folder = root / part if suite == "paper" else root
-        grid = make_grid(part, folder, seeds=seeds, episodes=episodes, only_tasks=names, only=algorithms, steps=steps)
+        grid = make_grid(part, folder, seeds=seeds, episodes=episodes, only_tasks=names, only=only, steps=steps)
         idle = idle and not grid.groups()
         counts = _run_grid(grid, engine, workers, threads, memory, address)
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
@@ -550,21 +581,32 @@ def main(arguments: list[str] | None = None) -> None:
                 args=arguments,
             )
     except UserError as error:
-        Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True)
+        _complain(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(1)
+    except OSError as error:  # of a path that nobody looked at before
+        what = f"'{error.filename}': {error.strerror}" if error.filename else str(error)
+        _complain(f"{what}; check that the path is what you mean and that you may use it.")
+        sys.exit(2)
 
 
-def _assignments(pairs: list[str]) -> dict[str, str]:
-    changes = {}
-    for pair in pairs:
+def _complain(message: str) -> None:
+    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def _assignments(given: list[list[str]]) -> dict[str, str]:
+    """Names and values of every --set; each of them takes several."""
+    changes: dict[str, str] = {}
+    for pair in (pair for pairs in given for pair in pairs):
         name, equals, value = pair.partition("=")
         if not equals or not name:
             raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set steps=8000.")
+        if name in changes:
+            raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
         changes[name] = value
     return changes
 

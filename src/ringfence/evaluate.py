@@ -7,7 +7,9 @@ Every episode is counted; *avoidable* cost is that of the episodes that do not s
 from __future__ import annotations
 
 import dataclasses
+import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
@@ -74,17 +76,17 @@ def rollout(
             "act() uses jax.numpy."
         )
     compiled = jax.jit(play, static_argnums=(2, 3))
-    chunks, done, recorded = [], 0, {}
+    chunks, done = [], 0
     with Progress(label or "evaluating", episodes, 0, quiet) as bar:
         while done < episodes:
             # Always whole chunks, so that the first n episodes are the same ones whatever number is asked for.
-            kept = jax.device_get(compiled(policy, done // CHUNK, CHUNK, min(record, CHUNK) if not done else 0))
-            if not done:
-                recorded = {k: v for k, v in kept.items() if k not in ("reward", "cost", "state")}
-            chunks.append({k: kept[k] for k in ("reward", "cost", "state")})
+            keep = min(max(record - done, 0), CHUNK)
+            chunks.append(jax.device_get(compiled(policy, done // CHUNK, CHUNK, keep)))
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
-    out = {k: np.concatenate([c[k] for c in chunks])[:episodes] for k in chunks[0]}
+    out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
+    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state")}
+    recorded = {k: v for k, v in out.items() if k not in ("reward", "cost", "state")}
     whole_length = {"steps": np.full(episodes, env.episode_length), "terminated": np.zeros(episodes, bool)}
     return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | whole_length | recorded
 
@@ -212,6 +214,9 @@ def evaluate_policy(
         raise UserError(f"Task '{task.name}' exists only as data, so nothing can be evaluated; use a simulated task.")
     if episodes < 1:
         raise UserError(f"episodes={episodes} must be at least 1.")
+    if record < 0:
+        raise UserError(f"record={record} must be 0 or more: the number of episodes to keep for the report.")
+    record = min(record, episodes)
     begun = time.perf_counter()
     played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
     result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
@@ -223,6 +228,12 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
     """(job, policy) of a finished run; `planner` is a named set of planner options (policies.PLANNERS), `options` are
     fields of PlanOptions that change it. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`."""
+    job, policy, _ = _loaded(run, step, planner, options)
+    return job, policy
+
+
+def _loaded(run: Run | str, step: int | None, planner: str, options: dict) -> tuple[training.Job, Policy, int]:
+    """`load`, and the step of the checkpoint."""
     run = run if isinstance(run, Run) else Run(Path(run))
     if planner not in PLANNERS:
         raise unknown("planner", planner, PLANNERS)
@@ -231,8 +242,8 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
     template = jax.eval_shape(
         lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
     )
-    _, state = run.load_checkpoint(template, step)
-    return job, make_policy(job, state, options)
+    at, state = run.load_checkpoint(template, step)
+    return job, make_policy(job, state, options), at
 
 
 class Controller:
@@ -254,17 +265,58 @@ class Controller:
         self._memory = self.policy.start(1)
 
     def act(self, observations: np.ndarray, state: np.ndarray | None = None) -> np.ndarray:
-        """(N, A) joint action within the task's bounds."""
+        """(N, A) joint action within the task's bounds. Arrays of another shape than the run's are refused, and so is
+        what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow NaN."""
+        width, state_width = self.job.widths
+        seen = _given("observations", observations, (self.job.spec.n_agents, width))
+        if state is not None and state_width == 0:
+            raise UserError(
+                "This run's data has no global state, but act() was given one; pass the observations alone."
+            )
+        whole = None if state is None else _given("state", state, (state_width,))
+        if None in self.job.widths:
+            self._reaches(seen, whole)
         self._key, key = jax.random.split(self._key)
-        state = None if state is None else np.asarray(state, np.float32)[None]
-        seen = np.asarray(observations, np.float32)[None]
-        self._memory, step = self._act(self.policy, self._memory, seen, state, key)
+        whole = None if whole is None else whole[None]
+        self._memory, step = self._act(self.policy, self._memory, seen[None], whole, key)
         return np.asarray(step.action[0])
+
+    def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
+        """Refuse arrays too short for the entries that the run reads; runs of own data once told no widths."""
+        view, last = self.job.feature_map, int(self.job.feature_map.plus.max())
+        name, there = "observations", seen.shape[-1]
+        if view.source == "state":
+            name, there = "state", last + 1 if state is None else len(state)
+        elif state is not None:
+            name, there = "observations and state", there + len(state)
+        if last >= there:
+            raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
+
+
+def _given(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np.ndarray:
+    """What a controller is given, as numbers of the expected shape; None stands for a width that nobody knows."""
+    letters = "NO" if len(expected) == 2 else "S"
+    wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
+    try:
+        array = np.asarray(value, np.float32)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} is no array of numbers; pass one of shape {wanted}.") from None
+    if array.ndim != len(expected) or any(n not in (None, m) for m, n in zip(array.shape, expected)):
+        raise UserError(f"{name} has shape {array.shape}, this run takes {wanted}; pass what its data holds.")
+    if not np.isfinite(array).all():
+        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+        raise UserError(
+            f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
+        )
+    return array
 
 
 def load_job(run: Run) -> training.Job:
     """The job that a run folder holds, rebuilt from its config.json."""
     told = run.config
+    lacking = [name for name in ("spec", "feature_map") if name not in told]
+    if lacking:
+        raise UserError(f"'{run.path / 'config.json'}' lacks '{lacking[0]}', so nothing can be played; train it again.")
     algorithm = algos.get(told["algorithm"])
     config = build_config(algorithm.Config, told["config"], algorithm.name)
     spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
@@ -274,6 +326,7 @@ def load_job(run: Run) -> training.Job:
         if task is None:
             raise unknown("task", told["task"], tasks.TASKS)
         feature_map = task.feature_map(config.view)
+        widths = training.widths_of(task)
     else:
         card = told["data"]
         task = Task(
@@ -284,8 +337,10 @@ def load_job(run: Run) -> training.Job:
             action_high=card["action_high"],
         )
         feature_map = features.from_dict(told["feature_map"])
+        named = (card.get("observation_names"), card.get("state_names"))
+        widths = tuple(told.get("widths") or (len(names) if names else None for names in named))
     hazard: BoundHazard = hazards.bind(hazards.from_dict(told["hazard"]), spec.feature_names, spec.n_agents)
-    return training.Job(algorithm, told["preset"], config, task, spec, feature_map, hazard)
+    return training.Job(algorithm, told["preset"], config, task, spec, feature_map, hazard, widths)
 
 
 def make_policy(job: training.Job, state, options: dict) -> Policy:
@@ -294,10 +349,14 @@ def make_policy(job: training.Job, state, options: dict) -> Policy:
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
 
 
-def variant_name(job: training.Job, planner: str, options: dict, split: str) -> str:
-    """Preset, named planner and the options given beside it, e.g. `split+guarded+steps10`."""
+def variant_name(job: training.Job, planner: str, options: PlanOptions | None, given: Iterable[str], split: str) -> str:
+    """Preset, named planner and the values of the options given beside it, e.g. `split+guarded+steps10`. Neither their
+    order nor how their values were spelled (10, 10.0, '1e1') makes another name."""
     name = job.preset if planner == "plain" else f"{job.preset}+{planner}"
-    name += "".join(f"+{k}{v}" for k, v in options.items())
+    for field in dataclasses.fields(PlanOptions) if options is not None else ():
+        if field.name in given:
+            value = getattr(options, field.name)
+            name += f"+{field.name}{float(value) if isinstance(field.default, float) else value}"
     return name if split == "test" else f"{name}@{split}"
 
 
@@ -314,12 +373,15 @@ def evaluate(
 ) -> dict:
     """Evaluate a run folder and add the result to its results.json, under the variant's name.
 
-    `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones.
+    `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones. The result tells the
+    `step` of the checkpoint that was played; where training is unfinished, a line on stderr says so.
     """
-    job, policy = load(run, step, planner, **options)
+    job, policy, at = _loaded(run, step, planner, options)
+    if step is None and at < job.config.steps:
+        print(f"'{run.path}' is at step {at} of {job.config.steps}; its training is unfinished.", file=sys.stderr)
     told = run.config
     plans = isinstance(policy, Planner)
-    variant = variant_name(job, planner if plans else "plain", options if plans else {}, split)
+    variant = variant_name(job, planner if plans else "plain", policy.options if plans else None, options, split)
     variant += "" if step is None else f"@step{step}"
     seed = told["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
@@ -327,6 +389,7 @@ def evaluate(
     result |= {
         "algorithm": job.algorithm.name,
         "variant": variant,
+        "step": at,
         "provenance": told["data"]["provenance"],
         "planner": planner if plans else "plain",
         "options": dataclasses.asdict(policy.options) if plans else {},

@@ -32,6 +32,11 @@ from ringfence.types import PyTree
 KEEP = 2  # checkpoints
 
 
+# What every config.json says, and in which form.
+_SAID = dict.fromkeys(("algorithm", "preset", "task"), str) | dict.fromkeys(("config", "hazard", "data"), dict)
+_SAID |= {"seed": int}
+
+
 @dataclass(frozen=True)
 class Run:
     """A run folder on disk."""
@@ -41,7 +46,14 @@ class Run:
     @property
     def config(self) -> dict:
         """Contents of config.json."""
-        return read_json(self.path / "config.json", "is no run folder; give the folder that `ringfence train` made")
+        told = read_json(self.path / "config.json", "is no run folder; give the folder that `ringfence train` made")
+        for name, kind in _SAID.items():
+            if not isinstance(told.get(name), kind):
+                raise UserError(
+                    f"'{self.path / 'config.json'}' says no {name}, so it is none of `ringfence train`; train the run "
+                    "again."
+                )
+        return told
 
     @property
     def results(self) -> dict[str, dict]:
@@ -51,13 +63,16 @@ class Run:
 
     @property
     def metrics(self) -> list[dict]:
-        """Logged training metrics, oldest first; a line cut short by an interruption is dropped."""
+        """Logged training metrics, oldest first; a line cut short by an interruption is dropped, and so is any that
+        tells neither step nor seconds."""
         file, rows = self.path / "metrics.jsonl", []
-        for line in file.read_text().splitlines() if file.exists() else []:
+        for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
             try:
-                rows.append(json.loads(line))
+                row = json.loads(line)
             except json.JSONDecodeError:
                 break
+            if isinstance(row, dict) and all(isinstance(row.get(k), int | float) for k in ("step", "seconds")):
+                rows.append(row)
         return rows
 
     def checkpoints(self) -> list[tuple[int, Path]]:
@@ -85,10 +100,13 @@ class Run:
     def load_checkpoint(self, template: PyTree, step: int | None = None) -> tuple[int, PyTree]:
         """(step, state) of the last checkpoint, or of `step`; arrays must match the template in name and shape."""
         found = self.checkpoints()
-        if step is not None:
-            found = [c for c in found if c[0] == step]
         if not found:
             raise CheckpointError(f"'{self.path}' holds no checkpoint; train it with `ringfence train` first.")
+        if step is not None:
+            there = ", ".join(str(at) for at, _ in found)
+            found = [c for c in found if c[0] == step]
+            if not found:
+                raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
         at, file = found[-1]
         try:
             arrays = load_file(file)
@@ -121,10 +139,14 @@ def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
 
 
 def read_json(path: Path, problem: str) -> dict:
+    """The object that a JSON file holds; whatever else is there is `problem`."""
     try:
-        return json.loads(path.read_text())
-    except (OSError, json.JSONDecodeError) as error:
+        told = json.loads(path.read_text())
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
         raise UserError(f"'{path.parent}' {problem} ({type(error).__name__}: {path.name}).") from error
+    if not isinstance(told, dict):
+        raise UserError(f"'{path.parent}' {problem} ({path.name} holds a {type(told).__name__}, not an object).")
+    return told
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -13,6 +13,7 @@ import operator
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from ringfence import algos, features, hazards, tasks
 from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
-from ringfence.files import whole
+from ringfence.files import owned, whole
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config, environment, write_json
 from ringfence.tasks import Task
@@ -44,6 +45,7 @@ class Job:
     spec: Spec
     feature_map: Any
     hazard: hazards.BoundHazard
+    widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
 
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
@@ -56,6 +58,7 @@ class Job:
             "spec": dataclasses.asdict(self.spec),
             "hazard": hazards.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
+            "widths": None if self.task.env is not None else list(self.widths),
             "seed": seed,
             "data": card,
         }
@@ -73,7 +76,16 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     spec = task.spec(feature_map, store)
     hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
     a.check(config, hazard)
-    return Job(a, preset, config, task, spec, feature_map, hazard)
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
+
+
+def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:
+    """How many entries an observation and the global state have (0: there is none): the simulator's, or the data's."""
+    if task.env is not None:
+        return task.env.observation_dim, len(task.env.state_names)
+    if store is None:
+        return None, None
+    return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]
 
 
 def train(
@@ -228,6 +240,14 @@ def make_program(job: Job):
 
 
 def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program=None):
+    """Train runs that nobody else trains at this time, in one program."""
+    with ExitStack() as locks:
+        for run in runs:
+            locks.enter_context(owned(run.path, f"Another process trains '{run.path}'; wait for it or stop it."))
+        return _advance(job, windows, runs, seeds, options, program)
+
+
+def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program):
     program = program or make_program(job)
     advance, diagnose = program
     roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
@@ -314,7 +334,7 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     mine = json.loads(json.dumps(job.describe(seed, data.card)))
     if (run.path / "config.json").exists():
-        there = {"revision": 1} | run.config
+        there = {"revision": 1, "widths": mine["widths"]} | run.config  # older runs tell neither
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

@@ -116,6 +116,11 @@ class Grid:
     cells: tuple[Cell, ...]
     episodes: int = 200
 
+    @property
+    def taken(self) -> str:
+        """What a second runner is told."""
+        return f"Another runner works on '{self.out}'; wait for it or stop it."
+
     def count(self) -> dict[str, int]:
         """How many cells are done, failed and to do."""
         states = [c.state(self.out, self.episodes) for c in self.cells]
@@ -134,6 +139,8 @@ class Grid:
         mine = about(self.suite, self.episodes)
         file = self.out / "bench.json"
         if not file.exists():
+            if self.out.exists() and not self.out.is_dir():
+                raise UserError(f"'{self.out}' is a file; give --out an empty or a results folder.")
             if self.out.exists() and any(self.out.iterdir()):
                 raise UserError(f"'{self.out}' holds something else; give --out an empty or a results folder.")
             write_json(file, mine)
@@ -161,10 +168,12 @@ def read_about(out: Path) -> dict:
 
 
 def statuses(out: str | Path) -> list[dict]:
-    """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way."""
+    """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way, and
+    one that failed early has nothing else."""
     read_about(Path(out))
     found = []
-    for folder in sorted(f.parent for f in (Path(out) / "cells").glob("*/*/*/config.json")):
+    begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/*/{name}.json")}
+    for folder in sorted(begun):
         file = folder / "status.json"
         told = read_json(file, "is damaged; delete it") if file.exists() else {"state": "under way"}
         task, algorithm, seed = folder.parts[-3:]
@@ -208,6 +217,11 @@ def make_grid(
             played = tuple((e.variant(task, v), v) for v in e.evaluations)
             preset = e.preset_for(task)
             cells += [Cell(name, e.algorithm, preset, k, changes, played, transitions) for k in range(seeds)]
+    if not cells:
+        raise UserError(
+            f"The suite {suite} plays {', '.join(sorted(only))} on none of {', '.join(names)}; choose other tasks or "
+            "algorithms."
+        )
     return Grid(Path(out), suite, tuple(cells), episodes)
 
 

@@ -14,8 +14,8 @@ import tempfile
 from pathlib import Path
 
 from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group
-from ringfence.bench.local import owned
 from ringfence.errors import UserError
+from ringfence.files import owned
 from ringfence.progress import Progress
 
 RETRIES = 3
@@ -23,6 +23,8 @@ RETRIES = 3
 
 def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: bool = False) -> dict[str, int]:
     """Make all unfinished cells on a Ray cluster (`auto`, host:port or ray://host:port; None starts a local one)."""
+    if threads < 1:
+        raise UserError(f"threads={threads} must be at least 1.")
     ray, make = connect(address), packed
     grid.open()
 
@@ -30,7 +32,7 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
     def make_cell(cell: Cell, episodes: int, begun: bytes) -> bytes:
         return make(cell, episodes, begun)
 
-    with owned(grid.out):
+    with owned(grid.out, grid.taken):
         for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
             make_reference(name, grid.out, grid.episodes, transitions)
         cells = [c for group in grid.groups() for c in group]

@@ -13,14 +13,13 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from ringfence import reference, tasks
 from ringfence.bench.cells import Cell, Grid, record_failure
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
+from ringfence.files import owned
 from ringfence.progress import Progress
 
 DEATHS = 2  # of workers on one cell, after which it is left
@@ -35,11 +34,13 @@ def run_local(
     is killed and its cell recorded as failed.
     """
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    workers = workers or max(1, len(cores) // threads)
-    if threads < 1 or workers < 1:
+    if threads < 1 or (workers is not None and workers < 1):
         raise UserError(f"workers={workers} and threads={threads} must be at least 1.")
+    if memory is not None and not memory > 0:
+        raise UserError(f"memory={memory:g} GiB must be more than 0; leave it out for no limit.")
+    workers = workers or max(1, len(cores) // threads)
     grid.open()
-    with owned(grid.out) as lock:
+    with owned(grid.out, grid.taken) as lock:
         groups = grid.groups()
         jobs: queue.Queue[dict] = queue.Queue()
         for job in _references(grid):
@@ -196,26 +197,3 @@ def resident(pid: int) -> float:
     except (OSError, IndexError, ValueError):
         return 0.0
     return pages * os.sysconf("SC_PAGE_SIZE") / 2**30
-
-
-@contextmanager
-def owned(out: Path) -> Iterator[int]:
-    """Hold DIR's lock; it frees itself when the runner and all its workers are gone, however they went."""
-    try:
-        import fcntl
-    except ImportError:  # no such locks here: one runner per folder is then up to the user
-        yield -1
-        return
-    file = os.open(out / ".lock", os.O_RDWR | os.O_CREAT)
-    try:
-        for attempt in range(20):
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except OSError:
-                if attempt == 19:
-                    raise UserError(f"Another runner works on '{out}'; wait for it or stop it.") from None
-                time.sleep(0.25)
-        yield file
-    finally:
-        os.close(file)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ringfence import __version__, hazards
 from ringfence.data import behaviour, robots
-from ringfence.data.store import EpisodeStore, complete_card
+from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, SimpleSpread
 from ringfence.errors import StoreError, UserError
 from ringfence.tasks import Task, siblings
@@ -130,7 +130,7 @@ def _relabelled(task: Task, transitions: int, seed: int, card: dict) -> EpisodeS
             told = other.card | card | {"protocol": task.protocol}
             told |= task.env.describe(other.speed, task.cost_limit)
             costs = (other.speed > task.env.limit).astype(np.float32)
-            return replace(other, costs=costs, card=complete_card(told))
+            return replace(other, costs=costs, card=told)
     return None
 
 

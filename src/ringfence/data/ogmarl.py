@@ -114,6 +114,9 @@ def import_madiff(
     where = f"'{directory}'"
     obs, actions, rewards, lengths = (_load(directory, f) for f in ("obs", "actions", "rewards", "path_lengths"))
     n, wide = env.n_agents, OLD_OBSERVATION[env.parts]
+    if lengths.ndim != 1 or lengths.dtype.kind == "b" or not ((lengths >= 1) & (lengths % 1 == 0)).all():
+        raise StoreError(f"{where}: path_lengths.npy must hold the steps of every episode, whole numbers of 1 or more.")
+    lengths = lengths.astype(np.int64)
     steps = int(lengths.sum())
     _shape(where, "obs.npy", obs, (steps, n, n + wide))
     _shape(where, "actions.npy", actions, (steps, n, env.action_dim))
@@ -369,7 +372,10 @@ def _load(directory: Path, name: str) -> np.ndarray:
             f"'{directory}' lacks {name}.npy; pass a folder of MADIFF's robots (obs.npy, actions.npy, ...)."
         )
     try:
-        return np.load(file, allow_pickle=False)
+        array = np.load(file, allow_pickle=False)
+        if array.dtype.kind not in "biuf":
+            raise ValueError(f"it holds entries of type {array.dtype}")
+        return array
     except (OSError, ValueError, EOFError) as error:
         raise StoreError(f"'{file}' is truncated or no .npy file of numbers ({error}); copy it again.") from error
 

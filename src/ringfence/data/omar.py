@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from ringfence import features, hazards, tasks
-from ringfence.data.store import EpisodeStore
+from ringfence.data.store import EpisodeStore, complete_card
 from ringfence.envs import SimpleSpread
 from ringfence.errors import StoreError
 
@@ -43,6 +43,8 @@ def import_omar(
     `hazard` defines the costs (default: `Separation(0.30)`, the contact of two agents). `task` defaults to
     `simple_spread-<tier>` where the path names the tier, else to `simple_spread-imported`.
     """
+    if task is not None:
+        complete_card({"task": task})  # a name that cannot be one is refused before the files are read
     directory = Path(directory)
     n, has_next = _survey(directory)
     if episode_length < 1 or (episode_length < 2 and not has_next):

@@ -23,7 +23,7 @@ import h5py
 import numpy as np
 
 from ringfence import hazards
-from ringfence.errors import StoreError
+from ringfence.errors import StoreError, UserError
 from ringfence.files import whole
 
 FORMAT = 1
@@ -47,6 +47,7 @@ class EpisodeStore:
     speed: np.ndarray | None = None
 
     def __post_init__(self):
+        object.__setattr__(self, "card", complete_card(self.card))
         validate(self)
 
     # --- sizes ---
@@ -93,7 +94,7 @@ class EpisodeStore:
     @property
     def hazard(self) -> hazards.Hazard:
         """The definition of danger in the card; CostColumn when the card has none."""
-        return hazards.from_dict(self.card.get("hazard", {"kind": "CostColumn"}))
+        return hazards.from_dict(self.card["hazard"])
 
     def select(self, keep: np.ndarray) -> EpisodeStore:
         """The episodes where `keep` (E,) is true."""
@@ -121,18 +122,20 @@ class EpisodeStore:
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
         costs (E, L) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (none, if
         it is not given)."""
-        observations, actions = np.asarray(observations), np.asarray(actions)
+        observations, actions = _numbers("observations", observations), _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
             raise StoreError(
                 f"from_episodes got observations {observations.shape} and actions {actions.shape}; they must be "
                 "(E, L+1, N, O) and (E, L, N, A): keep the state that the last action leads to."
             )
         e, length, n = actions.shape[:3]
-        rewards, costs = np.asarray(rewards), np.asarray(np.zeros((e, length)) if costs is None else costs)
+        rewards = _numbers("rewards", rewards)
+        costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
         one = {"observations": (observations, (e, length + 1, n)), "costs": (costs, (e, length))}
         one["rewards"] = (rewards, (e, length, n)[: max(2, rewards.ndim)])
         if state is not None:
-            one["state"] = (np.asarray(state), (e, length + 1))
+            state = _numbers("state", state)
+            one["state"] = (state, (e, length + 1))
         if terminated is not None:
             one["terminated"] = (np.asarray(terminated), (e,))
         for name, (value, expected) in one.items():
@@ -157,7 +160,7 @@ class EpisodeStore:
             (last & ~ended[:, None]).ravel(),
             np.arange(1, e + 1) * length,
             None if state is None else flat(state, e * (length + 1)).astype(np.float32, copy=False),
-            complete_card(card),
+            {} if card is None else card,
         )
 
     @classmethod
@@ -179,8 +182,18 @@ class EpisodeStore:
         """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,), state (T, S);
         `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
         episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
-        ends = np.asarray(episode_ends, np.int64)
-        observations, actions = np.asarray(observations, np.float32), np.asarray(actions, np.float32)
+        ends = _numbers("episode_ends", episode_ends, 1)
+        if (ends % 1 != 0).any():
+            raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
+        ends = ends.astype(np.int64)
+        observations = _numbers("observations", observations, 3).astype(np.float32, copy=False)
+        actions = _numbers("actions", actions, 3).astype(np.float32, copy=False)
+        final_observations = _numbers("final_observations", final_observations, 3).astype(np.float32, copy=False)
+        rewards = _numbers("rewards", rewards).astype(np.float32, copy=False)
+        state, final_state = (
+            None if x is None else _numbers(name, x, 2).astype(np.float32, copy=False)
+            for name, x in (("state", state), ("final_state", final_state))
+        )
         if len(ends) == 0 or ends[-1] != len(actions):
             raise StoreError(
                 f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {len(actions)} steps; "
@@ -204,7 +217,6 @@ class EpisodeStore:
                     f"{name} has shape {np.shape(value)}, expected {expected}: the state that each of the {len(ends)} "
                     "episodes ended in."
                 )
-        rewards = np.asarray(rewards, np.float32)
         if rewards.ndim == 1:
             rewards = np.repeat(rewards[:, None], actions.shape[1], 1)
         ended = np.zeros(len(ends), bool) if terminated is None else np.asarray(terminated, bool)
@@ -214,16 +226,16 @@ class EpisodeStore:
         if state is not None and final_state is None:
             raise StoreError("state was given without final_state; pass the global state each episode ended in, too.")
         return cls(
-            np.insert(observations, ends, np.asarray(final_observations, np.float32), axis=0),
+            np.insert(observations, ends, final_observations, axis=0),
             actions,
             rewards,
-            np.zeros(len(actions), np.float32) if costs is None else np.asarray(costs, np.float32),
+            np.zeros(len(actions), np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
             flags[0],
             flags[1],
             ends,
-            None if state is None else np.insert(np.asarray(state, np.float32), ends, final_state, axis=0),
-            complete_card(card),
-            None if speed is None else np.asarray(speed),
+            None if state is None else np.insert(state, ends, final_state, axis=0),
+            {} if card is None else card,
+            None if speed is None else _numbers("speed", speed),
         )
 
     # --- disk ---
@@ -253,23 +265,45 @@ class EpisodeStore:
                 missing = [name for name in ARRAYS if name not in f]
                 if missing:
                     raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
-                size = sum(f[name].nbytes for name in (*ARRAYS, *OPTIONAL) if name in f)
-                if size > (there := _memory()):
+                there = [name for name in (*ARRAYS, *OPTIONAL) if name in f]
+                odd = [name for name in there if not isinstance(f[name], h5py.Dataset)]
+                if odd:
                     raise StoreError(
-                        f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {there / 2**30:.1f} GiB of "
-                        "memory; take a larger machine, or store fewer episodes."
+                        f"'{path}' holds a group where the array '{odd[0]}' belongs; make the store again."
                     )
-                arrays = {name: f[name][()] for name in (*ARRAYS, *OPTIONAL) if name in f}
+                size = sum(f[name].nbytes for name in there)
+                if size > (memory := _memory()):
+                    raise StoreError(
+                        f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB "
+                        "of memory; take a larger machine, or store fewer episodes."
+                    )
+                arrays = {name: f[name][()] for name in there}
                 card = json.loads(f.attrs["card"])
-        except (KeyError, json.JSONDecodeError) as error:
+        except StoreError:
+            raise
+        except (KeyError, TypeError, ValueError) as error:  # no card, or one that is no JSON
             raise StoreError(f"'{path}' has no card that can be read ({error}); make or import it again.") from error
         except OSError as error:
             told = str(error).splitlines()[0]
             raise StoreError(f"'{path}' is truncated or not HDF5 ({told}); make or import the store again.") from error
         try:
             return cls(**arrays, card=card)
-        except StoreError as error:
+        except UserError as error:
             raise StoreError(f"'{path}': {error}") from None
+
+
+def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
+    """An array of real numbers, with that many axes; ragged lists, words and None are refused by name."""
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # rows of several lengths
+        raise StoreError(f"{name} is no array ({str(error).split('. ')[0]}); give every row the same length.") from None
+    if array.dtype.kind not in "biuf":
+        kind = "nothing" if value is None else "entries that are no real numbers"
+        raise StoreError(f"{name} holds {kind} (dtype {array.dtype}); give an array of numbers.")
+    if axes is not None and array.ndim != axes:
+        raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
+    return array
 
 
 def _memory() -> float:
@@ -279,7 +313,7 @@ def _memory() -> float:
     return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")
 
 
-def complete_card(card: dict | None) -> dict:
+def complete_card(card: dict) -> dict:
     """A card with every field present; unknown fields are kept, for provenance of any kind."""
     base = {
         "task": "custom",
@@ -291,13 +325,28 @@ def complete_card(card: dict | None) -> dict:
         "state_names": None,
         "hazard": {"kind": "CostColumn"},
     }
-    if not isinstance(card or {}, dict):
+    if not isinstance(card, dict):
         raise StoreError(f"The card is a {type(card).__name__}; it must be a dictionary of fields.")
-    card = {**base, **(card or {})}
+    card = {**base, **card}
+    _check_name(card["task"])
     for name in ("action_low", "action_high"):
-        if isinstance(card[name], bool) or not isinstance(card[name], int | float | np.number):
+        if not _is_number(card[name]):
             raise StoreError(f"The card has {name}={card[name]!r}; it must be one number, the bound of every entry.")
         card[name] = float(card[name])
+    if not card["action_low"] < card["action_high"]:
+        raise StoreError(
+            f"The card has action_low={card['action_low']:g} and action_high={card['action_high']:g}; the first must "
+            "be the smaller one."
+        )
+    if "cost_limit" in card and not (_is_number(card["cost_limit"]) and card["cost_limit"] >= 0):
+        raise StoreError(f"The card has cost_limit={card['cost_limit']!r}; it must be one number, 0 or more.")
+    for name in ("observation_names", "state_names", "warnings"):
+        words = card.get(name)
+        words = words.tolist() if isinstance(words, np.ndarray) else words
+        if words is not None and not (isinstance(words, list | tuple) and all(isinstance(w, str) for w in words)):
+            raise StoreError(f"The card has {name}={words!r}; it must be a list of words, or be left out.")
+        if name in card:
+            card[name] = words if words is None else list(words)
     if isinstance(card["hazard"], hazards.Hazard):
         card["hazard"] = hazards.to_dict(card["hazard"])
     elif not isinstance(card["hazard"], dict):
@@ -305,8 +354,39 @@ def complete_card(card: dict | None) -> dict:
             f"The card has hazard={card['hazard']!r}; it must be a Separation, SpeedLimit, CostColumn or All (other "
             "dangers go into the costs, with CostColumn)."
         )
-    hazards.from_dict(card["hazard"])
-    return json.loads(json.dumps(card))
+    try:
+        told = hazards.from_dict(card["hazard"])
+        sound = all(_is_sound(h) for h in getattr(told, "hazards", (told,)))
+    except UserError:
+        raise
+    except (TypeError, ValueError):  # a field of a kind that no hazard has
+        sound = False
+    if not sound:
+        raise StoreError(f"The card has hazard={card['hazard']!r}, which is none; see docs/data.md.")
+    try:
+        return json.loads(json.dumps(card, default=lambda x: x.tolist()))  # NumPy's arrays and numbers become plain
+    except (AttributeError, TypeError, ValueError) as error:
+        raise StoreError(f"The card cannot be kept as JSON ({error}); use words, numbers, lists and dicts.") from None
+
+
+def _is_number(x) -> bool:
+    return isinstance(x, int | float | np.number) and not isinstance(x, bool) and bool(np.isfinite(x))
+
+
+def _is_sound(hazard: hazards.Hazard) -> bool:
+    """Whether a hazard has the sizes that define it, and names its features with words."""
+    features = getattr(hazard, "features", ())
+    sizes = ("radius", "safe_margin") if isinstance(hazard, hazards.Separation) else ("limit",)
+    sized = all(getattr(hazard, name, 0.0) is not None for name in sizes)
+    return sized and isinstance(features, tuple) and all(isinstance(name, str) for name in features)
+
+
+def _check_name(task) -> None:
+    """A task's name becomes that of folders and files."""
+    if not isinstance(task, str) or not task.strip() or task in (".", "..") or set(task) & {"/", "\\", "\0"}:
+        raise StoreError(
+            f"The card has task={task!r}; it must be a name without slashes, since folders of runs are called so."
+        )
 
 
 def validate(store: EpisodeStore) -> None:
@@ -317,8 +397,21 @@ def validate(store: EpisodeStore) -> None:
         if not ok:
             raise StoreError(message)
 
+    for name in (*ARRAYS, *OPTIONAL):
+        array = getattr(s, name)
+        if array is None and name in OPTIONAL:
+            continue
+        demand(isinstance(array, np.ndarray), f"{name} is a {type(array).__name__}; give a NumPy array.")
+        kinds, what = {"episode_ends": ("iu", "whole numbers")}.get(name, ("biuf", "real numbers"))
+        if name in ("terminated", "truncated"):
+            kinds, what = "b", "true or false"
+        demand(array.dtype.kind in kinds, f"{name} holds entries of type {array.dtype}; it must hold {what}.")
     demand(s.actions.ndim == 3, f"actions has shape {s.actions.shape}, expected (T, N, A); add the missing axis.")
     t, n = s.actions.shape[:2]
+    demand(
+        n > 0 and s.actions.shape[2] > 0,
+        f"actions has shape {s.actions.shape}; a store needs at least one agent and one action entry.",
+    )
     ends = s.episode_ends
     demand(ends.ndim == 1 and len(ends) > 0, "episode_ends is empty; a store needs at least one whole episode.")
     demand(bool((np.diff(ends, prepend=0) > 0).all()), "episode_ends must increase; give cumulative step counts.")
@@ -338,6 +431,7 @@ def validate(store: EpisodeStore) -> None:
             f"{name} has shape {got}, expected {(*expected, 'O') if name == 'observations' else expected} for "
             f"{t} steps, {e} episodes and {n} agents; every episode keeps one more observation than steps.",
         )
+    demand(s.observations.shape[2] > 0, "observations has no entries; an agent must see at least one number.")
     if s.state is not None:
         demand(
             s.state.ndim == 2 and len(s.state) == t + e,
@@ -351,7 +445,7 @@ def validate(store: EpisodeStore) -> None:
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
     demand(bool((s.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
-    low, high = float(s.card.get("action_low", -1.0)), float(s.card.get("action_high", 1.0))
+    low, high = s.card["action_low"], s.card["action_high"]
     slack = 1e-4 * (high - low)
     outside = (s.actions < low - slack) | (s.actions > high + slack)
     if outside.any():
