@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import features, hazards
+from ringfence import features, hazards, tasks
+from ringfence.data import EpisodeStore
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 
@@ -193,6 +194,16 @@ def test_views_of_anybodys_data_drop_constants_and_duplicates():
         features.from_data("centralized", observations, None, names, ())
     with pytest.raises(UserError, match="Every observation entry is constant"):
         features.from_data("pruned", np.zeros((5, 2, 3)), None, ("a", "b", "c"), ())
+
+
+def test_entries_that_vary_late_in_a_log_are_kept():
+    """A log sorted by site: an entry rests, and another repeats an earlier one, on all rows but the last hundred."""
+    observations = np.random.default_rng(0).normal(size=(25_100, 2, 3)).astype(np.float32)
+    observations[:25_000, :, 1] = 0.5
+    observations[:25_000, :, 2] = observations[:25_000, :, 0]
+    steps = len(observations) - 1
+    store = EpisodeStore.from_episodes(observations[None], np.zeros((1, steps, 2, 1)), np.zeros((1, steps)), None)
+    assert tasks.from_store(store).feature_map("decentralized", store).names == ("obs0", "obs1", "obs2")
 
 
 def test_a_view_of_the_state_needs_it(rows):
