@@ -119,7 +119,9 @@ class Planner(eqx.Module):
         if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if judged and o.select != "barrier" and not self.hazard.has_formula:
-            raise UserError(f"select='{o.select}' needs a hazard with a formula; use select='barrier'.")
+            raise UserError(
+                f"select='{o.select}' needs a hazard formula that the model's view can read; use select='barrier'."
+            )
         if self.carries_own and not o.reconcile:
             raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
         if o.execution == "decentralized" and self.observe == "all":

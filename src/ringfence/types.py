@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 
@@ -109,6 +109,8 @@ class Algorithm:
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
     heeds_danger: bool = True  # False: training reads neither costs nor the hazard
+    # config -> what training knows danger by: the hazard's labels of states, the logged costs alone, or nothing
+    reads: Callable[[Any], Literal["labels", "costs", "nothing"]] = lambda config: "labels"
     revision: int = 1  # raised when the same settings come to train another policy; results tell theirs
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +70,11 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("bc looks at the present state alone; leave history=0 and horizon=2.")
 
 
+def reads(config: Config) -> Literal["costs", "nothing"]:
+    """Costs choose the episodes that are cloned, if anything does."""
+    return "nothing" if config.cost_limit is None else "costs"
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     opt = _optimiser(config)
 
@@ -108,6 +114,7 @@ BC = Algorithm(
     make_policy,
     {"default": {}, "mujoco": {"steps": 8_000}},
     heeds_danger=False,
+    reads=reads,
 )
 BC_SAFE = replace(
     BC,

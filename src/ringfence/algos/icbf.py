@@ -234,6 +234,11 @@ def check(config: Config, hazard: BoundHazard) -> None:
         )
 
 
+def reads(config: Config) -> Literal["labels", "nothing"]:
+    """A barrier learns from labelled states; without one, danger matters at run time only."""
+    return "labels" if config.barrier else "nothing"
+
+
 def gradient_depth(text: str) -> tuple[str, int]:
     """'x0' -> ('x0', 0); 'ddim:3' -> ('ddim', 3)."""
     kind, _, count = text.partition(":")
@@ -555,7 +560,9 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 
 
 REVISION = 2  # 1: the scale of the critic that ranks plans was of every other agent's view of states, or of one's
-ICBF = Algorithm("icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, revision=REVISION)
+ICBF = Algorithm(
+    "icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, reads=reads, revision=REVISION
+)
 MADIFF = Algorithm(
     "madiff",
     Config,
@@ -570,5 +577,6 @@ MADIFF = Algorithm(
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
     heeds_danger=False,
+    reads=reads,
     revision=REVISION,
 )

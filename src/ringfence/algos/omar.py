@@ -237,6 +237,7 @@ OMAR = Algorithm(
         "mujoco": _MUJOCO,
     },
     heeds_danger=False,
+    reads=lambda config: "nothing",
 )
 _CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "steps": 2_000}
 MA_CQL = replace(

@@ -14,6 +14,7 @@ size: a return of hundreds would otherwise drown a cost of one, whatever λ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +62,11 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError(f"delay={config.delay} must be at least 1.")
     if config.limit <= 0:
         raise UserError(f"limit={config.limit} must be positive; it is a cost per episode.")
+
+
+def reads(config: Config) -> Literal["costs", "nothing"]:
+    """What cost critics learn from, if there are any."""
+    return "costs" if config.lagrange else "nothing"
 
 
 def optimiser(config: Config) -> Optimiser:
@@ -190,6 +196,7 @@ MA_TD3BC = Algorithm(
     ac.make_policy,
     {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}, "mujoco": _MUJOCO},
     heeds_danger=False,
+    reads=reads,
 )
 MA_TD3BC_LAG = replace(
     MA_TD3BC,
