@@ -7,8 +7,10 @@ import pytest
 
 from ringfence import tasks, training
 from ringfence.algos import actor_critic as ac
-from ringfence.algos import fisor, omar, td3bc
+from ringfence.algos import fisor, icbf, omar, td3bc
 from ringfence.errors import UserError
+from ringfence.optim import Optimiser
+from ringfence.runs import build_config
 from ringfence.types import Spec
 
 SPEC = Spec("t", 2, 2, ("a", "b", "c"), -1.0, 1.0, 25)
@@ -108,6 +110,7 @@ def test_threshold_of_the_multiplier():
     config = td3bc.Config(limit=3.0)
     expected = 3.0 / 25 * sum(0.95**t for t in range(25))
     assert td3bc.threshold(config, SPEC) == pytest.approx(expected)
+    assert td3bc.threshold(td3bc.Config(limit=3.0, discount=1.0), SPEC) == 3.0
 
 
 @pytest.mark.parametrize(
@@ -118,13 +121,44 @@ def test_threshold_of_the_multiplier():
         (td3bc.check, td3bc.Config(horizon=4), "horizon"),
         (omar.check, omar.Config(coefficient=1.5), "coefficient"),
         (omar.check, omar.Config(search="elites", elites=11), "elites"),
+        (omar.check, omar.Config(search="elites", elites=1), "elites=1 must be 2 to 10"),
+        (omar.check, omar.Config(cql_actions="policy", cql_noise=0.0), "cql_noise=0"),
         (fisor.check, fisor.Config(expectile_reward=1.0), "expectile_reward"),
         (fisor.check, fisor.Config(candidates=0), "candidates"),
+        (fisor.check, fisor.Config(diffusion_steps=1), "at least 2 diffusion steps"),
+        (icbf.check, icbf.Config(snr_floor=6.0), "snr_floor=6.0 is above snr_ceiling=5.0"),
+        (icbf.check, icbf.Config(barrier_start=0.6), "barrier_start=0.6 is above barrier_full=0.5"),
     ],
 )
 def test_bad_settings_are_refused(check, config, word):
     with pytest.raises(UserError, match=word):
         check(config, None)
+
+
+@pytest.mark.parametrize(
+    "config, changes",
+    [
+        (td3bc.Config, {"alpha": -1.0}),
+        (td3bc.Config, {"multiplier_rate": -0.1}),
+        (td3bc.Config, {"multiplier_max": -1.0}),
+        (omar.Config, {"search_iterations": 0}),
+        (omar.Config, {"cql_samples": 0}),
+        (icbf.Config, {"critic_updates": 0}),
+        (icbf.Config, {"clip": 0.0}),
+    ],
+)
+def test_settings_out_of_range_are_refused(config, changes):
+    with pytest.raises(UserError, match=rf"{next(iter(changes))}=-?[\d.]+ of it must be (at least|positive)"):
+        build_config(config, changes, "it")
+
+
+def test_a_bound_of_zero_on_gradients_is_none():
+    optimiser = Optimiser(0.1, 0, 10, clip=0.0, floor=1.0)
+    params = {"net": jnp.ones(3)}
+    kept = optimiser.init(params)
+    for _ in range(2):  # the rate of the first update of a warm-up is 0
+        params, kept, _ = optimiser.update({"net": jnp.array([5.0, -7.0, 0.0])}, kept, params)
+    assert (np.asarray(params["net"] != 1.0) == [True, True, False]).all()
 
 
 def test_a_run_takes_the_preset_of_its_data(small_store):

@@ -33,7 +33,7 @@ class Config:
     batch: int = 256  # windows per update
     lr: float = 1e-3  # Adam
     warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm
+    grad_clip: float = 1.0  # global norm; 0: no bound
     ema: float = 0.995  # of the parameters
 
 

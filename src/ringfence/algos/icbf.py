@@ -87,7 +87,7 @@ class Config:
     batch: int = 128  # windows per update
     lr: float = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
     warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm, per network
+    grad_clip: float = 1.0  # global norm, per network; 0: no bound
     ema: float = 0.995  # of all parameters; the policy uses the averages
 
 
@@ -227,6 +227,11 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
     if config.horizon < 2:
         raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
+    for low, high in (("snr_floor", "snr_ceiling"), ("barrier_start", "barrier_full")):
+        if getattr(config, low) > getattr(config, high):
+            raise UserError(
+                f"{low}={getattr(config, low)} is above {high}={getattr(config, high)}; lower it or raise {high}."
+            )
     if config.routing == "split" and not config.scaled_margin and config.delta / (1 - config.retention) > 2.0:
         raise UserError(
             f"delta={config.delta} with retention={config.retention} asks a parked agent for h >= "

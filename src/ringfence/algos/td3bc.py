@@ -51,7 +51,7 @@ class Config:
     steps: int = 2_000  # updates
     batch: int = 1024  # transitions per update
     lr: float = 0.01  # Adam, constant
-    grad_clip: float = 0.5  # global norm, per network
+    grad_clip: float = 0.5  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -100,6 +100,8 @@ def init(
 def threshold(config: Config, spec: Spec) -> float:
     """d: what a discounted cost value may be if `limit` is spread evenly over an episode."""
     g, t = config.discount, spec.episode_length
+    if g == 1:  # Σ γ^t / T is then 1
+        return config.limit
     return config.limit * (1 - g**t) / ((1 - g) * t)
 
 
