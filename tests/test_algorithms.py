@@ -249,6 +249,8 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         training.train("icbf", small_store, out=run.path.parents[2], changes={**TINY["icbf"], "lr": 0.1})
     with pytest.raises(UserError, match="planner"):
         evaluate.evaluate(run, planner="gaurded")
+    with pytest.raises(UserError, match="share=0.6 of a margin.*select='barrier'"):
+        evaluate.evaluate(run, planner="shielded", select="barrier")
     with pytest.raises(UserError, match="1 to 20 steps"):
         evaluate.evaluate(run, steps=21)
     with pytest.raises(UserError, match="trained with observe"):

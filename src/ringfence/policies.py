@@ -61,6 +61,11 @@ class PlanOptions:
         for name in ("temperature", "ascent", "repair", "persist", "share"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if self.share > 0 and self.select != "clearance":
+            raise UserError(
+                f"share={self.share} of a margin in m or m/s means nothing to select='{self.select}', as a barrier has "
+                "no unit; set share=0 or select='clearance'."
+            )
         if self.sampler not in diffusion.SAMPLERS:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):

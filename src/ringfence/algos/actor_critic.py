@@ -130,7 +130,8 @@ def act(actor: MLP, x: Array, spec: Spec) -> Array:
 
 
 def fit_states(data: WindowData | None, spec: Spec, key: Key) -> normalise.Normaliser:
-    """Mean and deviation of states; blank without data. It stands for the batch normalisation of OMAR's networks."""
+    """Mean and deviation of states; blank without data. It stands for the batch normalisation of OMAR's networks, and
+    cloning reads states the same way."""
     if data is None:
         one, step = jnp.zeros(spec.feature_dim), jnp.zeros((1, spec.feature_dim))
         return normalise.Normaliser(one, one, step, step, 0, "displacement")
