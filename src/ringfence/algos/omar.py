@@ -125,6 +125,7 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
     opt = optimiser(config)
+    given, spec = spec, ac.in_units(spec)
     low, high = spec.action_low, spec.action_high
     uniform_density = -spec.action_dim * jnp.log(high - low)
 
@@ -137,7 +138,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         ku, kp, kn, ks = jax.random.split(key, 4)
-        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
         params, target = state["params"], state["target"]
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
             t.ahead, ac.act(target["actor"], t.ahead, spec)

@@ -108,12 +108,13 @@ def threshold(config: Config, spec: Spec) -> float:
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
     opt, allowed = optimiser(config), threshold(config, spec)
+    given, spec = spec, ac.in_units(spec)
 
     def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
         return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
         params, target = state["params"], state["target"]
         next_action = ac.act(target["actor"], t.ahead, spec)
         if config.target_noise > 0:
