@@ -16,6 +16,7 @@ import numpy as np
 from ringfence import algos, tasks
 from ringfence.bench import paper
 from ringfence.report import board, export
+from ringfence.runs import build_config
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -179,7 +180,7 @@ def spent(folder: Path) -> str:
         told, name = json.loads(file.read_text()), file.parent.parent.name
         if told["state"] != "done":
             continue
-        if "adopted" in told or (tasks.twin(file.parts[-4]) and not algos.get(_algorithm(name)).heeds_danger):
+        if "adopted" in told or (tasks.twin(file.parts[-4]) and not _reads_danger(file.parent)):
             trained, name = told.get("train_seconds", 0.0), f"{name}, trained before"
         else:  # of a cell that was played again the last attempt trained nothing
             results = json.loads((file.parent / "results.json").read_text())
@@ -193,9 +194,10 @@ def spent(folder: Path) -> str:
     return "\n".join(lines)
 
 
-def _algorithm(folder: str) -> str:
-    """Of a cell's folder, which is named algorithm[-preset]."""
-    return max((a for a in algos.ALGORITHMS if folder == a or folder.startswith(f"{a}-")), key=len)
+def _reads_danger(cell: Path) -> bool:
+    told = json.loads((cell / "config.json").read_text())
+    algorithm = algos.get(told["algorithm"])
+    return algorithm.reads(build_config(algorithm.Config, told["config"], told["algorithm"])) != "nothing"
 
 
 def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:

@@ -1,5 +1,7 @@
 """The actor-critic baselines: what their losses ask for, on networks small enough to compute by hand."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,9 +9,12 @@ import pytest
 
 from ringfence import tasks, training
 from ringfence.algos import actor_critic as ac
-from ringfence.algos import fisor, omar, td3bc
+from ringfence.algos import fisor, icbf, omar, td3bc
 from ringfence.errors import UserError
-from ringfence.types import Spec
+from ringfence.normalise import Normaliser
+from ringfence.optim import Optimiser
+from ringfence.runs import build_config
+from ringfence.types import Batch, Spec
 
 SPEC = Spec("t", 2, 2, ("a", "b", "c"), -1.0, 1.0, 25)
 
@@ -103,11 +108,31 @@ def test_units_of_actions_are_inverse():
     assert float(jnp.abs(fisor.to_unit(a, spec)).max()) == 1.0
 
 
+@pytest.mark.parametrize("learner, more", [(td3bc, {"target_noise": 0.2}), (omar, {"cql_actions": "policy"})])
+def test_bounds_of_actions_change_no_lesson(learner, more):
+    """Actions told in other units teach the same networks."""
+    config = learner.Config(width=4, batch=8, **more)
+    k = jax.random.split(jax.random.key(0), 3)
+    action = jax.random.uniform(k[0], (8, 1, 2, 2), minval=-1.0)
+    zeros, one = jnp.zeros((8, 2)), jnp.ones((8, 1), bool)
+    x = jax.random.normal(k[1], (8, 2, 2, 3))
+    new = []
+    for spec, told in ((SPEC, action), (replace(SPEC, action_low=2.0, action_high=8.0), 5.0 + 3.0 * action)):
+        state = learner.init(k[2], spec, config, None, None, None)
+        plain = Normaliser(jnp.zeros(3), jnp.ones(3), jnp.zeros((1, 3)), jnp.ones((1, 3)), 0, "displacement")
+        state["frozen"] = {"normaliser": plain}
+        batch = Batch(x, told, zeros == 0, zeros[:, 0], zeros, jnp.ones((8, 1, 2)), ~one)
+        new.append(learner.make_update(config, spec, None, None)(state, batch, k[2])[0]["params"])
+    for a, b in zip(*map(jax.tree.leaves, new)):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
+
+
 def test_threshold_of_the_multiplier():
     """A limit of one per episode, spread evenly, costs Σ γ^t / T in discounted value."""
     config = td3bc.Config(limit=3.0)
     expected = 3.0 / 25 * sum(0.95**t for t in range(25))
     assert td3bc.threshold(config, SPEC) == pytest.approx(expected)
+    assert td3bc.threshold(td3bc.Config(limit=3.0, discount=1.0), SPEC) == 3.0
 
 
 @pytest.mark.parametrize(
@@ -118,13 +143,44 @@ def test_threshold_of_the_multiplier():
         (td3bc.check, td3bc.Config(horizon=4), "horizon"),
         (omar.check, omar.Config(coefficient=1.5), "coefficient"),
         (omar.check, omar.Config(search="elites", elites=11), "elites"),
+        (omar.check, omar.Config(search="elites", elites=1), "elites=1 must be 2 to 10"),
+        (omar.check, omar.Config(cql_actions="policy", cql_noise=0.0), "cql_noise=0"),
         (fisor.check, fisor.Config(expectile_reward=1.0), "expectile_reward"),
         (fisor.check, fisor.Config(candidates=0), "candidates"),
+        (fisor.check, fisor.Config(diffusion_steps=1), "at least 2 diffusion steps"),
+        (icbf.check, icbf.Config(snr_floor=6.0), "snr_floor=6.0 is above snr_ceiling=5.0"),
+        (icbf.check, icbf.Config(barrier_start=0.6), "barrier_start=0.6 is above barrier_full=0.5"),
     ],
 )
 def test_bad_settings_are_refused(check, config, word):
     with pytest.raises(UserError, match=word):
         check(config, None)
+
+
+@pytest.mark.parametrize(
+    "config, changes",
+    [
+        (td3bc.Config, {"alpha": -1.0}),
+        (td3bc.Config, {"multiplier_rate": -0.1}),
+        (td3bc.Config, {"multiplier_max": -1.0}),
+        (omar.Config, {"search_iterations": 0}),
+        (omar.Config, {"cql_samples": 0}),
+        (icbf.Config, {"critic_updates": 0}),
+        (icbf.Config, {"clip": 0.0}),
+    ],
+)
+def test_settings_out_of_range_are_refused(config, changes):
+    with pytest.raises(UserError, match=rf"{next(iter(changes))}=-?[\d.]+ of it must be (at least|positive)"):
+        build_config(config, changes, "it")
+
+
+def test_a_bound_of_zero_on_gradients_is_none():
+    optimiser = Optimiser(0.1, 0, 10, clip=0.0, floor=1.0)
+    params = {"net": jnp.ones(3)}
+    kept = optimiser.init(params)
+    for _ in range(2):  # the rate of the first update of a warm-up is 0
+        params, kept, _ = optimiser.update({"net": jnp.array([5.0, -7.0, 0.0])}, kept, params)
+    assert (np.asarray(params["net"] != 1.0) == [True, True, False]).all()
 
 
 def test_a_run_takes_the_preset_of_its_data(small_store):

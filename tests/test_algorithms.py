@@ -284,6 +284,8 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         training.train("icbf", small_store, out=run.path.parents[2], changes={**TINY["icbf"], "lr": 0.1})
     with pytest.raises(UserError, match="planner"):
         evaluate.evaluate(run, planner="gaurded")
+    with pytest.raises(UserError, match="share=0.6 of a margin.*select='barrier'"):
+        evaluate.evaluate(run, planner="shielded", select="barrier")
     with pytest.raises(UserError, match="1 to 20 steps"):
         evaluate.evaluate(run, steps=21)
     with pytest.raises(UserError, match="trained with observe"):
@@ -459,6 +461,43 @@ def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsy
     with pytest.raises(SystemExit) as stop:
         main(["eval", str(trained["madiff"].path), "--episodes", "2", *words])
     assert stop.value.code == 2 and said in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def absolute(played):
+    """Logs whose danger is about positions in the global state, which no agent observes; and as they are, no costs."""
+    from ringfence.data import EpisodeStore
+    from ringfence.envs import SimpleSpread
+    from ringfence.hazards import Separation
+
+    card = {"task": "yard", "state_names": list(SimpleSpread().state_names), "hazard": Separation(0.3)}
+    arrays = played["observations"], played["actions"], played["rewards"]
+    return lambda costs: EpisodeStore.from_episodes(*arrays, costs, state=played["state"], card=card)
+
+
+def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, absolute, tmp_path):
+    store = absolute(played["costs"])
+    run = training.train("bc", store, out=tmp_path, changes=TINY["bc"], quiet=True)[0]
+    evaluate.load(run)
+    task = tasks.from_store(store)
+    for name in ("madiff", "bc-safe", "ma-td3bc-lag", "omar"):
+        assert not training.make_job(name, task, None, {"view": "decentralized"}, store).hazard.has_formula
+    assert training.make_job("madiff", task, None, {"view": "centralized"}, store).hazard.has_formula
+    for name in ("icbf", "fisor"):
+        with pytest.raises(UserError, match=r"reads the feature 'other0\.dx'"):
+            training.make_job(name, task, None, {"view": "decentralized"}, store)
+
+
+def test_costs_that_were_never_filled_in_are_refused_by_those_who_learn_from_them(absolute):
+    store = absolute(None)
+    task = tasks.from_store(store)
+    for name in ("bc-safe", "ma-td3bc-lag"):
+        with pytest.raises(
+            UserError, match=rf"{name} knows danger by costs alone.*calls [\d.]+ % of its states unsafe"
+        ):
+            training.make_job(name, task, None, {}, store)
+    for name, view in (("bc", "decentralized"), ("icbf", "centralized")):
+        training.make_job(name, task, None, {"view": view}, store)
 
 
 def test_trained_config_round_trip(trained):

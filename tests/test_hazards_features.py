@@ -7,9 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import features, hazards
+from ringfence import features, hazards, tasks
+from ringfence.data import EpisodeStore
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
+from ringfence.windows import NOT_ARRIVED
 
 VIEWS = features.VIEWS
 
@@ -109,6 +111,11 @@ def test_all_is_the_smallest_clearance(rows):
     parts = hazards.Separation(), hazards.SpeedLimit(0.8, ("own.vx", "own.vy"))
     bound = hazards.bind(hazards.All(parts), table.names, 3)
     each = [np.asarray(jax.jit(hazards.bind(p, table.names, 3).clearance)(x)) for p in parts]
+    labels = [hazards.bind(p, table.names, 3).labels(x) for p in parts]
+    unsafe, safe = bound.labels(x)
+    np.testing.assert_array_equal(unsafe, labels[0][0] | labels[1][0])
+    np.testing.assert_array_equal(safe, labels[0][1] & labels[1][1])  # metres and m/s by margins of their own
+    assert (safe & (bound.clearance(x) < bound.safe_margin)).any()
     clearance = jax.jit(bound.clearance)
     np.testing.assert_allclose(clearance(x), np.minimum(*each), atol=1e-6)
     assert (clearance(jax.jit(bound.endanger)(x, jax.random.key(1))) < 0).all()
@@ -122,9 +129,9 @@ def test_cost_column_labels_only_what_was_logged(rows):
     table, x = views_of(rows, "pruned")
     bound = hazards.bind(hazards.CostColumn(), table.names, 3)
     assert not bound.has_formula
-    unsafe, safe = bound.labels(jnp.asarray(x[:3]), jnp.array([0.0, 2.0, 0.0]))
+    unsafe, safe = bound.labels(jnp.asarray(x[:3]), jnp.array([0.0, 2.0, NOT_ARRIVED]))
     assert unsafe.tolist() == [[False] * 3, [True] * 3, [False] * 3]
-    np.testing.assert_array_equal(safe, ~unsafe)
+    assert safe.tolist() == [[True] * 3, [False] * 3, [False] * 3]  # an episode's first state is neither
     with pytest.raises(UserError, match="pass their costs"):
         bound.labels(jnp.asarray(x))
 
@@ -193,6 +200,16 @@ def test_views_of_anybodys_data_drop_constants_and_duplicates():
         features.from_data("centralized", observations, None, names, ())
     with pytest.raises(UserError, match="Every observation entry is constant"):
         features.from_data("pruned", np.zeros((5, 2, 3)), None, ("a", "b", "c"), ())
+
+
+def test_entries_that_vary_late_in_a_log_are_kept():
+    """A log sorted by site: an entry rests, and another repeats an earlier one, on all rows but the last hundred."""
+    observations = np.random.default_rng(0).normal(size=(25_100, 2, 3)).astype(np.float32)
+    observations[:25_000, :, 1] = 0.5
+    observations[:25_000, :, 2] = observations[:25_000, :, 0]
+    steps = len(observations) - 1
+    store = EpisodeStore.from_episodes(observations[None], np.zeros((1, steps, 2, 1)), np.zeros((1, steps)), None)
+    assert tasks.from_store(store).feature_map("decentralized", store).names == ("obs0", "obs1", "obs2")
 
 
 def test_a_view_of_the_state_needs_it(rows):

@@ -16,7 +16,7 @@ import ringfence.data.store as store_module
 from ringfence.data.store import ARRAYS, EpisodeStore
 from ringfence.errors import StoreError, UserError
 from ringfence.hazards import CostColumn
-from ringfence.windows import WindowData, at, return_scores, returns_to_go
+from ringfence.windows import NOT_ARRIVED, WindowData, at, return_scores, returns_to_go
 
 
 def logs(lengths=(3, 1, 4), agents=2, seed=0, **card) -> EpisodeStore:
@@ -357,7 +357,7 @@ def test_windows_repeat_rows_at_the_ends_of_episodes(horizon, history, lengths):
                 np.testing.assert_array_equal(batch.features[step, j], store.observations[here])
                 assert batch.valid[step, j] == (time <= length)
                 arrived = min(max(time, 0), length)
-                assert batch.costs[step, j] == (store.costs[step - t + arrived - 1] if arrived else 0)
+                assert batch.costs[step, j] == (store.costs[step - t + arrived - 1] if arrived else NOT_ARRIVED)
                 if j < horizon + history - 1:
                     acted = 0 <= time < length
                     wanted = store.actions[step - t + time] if acted else np.zeros((2, 2))

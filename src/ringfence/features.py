@@ -176,7 +176,8 @@ def from_data(
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned.
 
-    observations (M, N, O), state (M, S) or None; a sample of rows is enough.
+    observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
+    that vary only later on.
     """
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
@@ -184,7 +185,7 @@ def from_data(
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
     m, n, o = observations.shape
     own = [observations[:, :, d] for d in range(o)]
-    shared = [] if state is None else [np.repeat(state[:, d : d + 1], n, 1) for d in range(state.shape[1])]
+    shared = [] if state is None else [np.broadcast_to(state[:, d : d + 1], (m, n)) for d in range(state.shape[1])]
     if view == "decentralized" or state is None:
         columns, names = own, observation_names
     elif view == "centralized":
@@ -193,8 +194,7 @@ def from_data(
         columns, names = own + shared, observation_names + state_names
     kept: list[int] = []
     for d, column in enumerate(columns):
-        constant = np.ptp(column, axis=0).max() < 1e-9
-        if not constant and not any(np.array_equal(column, columns[e]) for e in kept):
+        if not _constant(column) and not any(_same(column, columns[e]) for e in kept):
             kept.append(d)
     if not kept:
         raise UserError("Every observation entry is constant, so there is nothing to plan over; check the store.")
@@ -205,6 +205,16 @@ def from_data(
     source = "state" if view == "centralized" else "observations"
     table = np.tile(np.array(kept), (n, 1))
     return FeatureMap(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
+
+
+def _constant(column: np.ndarray, rows: int = 10_000) -> bool:
+    """Whether a column (M, N) never varies for any agent. Most vary at once, so the first rows are asked first."""
+    return all(np.ptp(some, axis=0).max() < 1e-9 for some in (column[:rows], column))
+
+
+def _same(a: np.ndarray, b: np.ndarray, rows: int = 10_000) -> bool:
+    """Whether two columns are equal; most differ at once, so they are compared piece by piece."""
+    return all(np.array_equal(a[k : k + rows], b[k : k + rows]) for k in range(0, len(a), rows))
 
 
 @dataclass(frozen=True, eq=False)

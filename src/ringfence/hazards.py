@@ -48,7 +48,8 @@ class CostColumn:
 
 @dataclass(frozen=True)
 class All:
-    """Every hazard at once: the clearance is the smallest one (of quantities that should share a unit)."""
+    """Every hazard at once: unsafe for any is unsafe, and safe is what every one calls safe by its own margin. The
+    clearance is the smallest one, of quantities that should share a unit where plans are judged by it."""
 
     hazards: tuple[Separation | SpeedLimit, ...]
 
@@ -68,21 +69,25 @@ class BoundHazard:
     clearance: Callable[[Array], Array] | None
     endanger: Callable[[Array, Key], Array] | None
     safe_margin: float
+    members: tuple[BoundHazard, ...] = ()  # of All: each has a margin of its own
 
     @property
     def has_formula(self) -> bool:
         return self.clearance is not None
 
     def labels(self, features: Array, costs: Array | None = None) -> tuple[Array, Array]:
-        """(unsafe, safe), each (..., N) bool. `costs` (...) is the cost charged on arriving in the state; it is read
-        only where there is no formula."""
+        """(unsafe, safe), each (..., N) bool. `costs` (...) is the cost charged on arriving in the state, negative
+        where nobody knows; it is read only where there is no formula."""
+        if self.members:
+            unsafe, safe = zip(*(m.labels(features) for m in self.members))
+            return functools.reduce(jnp.logical_or, unsafe), functools.reduce(jnp.logical_and, safe)
         if self.clearance is not None:
             ell = self.clearance(features)
             return ell < 0, ell >= self.safe_margin
         if costs is None:
             raise UserError("CostColumn can label only states of the data; pass their costs or give a hazard formula.")
-        unsafe = jnp.broadcast_to((costs > 0)[..., None], features.shape[:-1])
-        return unsafe, ~unsafe
+        costs = jnp.broadcast_to(costs[..., None], features.shape[:-1])
+        return costs > 0, costs == 0
 
 
 def least(x: list[Array]) -> Array:
@@ -111,6 +116,7 @@ def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
         lambda x: least([p.clearance(x) for p in parts]),
         endanger,
         max(p.safe_margin for p in parts),
+        tuple(parts),
     )
 
 

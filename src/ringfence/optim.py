@@ -19,14 +19,15 @@ class Optimiser:
     lr: float
     warmup: int  # updates of linear rise
     steps: int  # updates in all; the rate falls along a cosine to `floor`
-    clip: float
+    clip: float  # bound on the norm; 0: none
     floor: float = 0.1  # share of the rate that is left at the end; 1 keeps it constant
 
     def _adam(self) -> optax.GradientTransformation:
         warmup = min(self.warmup, max(self.steps // 10, 1))
         last = max(self.steps, warmup + 1)
         rate = optax.warmup_cosine_decay_schedule(0.0, self.lr, warmup, last, self.floor * self.lr)
-        return optax.chain(optax.clip_by_global_norm(self.clip), optax.adam(rate))
+        bounded = optax.clip_by_global_norm(self.clip) if self.clip > 0 else optax.identity()
+        return optax.chain(bounded, optax.adam(rate))
 
     def init(self, params: dict[str, PyTree]) -> dict[str, PyTree]:
         adam = self._adam()

@@ -61,6 +61,11 @@ class PlanOptions:
         for name in ("temperature", "ascent", "repair", "persist", "share"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if self.share > 0 and self.select != "clearance":
+            raise UserError(
+                f"share={self.share} of a margin in m or m/s means nothing to select='{self.select}', as a barrier has "
+                "no unit; set share=0 or select='clearance'."
+            )
         if self.sampler not in diffusion.SAMPLERS:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):
@@ -119,7 +124,9 @@ class Planner(eqx.Module):
         if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if judged and o.select != "barrier" and not self.hazard.has_formula:
-            raise UserError(f"select='{o.select}' needs a hazard with a formula; use select='barrier'.")
+            raise UserError(
+                f"select='{o.select}' needs a hazard formula that the model's view can read; use select='barrier'."
+            )
         if self.carries_own and not o.reconcile:
             raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
         if o.execution == "decentralized" and self.observe == "all":

@@ -171,12 +171,17 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 
 
 # Least and largest value that a field of this name may have, in whatever config it is.
-RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps"), (1, None))
-RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "bank", "bank_batch"), (1, None))
+RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps", "inverse_width"), (1, None))
+RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "bank", "bank_batch", "gradient_batch"), (1, None))
+RANGES |= dict.fromkeys(("critic_updates", "search_iterations", "search_samples", "cql_samples"), (1, None))
 RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
 RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
-RANGES |= dict.fromkeys(("history", "warmup", "critic_updates", "barrier_weight", "delta", "cql_weight"), (0, None))
+RANGES |= dict.fromkeys(("history", "warmup", "barrier_weight", "delta", "cql_weight", "cql_noise"), (0, None))
+RANGES |= dict.fromkeys(("alpha", "multiplier_rate", "multiplier_max", "action_penalty", "logit_penalty"), (0, None))
+RANGES |= dict.fromkeys(("search_deviation", "target_noise", "target_noise_clip", "inverse_noise"), (0, None))
+RANGES |= dict.fromkeys(("temperature_reward", "temperature_danger", "snr_floor", "snr_ceiling"), (0, None))
 RANGES |= {"horizon": (2, None), "grad_clip": (0, None), "cost_limit": (0, None)}
+POSITIVE = ("lr", "clip")
 
 
 def _in_range(of: str, name: str, value: Any) -> None:
@@ -186,8 +191,8 @@ def _in_range(of: str, name: str, value: Any) -> None:
     if not np.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
         bound = "finite" if low is None else f"at least {low}" if high is None else f"between {low} and {high}"
         raise UserError(f"{name}={value} of {of} must be {bound}.")
-    if name == "lr" and value <= 0:
-        raise UserError(f"lr={value} of {of} must be positive.")
+    if name in POSITIVE and value <= 0:
+        raise UserError(f"{name}={value} of {of} must be positive.")
 
 
 def _parse(name: str, text: str, default: Any) -> Any:

@@ -48,12 +48,10 @@ class Task:
             return features.robot(view, e.state_names, e.joints, e.own_joints, e.observed)
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
-        rows = slice(0, 20_000)
         width = 0 if store.state is None else store.state.shape[1]
         names = store.card["observation_names"] or [f"obs{d}" for d in range(store.observations.shape[2])]
         state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
-        state = None if store.state is None else store.state[rows]
-        return features.from_data(view, store.observations[rows], state, tuple(names), tuple(state_names))
+        return features.from_data(view, store.observations, store.state, tuple(names), tuple(state_names))
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
         env = self.env

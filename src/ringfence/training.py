@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import algos, features, hazards, tasks
+from ringfence.data.audit import APART, disagreement
 from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
@@ -74,8 +75,10 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
-    hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
+    hazard = _bound(task.hazard, spec, a.reads(config))
     a.check(config, hazard)
+    if store is not None and a.reads(config) == "costs":
+        _refuse_blank_costs(a.name, task, store)
     return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
 
 
@@ -86,6 +89,30 @@ def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None
     if store is None:
         return None, None
     return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]
+
+
+def _bound(hazard: hazards.Hazard, spec: Spec, reads: str) -> hazards.BoundHazard:
+    """The hazard as the algorithm's own view tells it. Where that view lacks what the formula is about (positions that
+    only the global state holds), those who label no states train all the same, with the costs for danger."""
+    try:
+        return hazards.bind(hazard, spec.feature_names, spec.n_agents)
+    except UserError:
+        if reads == "labels":
+            raise
+        return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
+
+
+def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore) -> None:
+    """Refuse costs that were never filled in: who learns from them alone would call every step safe."""
+    if store.costs.any():
+        return
+    unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
+    if unsafe > (APART if "mujoco" in task.presets else 0.0):
+        raise UserError(
+            f"{algorithm} knows danger by costs alone, which in '{task.name}' are 0 everywhere, but the hazard calls "
+            f"{100 * unsafe:.3g} % of its states unsafe; give costs to EpisodeStore, e.g. 1 where the hazard's labels "
+            "say unsafe."
+        )
 
 
 def train(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 
@@ -74,9 +74,9 @@ class Batch(NamedTuple):
 
     features: Array  # (B, H, N, D) s̃_i at t .. t+H-1; the tail past the episode's end repeats the last state
     actions: Array  # (B, H-1, N, A) the action between rows h and h+1 (0 where padded)
-    valid: Array  # (B, H) bool: the row is a real state of the episode
+    valid: Array  # (B, H) bool: the row is not past the episode's end; history before its start repeats the first state
     score: Array  # (B,) normal score of the window's value among the data: the condition y
-    costs: Array  # (B, H) cost charged on arriving in the row
+    costs: Array  # (B, H) cost charged on arriving in the row; −1 in an episode's first state, where nobody arrived
     rewards: Array  # (B, H-1, N) of the step between rows h and h+1 (0 where padded)
     terminated: Array  # (B, H-1) bool: that step ended the task itself
 
@@ -108,7 +108,8 @@ class Algorithm:
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
-    heeds_danger: bool = True  # False: training reads neither costs nor the hazard
+    # config -> what training knows danger by: the hazard's labels of states, the logged costs alone, or nothing
+    reads: Callable[[Any], Literal["labels", "costs", "nothing"]] = lambda config: "labels"
     revision: int = 1  # raised when the same settings come to train another policy; results tell theirs
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:

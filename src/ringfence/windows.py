@@ -16,6 +16,7 @@ from ringfence import values
 from ringfence.data.store import EpisodeStore
 from ringfence.types import Array, Batch, Key
 
+NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
 MIN_COHORT = 30  # return scores are ranks among at least this many steps
 
 
@@ -68,7 +69,7 @@ class WindowData:
             "rewards": jnp.asarray(store.rewards),  # (T, N)
             "terminated": jnp.asarray(store.terminated),  # (T,)
             "scores": jnp.asarray(scores, jnp.float32),  # (T,)
-            "costs": jnp.asarray(np.insert(store.costs, starts, 0.0), jnp.float32),  # (M,) charged on arriving
+            "costs": jnp.asarray(np.insert(store.costs, starts, NOT_ARRIVED), jnp.float32),  # (M,) charged on arriving
             "row": jnp.asarray(row, jnp.int32),  # (T,) row of the state before the step
             "first_row": jnp.asarray(starts[episode] + episode, jnp.int32),  # (T,)
             "last_row": jnp.asarray(last, jnp.int32),  # (T,)

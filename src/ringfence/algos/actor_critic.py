@@ -6,6 +6,8 @@ its own reward, as in OMAR's study (Pan et al. 2022); with `joint`, Q_i reads ev
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -88,11 +90,20 @@ class Transitions(eqx.Module):
     bootstrap: Array  # (B, 1): 0 after a terminal state, 1 otherwise; the time limit is no end
 
 
-def transitions(batch: Batch, norm: normalise.Normaliser) -> Transitions:
-    """The present step of each window."""
+def in_units(spec: Spec) -> Spec:
+    """The same task with actions in [−1, 1], where weights, noise and searches mean the same in any bounds."""
+    return replace(spec, action_low=-1.0, action_high=1.0)
+
+
+def transitions(batch: Batch, norm: normalise.Normaliser, spec: Spec | None = None) -> Transitions:
+    """The present step of each window; given the spec, actions are told in [−1, 1]. Those bounded so anyway are
+    left as they are, to the last bit."""
+    action = batch.actions[:, 0]
+    if spec is not None and (spec.action_low, spec.action_high) != (-1.0, 1.0):
+        action = 2.0 * (action - spec.action_low) / (spec.action_high - spec.action_low) - 1.0
     x = norm.state(batch.features[:, :2])
     alive = 1.0 - batch.terminated[:, :1].astype(jnp.float32)
-    return Transitions(x[:, 0], batch.actions[:, 0], batch.rewards[:, 0], x[:, 1], alive)
+    return Transitions(x[:, 0], action, batch.rewards[:, 0], x[:, 1], alive)
 
 
 def joint(x: Array) -> Array:
@@ -130,7 +141,8 @@ def act(actor: MLP, x: Array, spec: Spec) -> Array:
 
 
 def fit_states(data: WindowData | None, spec: Spec, key: Key) -> normalise.Normaliser:
-    """Mean and deviation of states; blank without data. It stands for the batch normalisation of OMAR's networks."""
+    """Mean and deviation of states; blank without data. It stands for the batch normalisation of OMAR's networks, and
+    cloning reads states the same way."""
     if data is None:
         one, step = jnp.zeros(spec.feature_dim), jnp.zeros((1, spec.feature_dim))
         return normalise.Normaliser(one, one, step, step, 0, "displacement")

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 
-from ringfence import features, normalise
+from ringfence import features
+from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
 from ringfence.optim import Optimiser, average, fresh
 from ringfence.policies import Direct, squash
 from ringfence.types import Algorithm, Batch, Key, Metrics, PyTree, Spec
-from ringfence.windows import WindowData, at
+from ringfence.windows import WindowData
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Config:
     batch: int = 256  # windows per update
     lr: float = 1e-3  # Adam
     warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm
+    grad_clip: float = 1.0  # global norm; 0: no bound
     ema: float = 0.995  # of the parameters
 
 
@@ -46,27 +46,24 @@ def init(
 ) -> PyTree:
     """Parameters, their averages, optimiser state, the normaliser; without data, zeros stand for its statistics."""
     ka, kw = jax.random.split(key)
-    d = spec.feature_dim
 
     def networks() -> dict:
-        sizes = (d, *[config.width] * config.depth, spec.action_dim)
+        sizes = (spec.feature_dim, *[config.width] * config.depth, spec.action_dim)
         params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
         return fresh(_optimiser(config), params, "ema")
 
-    if data is None:
-        one, step = jnp.zeros(d), jnp.zeros((1, d))
-        norm = normalise.Normaliser(one, one, step, step, 0, "displacement")
-    else:
-        some = jax.random.randint(kw, (min(8192, 4 * data.steps),), 0, data.steps)
-        windows = at(data.arrays, some, 2)
-        norm = normalise.fit(np.asarray(windows.features), np.asarray(windows.valid), 0, "displacement")
-    return jax.jit(networks)() | {"frozen": {"normaliser": norm}}
+    return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     if config.history or config.horizon != 2:
         raise UserError("bc looks at the present state alone; leave history=0 and horizon=2.")
+
+
+def reads(config: Config) -> Literal["costs", "nothing"]:
+    """Costs choose the episodes that are cloned, if anything does."""
+    return "nothing" if config.cost_limit is None else "costs"
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
@@ -86,10 +83,6 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     return update
 
 
-def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
-    return lambda state, batch, key: {}
-
-
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options=None) -> Direct:
     return Direct(state["ema"]["actor"], state["frozen"]["normaliser"], spec, feature_map)
 
@@ -104,14 +97,13 @@ BC = Algorithm(
     check,
     init,
     make_update,
-    make_diagnose,
+    ac.no_diagnosis,
     make_policy,
     {"default": {}, "mujoco": {"steps": 8_000}},
-    heeds_danger=False,
+    reads=reads,
 )
 BC_SAFE = replace(
     BC,
     name="bc-safe",
     presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, "steps": 20_000}},
-    heeds_danger=True,
 )

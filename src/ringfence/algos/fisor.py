@@ -57,7 +57,7 @@ class Config:
     batch: int = 512  # transitions per update
     lr: float = 1e-3  # Adam, cosine decay to a tenth
     warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm, per network
+    grad_clip: float = 1.0  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -69,6 +69,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
             raise UserError(f"{name}={getattr(config, name)} must lie in [0.5, 1); FISOR uses 0.9.")
     if config.candidates < 1:
         raise UserError(f"candidates={config.candidates} must be at least 1.")
+    diffusion.cosine_schedule(config.diffusion_steps)
 
 
 def optimiser(config: Config) -> Optimiser:

@@ -87,7 +87,7 @@ class Config:
     batch: int = 128  # windows per update
     lr: float = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
     warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm, per network
+    grad_clip: float = 1.0  # global norm, per network; 0: no bound
     ema: float = 0.995  # of all parameters; the policy uses the averages
 
 
@@ -227,11 +227,21 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
     if config.horizon < 2:
         raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
+    for low, high in (("snr_floor", "snr_ceiling"), ("barrier_start", "barrier_full")):
+        if getattr(config, low) > getattr(config, high):
+            raise UserError(
+                f"{low}={getattr(config, low)} is above {high}={getattr(config, high)}; lower it or raise {high}."
+            )
     if config.routing == "split" and not config.scaled_margin and config.delta / (1 - config.retention) > 2.0:
         raise UserError(
             f"delta={config.delta} with retention={config.retention} asks a parked agent for h >= "
             f"{config.delta / (1 - config.retention):.3g}; lower one of them or set scaled_margin=True."
         )
+
+
+def reads(config: Config) -> Literal["labels", "nothing"]:
+    """A barrier learns from labelled states; without one, danger matters at run time only."""
+    return "labels" if config.barrier else "nothing"
 
 
 def gradient_depth(text: str) -> tuple[str, int]:
@@ -555,7 +565,9 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 
 
 REVISION = 2  # 1: the scale of the critic that ranks plans was of every other agent's view of states, or of one's
-ICBF = Algorithm("icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, revision=REVISION)
+ICBF = Algorithm(
+    "icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, reads=reads, revision=REVISION
+)
 MADIFF = Algorithm(
     "madiff",
     Config,
@@ -569,6 +581,6 @@ MADIFF = Algorithm(
         "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
-    heeds_danger=False,
+    reads=reads,
     revision=REVISION,
 )

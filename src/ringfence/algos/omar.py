@@ -51,7 +51,7 @@ class Config:
     steps: int = 2_000  # updates
     batch: int = 1024  # transitions per update
     lr: float = 0.01  # Adam, constant
-    grad_clip: float = 0.5  # global norm, per network
+    grad_clip: float = 0.5  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -60,8 +60,14 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("omar learns from single transitions; leave history=0 and horizon=2.")
     if not 0.0 <= config.coefficient <= 1.0:
         raise UserError(f"coefficient={config.coefficient} must lie between 0 (MA-CQL) and 1 (search alone).")
-    if config.search == "elites" and not 0 < config.elites <= config.search_samples:
-        raise UserError(f"elites={config.elites} must be 1 to {config.search_samples}, the samples of a round.")
+    if config.search == "elites" and not 1 < config.elites <= config.search_samples:
+        raise UserError(
+            f"elites={config.elites} must be 2 to {config.search_samples}, the samples of a round: one has no spread."
+        )
+    if config.cql_actions == "policy" and config.cql_noise == 0:
+        raise UserError(
+            "cql_noise=0 gives samples around the policy no density; raise it or use cql_actions='uniform'."
+        )
 
 
 def optimiser(config: Config) -> Optimiser:
@@ -119,6 +125,7 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
     opt = optimiser(config)
+    given, spec = spec, ac.in_units(spec)
     low, high = spec.action_low, spec.action_high
     uniform_density = -spec.action_dim * jnp.log(high - low)
 
@@ -131,7 +138,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         ku, kp, kn, ks = jax.random.split(key, 4)
-        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
         params, target = state["params"], state["target"]
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
             t.ahead, ac.act(target["actor"], t.ahead, spec)
@@ -236,7 +243,7 @@ OMAR = Algorithm(
         **_TIERS,
         "mujoco": _MUJOCO,
     },
-    heeds_danger=False,
+    reads=lambda config: "nothing",
 )
 _CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "steps": 2_000}
 MA_CQL = replace(

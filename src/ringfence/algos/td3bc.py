@@ -1,4 +1,4 @@
-"""MA-TD3BC: TD3 per agent whose actors also imitate (Fujimoto & Gu 2021), and its safe version with a cost critic.
+"""MA-TD3+BC: TD3 per agent whose actors also imitate (Fujimoto & Gu 2021), and its safe version with a cost critic.
 
     L_Q  = Σ_heads E (Q_i(s̃, a) − (r_i + γ min_heads Q̄_i(s̃', π̄_i(s̃'))))²
     L_π  = E −w Q_i(s̃, π_i(s̃)) + ‖π_i(s̃) − a_i‖²,   w = α / E|Q_i|
@@ -14,6 +14,7 @@ size: a return of hundreds would otherwise drown a cost of one, whatever λ.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -50,7 +51,7 @@ class Config:
     steps: int = 2_000  # updates
     batch: int = 1024  # transitions per update
     lr: float = 0.01  # Adam, constant
-    grad_clip: float = 0.5  # global norm, per network
+    grad_clip: float = 0.5  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -61,6 +62,11 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError(f"delay={config.delay} must be at least 1.")
     if config.limit <= 0:
         raise UserError(f"limit={config.limit} must be positive; it is a cost per episode.")
+
+
+def reads(config: Config) -> Literal["costs", "nothing"]:
+    """What cost critics learn from, if there are any."""
+    return "costs" if config.lagrange else "nothing"
 
 
 def optimiser(config: Config) -> Optimiser:
@@ -94,18 +100,21 @@ def init(
 def threshold(config: Config, spec: Spec) -> float:
     """d: what a discounted cost value may be if `limit` is spread evenly over an episode."""
     g, t = config.discount, spec.episode_length
+    if g == 1:  # Σ γ^t / T is then 1
+        return config.limit
     return config.limit * (1 - g**t) / ((1 - g) * t)
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
     opt, allowed = optimiser(config), threshold(config, spec)
+    given, spec = spec, ac.in_units(spec)
 
     def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
         return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        t = ac.transitions(batch, state["frozen"]["normaliser"])
+        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
         params, target = state["params"], state["target"]
         next_action = ac.act(target["actor"], t.ahead, spec)
         if config.target_noise > 0:
@@ -189,7 +198,7 @@ MA_TD3BC = Algorithm(
     ac.no_diagnosis,
     ac.make_policy,
     {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}, "mujoco": _MUJOCO},
-    heeds_danger=False,
+    reads=reads,
 )
 MA_TD3BC_LAG = replace(
     MA_TD3BC,
@@ -197,5 +206,4 @@ MA_TD3BC_LAG = replace(
     presets={
         name: {"lagrange": True, **p} for name, p in MA_TD3BC.presets.items() if name in ("default", "random", "mujoco")
     },
-    heeds_danger=True,
 )

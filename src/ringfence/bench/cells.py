@@ -17,6 +17,7 @@ import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
 from ringfence.bench.suites import EVALUATIONS, SUITES
@@ -49,17 +50,20 @@ class Cell:
         return self.task, self.algorithm, self.preset
 
     @property
+    def config(self) -> Any:
+        algorithm = algos.get(self.algorithm)
+        changes = {**algorithm.presets[self.preset], **dict(self.changes)}
+        return build_config(algorithm.Config, changes, self.algorithm)
+
+    @property
     def id(self) -> str:
-        """Hash of all that training depends on; how the run is played does not count."""
-        task, algorithm = tasks.get(self.task), algos.get(self.algorithm)
-        config = build_config(
-            algorithm.Config, {**algorithm.presets[self.preset], **dict(self.changes)}, self.algorithm
-        )
+        """Hash of what training is told; how the run is played does not count."""
+        task = tasks.get(self.task)
         content = {
             "format": FORMAT,
             "data": [__version__, self.task, self.transitions or task.transitions, hazards.to_dict(task.hazard)],
             "algorithm": self.algorithm,
-            "config": dataclasses.asdict(config),
+            "config": dataclasses.asdict(self.config),
             "seed": self.seed,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
@@ -71,7 +75,7 @@ class Cell:
     def twin(self) -> Cell | None:
         """The same cell on the task that shares this one's data under another definition of danger, if the algorithm
         reads none: it learned the same there."""
-        if algos.get(self.algorithm).heeds_danger:
+        if algos.get(self.algorithm).reads(self.config) != "nothing":
             return None
         other = tasks.twin(self.task)
         return None if other is None else dataclasses.replace(self, task=other)

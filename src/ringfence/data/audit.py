@@ -56,7 +56,7 @@ def audit(store: EpisodeStore) -> Audit:
     except UserError as error:
         warnings.append(f"Nothing can be trained on this: {error}")
         task = None
-    starts, apart = (None, None) if task is None else (_labels(s, task, first), _disagreement(s, task))
+    starts, apart = (None, None) if task is None else (_labels(s, task, first), disagreement(s, task))
     if starts is not None:
         facts["episodes starting unsafe"] = f"{100 * starts.mean():.2f} %"
         facts["cost and hazard disagree"] = f"{100 * apart:.2f} % of steps"
@@ -98,7 +98,7 @@ def _labels(store: EpisodeStore, task: tasks.Task, rows: np.ndarray) -> np.ndarr
     return np.asarray(bound.labels(view(store.observations[rows], state))[0]).any(-1)
 
 
-def _disagreement(store: EpisodeStore, task: tasks.Task) -> float | None:
+def disagreement(store: EpisodeStore, task: tasks.Task) -> float | None:
     """Share of steps (at most a hundred thousand, evenly spread) whose cost is not what the formula says of the state
     that they end in."""
     steps = np.unique(np.linspace(0, store.steps - 1, 100_000).astype(int))
