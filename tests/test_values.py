@@ -43,6 +43,16 @@ def test_critic_learns_what_is_there_to_learn():
     np.testing.assert_allclose(values.values_of(critic, x), np.asarray(g), rtol=1e-5, atol=1e-5)
 
 
+def test_features_are_standardised_by_all_agents_and_all_moments():
+    """Two agents who see other things, 26 rows to an episode, twice as many rows as are looked at."""
+    episodes, rows = 2 * values.STATES // 26, 26
+    speed = np.tile(np.where(np.arange(rows) % 2, 1.0, 0.0), episodes)  # nobody moves at even times
+    x = np.stack([speed, speed + 5.0], 1)[..., None].astype(np.float32)
+    critic = values.fit_critic(jnp.asarray(x), speed, speed, jax.random.key(0), updates=1, batch=4, period=rows)
+    np.testing.assert_allclose(critic["mean"], x.mean((0, 1)), rtol=0.01)
+    np.testing.assert_allclose(critic["scale"], x.std((0, 1)), rtol=0.01)
+
+
 def test_plan_value_sums_rewards_and_the_last_value():
     critic = values.blank_critic(4)
     rows = jax.random.normal(jax.random.key(0), (2, 3, 2, 4))

@@ -7,6 +7,8 @@ the denoiser is conditioned on.
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Literal
 
 import jax
@@ -22,20 +24,25 @@ from ringfence.types import Array, Key
 
 Condition = Literal["advantage", "return"]
 ROWS = 100_000  # states evaluated at once
+STATES = 20_000  # that features are standardised by, or up to twice as many
 WIDTH = 128  # units of each of the critic's 2 hidden layers
 
 
 def fit_critic(
-    features: Array, rewards: Array, togo: Array, key: Key, updates: int = 8000, batch: int = 512
+    features: Array, rewards: Array, togo: Array, key: Key, updates: int = 8000, batch: int = 512, period: int = 1
 ) -> dict[str, Array]:
     """{'net', 'mean', 'scale', 'value'}: regression of (reward on arrival, return-to-go) on states.
 
     features (M, N, D), rewards (M,) of arriving in each row, togo (M,); 'value' (2, 2) holds mean and deviation of
-    both targets. Adam with cosine decay; the loss is the mean squared error of standardised targets.
+    both targets. Adam with cosine decay; the loss is the mean squared error of standardised targets. `period`: rows of
+    an episode, which are not to be in step with the rows that features are standardised by.
     """
     targets = jnp.stack([rewards, togo], -1)
     value = jnp.stack([targets.mean(0), jnp.maximum(targets.std(0), 1e-6)], -1)
-    some = features[:: max(1, len(features) // 20_000)]  # of states, with every agent's view of them
+    # Some states, with every agent's view of them. A stride in step with the episodes would see the same few moments
+    # of all of them, e.g. the start, where everybody rests.
+    stride = next(n for n in itertools.count(max(1, len(features) // STATES)) if math.gcd(n, period) == 1)
+    some = features[::stride]
     flat = np.asarray(some.reshape(-1, features.shape[-1]), np.float64)
     mean = flat.mean(0)
     critic = {

@@ -55,8 +55,9 @@ class WindowData:
                 arrived[row + 1], ahead[row] = team, togo
                 # First rows were not arrived in: they take the reward of their own first step, a fair stand-in.
                 arrived[starts + np.arange(store.episodes)] = team[starts]
+                longest = int(store.lengths.max()) + 1
                 self.critic = values.fit_critic(
-                    x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates
+                    x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates, period=longest
                 )
             if condition == "advantage":
                 value = values.values_of(self.critic, x)
