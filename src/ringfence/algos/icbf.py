@@ -564,7 +564,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     )
 
 
-REVISION = 2  # 1: the scale of the critic that ranks plans was of every other agent's view of states, or of one's
+REVISION = 2  # 1: the scale of the critic that ranks plans missed some agents' views of states, or some moments
 ICBF = Algorithm(
     "icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, reads=reads, revision=REVISION
 )
