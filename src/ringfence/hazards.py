@@ -204,10 +204,11 @@ def _missing(kind: str, name: str, names: tuple[str, ...]) -> UserError:
 
 
 def to_dict(hazard: Hazard) -> dict:
-    """JSON form of a hazard."""
+    """JSON form of a hazard, equal to what is read back from a file: lists, no tuples."""
     if isinstance(hazard, All):
         return {"kind": "All", "hazards": [to_dict(h) for h in hazard.hazards]}
-    return {"kind": type(hazard).__name__, **dataclasses.asdict(hazard)}
+    fields = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(hazard).items()}
+    return {"kind": type(hazard).__name__, **fields}
 
 
 def from_dict(data: dict) -> Hazard:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import equinox as eqx
@@ -63,16 +62,11 @@ def there(task: Task, out: str | Path, episodes: int, transitions: int | None = 
     if not all(complete(r, task) for r in known.values()):
         return False
     card = known.get("behaviour data", {}).get("data", {})
-    if known.get("do-nothing", {}).get("episodes") != episodes or card.get("hazard") != _plain(task.hazard):
+    if known.get("do-nothing", {}).get("episodes") != episodes or card.get("hazard") != hazards.to_dict(task.hazard):
         return False
     wanted = task.transitions if transitions is None else transitions
     # A card without the size that was asked for tells that of its whole episodes.
     return card.get("size") == wanted or ("size" not in card and wanted <= card.get("transitions", 0) < 1.01 * wanted)
-
-
-def _plain(hazard: hazards.Hazard) -> dict:
-    """As a card has it."""
-    return json.loads(json.dumps(hazards.to_dict(hazard)))
 
 
 def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import warnings
 from dataclasses import replace
@@ -60,7 +59,7 @@ def make(
     if isinstance(env, SimpleSpread):
         card |= {"integrator": env.integrator, "reward": env.reward}
     if not fresh and not out and (kept := _usable(path, card)) is not None:
-        if kept.card["hazard"] == json.loads(json.dumps(danger)):  # or else the name has come to mean something else
+        if kept.card["hazard"] == danger:  # or else the name has come to mean something else
             return kept, path
     if isinstance(env, SimpleSpread):
         store = _spread(task, transitions, seed, card)

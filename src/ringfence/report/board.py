@@ -67,6 +67,7 @@ class Entry:
     summary: dict  # as evaluate.summarise makes it
     path: Path  # the run folder
     method: Method
+    revision: int  # of the algorithm that trained it
 
 
 @dataclass(frozen=True)
@@ -272,7 +273,7 @@ def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entr
             if told["preset"] != preset:
                 shown = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)
             method = Method(algorithm, preset, shown, words)
-            entry = Entry(task, algorithm, variant, seed, summary, run.path, method)
+            entry = Entry(task, algorithm, variant, seed, summary, run.path, method, told.get("revision", 1))
             other = entries.setdefault((task, method, seed), entry)
             if other is not entry:
                 raise UserError(

@@ -122,9 +122,8 @@ def _older(tables: dict[str, list[Standing]]) -> list[tuple[str, str, list[int]]
     found = []
     for task, rows in tables.items():
         for r in rows:
-            told = {e.seed: Run(e.path).config.get("revision", 1) for e in r.entries}
             now = ALGORITHMS[r.method.algorithm].revision if r.method.algorithm in ALGORITHMS else 1
-            if seeds := [seed for seed, revision in told.items() if revision < now]:
+            if seeds := [e.seed for e in r.entries if e.revision < now]:
                 found.append((task, r.label, seeds))
     return found
 
