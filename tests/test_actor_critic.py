@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,6 +134,55 @@ def test_threshold_of_the_multiplier():
     expected = 3.0 / 25 * sum(0.95**t for t in range(25))
     assert td3bc.threshold(config, SPEC) == pytest.approx(expected)
     assert td3bc.threshold(td3bc.Config(limit=3.0, discount=1.0), SPEC) == 3.0
+
+
+def one_lesson(cost: float, charged: tuple[float, ...], multiplier: float = 1.0) -> tuple[dict, dict]:
+    """(state before, state after) one update of a Lagrangian learner whose cost critics say `cost` of everything,
+    on steps whose present state was arrived in at a charge of `charged` each."""
+    # The critics stand still, so that only actors and multipliers move.
+    config, b = td3bc.Config(lagrange=True, width=4, batch=4, lr=0.0, limit=1.0, multiplier_rate=0.5), len(charged)
+    k = jax.random.split(jax.random.key(0), 3)
+    state = td3bc.init(k[0], SPEC, config, None, None, None)
+    blank = jax.tree.map(jnp.zeros_like, state["params"]["cost"])
+    said = eqx.tree_at(lambda c: c.out_bias, blank, jnp.full_like(blank.out_bias, cost))
+    state["params"]["cost"] = state["target"]["cost"] = said
+    plain = Normaliser(jnp.zeros(3), jnp.ones(3), jnp.zeros((1, 3)), jnp.ones((1, 3)), 0, "displacement")
+    state |= {"frozen": {"normaliser": plain}, "multiplier": jnp.full(2, multiplier)}
+    costs = jnp.stack([jnp.asarray(charged), jnp.zeros(b)], 1)
+    batch = Batch(
+        jax.random.normal(k[1], (b, 2, 2, 3)),
+        jax.random.uniform(k[2], (b, 1, 2, 2), minval=-1.0),
+        jnp.ones((b, 2), bool),
+        jnp.zeros(b),
+        costs,
+        jnp.ones((b, 1, 2)),
+        jnp.zeros((b, 1), bool),
+    )
+    return state, td3bc.make_update(config, SPEC, None, None)(state, batch, k[0])
+
+
+def test_the_multiplier_hears_of_states_where_nothing_was_charged():
+    """λ moves by η (C/d − 1), read on calm and on first states; a log that is in danger throughout says nothing."""
+    allowed = td3bc.threshold(td3bc.Config(limit=1.0), SPEC)
+    for cost, charged, expected in (
+        (3 * allowed, (0.0, -1.0, 0.0, 0.0), 1.0 + 0.5 * 2),
+        (3 * allowed, (0.0, 1.0, 1.0, 1.0), 1.0 + 0.5 * 2),
+        (3 * allowed, (1.0, 1.0, 1.0, 1.0), 1.0),
+        (-3 * allowed, (0.0, 0.0, 0.0, 0.0), 1.0 - 0.5),  # a cost is never negative
+    ):
+        _, (after, metrics) = one_lesson(cost, charged)
+        np.testing.assert_allclose(after["multiplier"], expected, rtol=1e-5)
+    # λ is bounded from both sides
+    assert float(one_lesson(1e4, (0.0,))[1][0]["multiplier"].max()) == td3bc.Config().multiplier_max
+    assert float(one_lesson(0.0, (0.0,), 0.1)[1][0]["multiplier"].min()) == 0.0
+
+
+def test_targets_of_costs_are_not_negative():
+    """The cost critic's goal bootstraps through max(C, 0)."""
+    for cost, later in ((-2.0, 0.0), (2.0, 2.0)):
+        _, (_, metrics) = one_lesson(cost, (0.0, 0.0, 0.0))
+        error = (cost - 0.95 * later) ** 2  # nothing charged: the goal is γ max(C', 0)
+        np.testing.assert_allclose(metrics["loss/cost"], 2 * 2 * error, rtol=1e-5)  # agents, heads
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import values
+from ringfence import features, values
 
 
 def test_advantages_match_their_definition():
@@ -51,6 +51,22 @@ def test_features_are_standardised_by_all_agents_and_all_moments():
     critic = values.fit_critic(jnp.asarray(x), speed, speed, jax.random.key(0), updates=1, batch=4, period=rows)
     np.testing.assert_allclose(critic["mean"], x.mean((0, 1)), rtol=0.01)
     np.testing.assert_allclose(critic["scale"], x.std((0, 1)), rtol=0.01)
+
+
+def test_entries_are_read_by_their_weight():
+    """An entry of weight w moves the critic w times as much; Simple Spread's velocities are read at a quarter."""
+    x = jax.random.normal(jax.random.key(0), (400, 2, 3)) * jnp.asarray([1.0, 2.0, 5.0])
+    target = x[..., 0].mean(-1)
+    plain, weighed = (
+        values.fit_critic(x, target, target, jax.random.key(0), 1, 4, weight=w) for w in (None, (1, 0.5, 0))
+    )
+    np.testing.assert_allclose(weighed["scale"], plain["scale"] * jnp.asarray([1.0, 2.0, jnp.inf]), rtol=1e-6)
+    r, _ = values.state_values(weighed, x)
+    again, _ = values.state_values(weighed, x.at[..., 2].set(0.0))
+    np.testing.assert_array_equal(r, again)
+    view = features.simple_spread("pruned", 3)
+    weights = dict(zip(view.names, view.critic_weight))
+    assert weights["own.vx"] == weights["other1.dvy"] == 0.25 and weights["own.x"] == weights["landmark0.dx"] == 1.0
 
 
 def test_plan_value_sums_rewards_and_the_last_value():

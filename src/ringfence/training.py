@@ -197,7 +197,8 @@ def windows_of(
     used = data if cost_limit is None else data.select(within(data.episode_costs, cost_limit))
     about = (data, task.name, view, cost_limit, discount, updates)
     critic = _last_critic.get(about)
-    windows = WindowData(used, task.feature_map(view, data), discount, condition, horizon, updates, critic)
+    seen = task.feature_map(view, data)
+    windows = WindowData(used, seen, discount, condition, horizon, updates, critic, seen.critic_weight)
     if windows.critic is not None:
         _last_critic.clear()
         _last_critic[about] = windows.critic

@@ -29,13 +29,21 @@ WIDTH = 128  # units of each of the critic's 2 hidden layers
 
 
 def fit_critic(
-    features: Array, rewards: Array, togo: Array, key: Key, updates: int = 8000, batch: int = 512, period: int = 1
+    features: Array,
+    rewards: Array,
+    togo: Array,
+    key: Key,
+    updates: int = 8000,
+    batch: int = 512,
+    period: int = 1,
+    weight: tuple[float, ...] | None = None,
 ) -> dict[str, Array]:
     """{'net', 'mean', 'scale', 'value'}: regression of (reward on arrival, return-to-go) on states.
 
     features (M, N, D), rewards (M,) of arriving in each row, togo (M,); 'value' (2, 2) holds mean and deviation of
     both targets. Adam with cosine decay; the loss is the mean squared error of standardised targets. `period`: rows of
-    an episode, which are not to be in step with the rows that features are standardised by.
+    an episode, which are not to be in step with the rows that features are standardised by. `weight` (D): how strongly
+    the standardised entries are read.
     """
     targets = jnp.stack([rewards, togo], -1)
     value = jnp.stack([targets.mean(0), jnp.maximum(targets.std(0), 1e-6)], -1)
@@ -45,10 +53,12 @@ def fit_critic(
     some = features[::stride]
     flat = np.asarray(some.reshape(-1, features.shape[-1]), np.float64)
     mean = flat.mean(0)
+    with np.errstate(divide="ignore"):  # what has no weight is not read
+        scale = varying(flat.std(0), mean) / (1.0 if weight is None else np.asarray(weight))
     critic = {
         "net": MLP(key, (features.shape[-1], WIDTH, WIDTH, 2)),
         "mean": jnp.asarray(mean, jnp.float32),
-        "scale": jnp.asarray(varying(flat.std(0), mean), jnp.float32),
+        "scale": jnp.asarray(scale, jnp.float32),
         "value": value,
     }
     adam = optax.adam(optax.cosine_decay_schedule(4e-3, updates, 0.02))

@@ -37,6 +37,7 @@ class WindowData:
         horizon: int = 2,
         updates: int = 8000,
         critic: dict[str, Array] | None = None,
+        critic_weight: tuple[float, ...] | None = None,
     ):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
@@ -55,9 +56,10 @@ class WindowData:
                 arrived[row + 1], ahead[row] = team, togo
                 # First rows were not arrived in: they take the reward of their own first step, a fair stand-in.
                 arrived[starts + np.arange(store.episodes)] = team[starts]
+                arrived, ahead = jnp.asarray(arrived), jnp.asarray(ahead)
                 longest = int(store.lengths.max()) + 1
                 self.critic = values.fit_critic(
-                    x, jnp.asarray(arrived), jnp.asarray(ahead), jax.random.key(0), updates=updates, period=longest
+                    x, arrived, ahead, jax.random.key(0), updates=updates, period=longest, weight=critic_weight
                 )
             if condition == "advantage":
                 value = values.values_of(self.critic, x)

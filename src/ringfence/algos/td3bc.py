@@ -3,12 +3,14 @@
     L_Q  = Σ_heads E (Q_i(s̃, a) − (r_i + γ min_heads Q̄_i(s̃', π̄_i(s̃'))))²
     L_π  = E −w Q_i(s̃, π_i(s̃)) + ‖π_i(s̃) − a_i‖²,   w = α / E|Q_i|
 
-`ma-td3bc-lag` adds cost critics C_i, which learn the shared cost in the same way, and a multiplier λ ≥ 0:
+`ma-td3bc-lag` adds cost critics C_i ≥ 0, which learn the shared cost in the same way, and a multiplier λ ≥ 0:
 
-    L_π  = E −α (Q_i/E|Q_i| − λ C_i/E|C_i|)/(1 + λ) + ‖π_i − a_i‖²,   λ ← [λ + η (E C_i(s̃, π(s̃))/d − 1)]₊
+    L_π  = E −α (Q_i/E|Q_i| − λ C_i/max(E|C_i|, d))/(1 + λ) + ‖π_i − a_i‖²,   λ ← [λ + η (E' C_i(s̃, π(s̃))/d − 1)]₊
 
 with d the discounted form of the limit per episode, l (1 − γ^T) / ((1 − γ) T). Both values are divided by their own
-size: a return of hundreds would otherwise drown a cost of one, whatever λ.
+size: a return of hundreds would otherwise drown a cost of one, whatever λ. A cost below what is allowed is divided by
+that instead, so the penalty fades as the limit is met and λ has a level to settle at. E' is over logged states in
+which nothing was charged: those of a log that breaks the limit throughout are not where a policy that keeps it goes.
 """
 
 from __future__ import annotations
@@ -128,7 +130,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             error = ((p["critic"](*here) - goal[:, None]) ** 2).mean(2).sum()
             metrics = {"loss/critic": error}
             if config.lagrange:
-                cost = batch.costs[:, 1][None] + config.discount * t.bootstrap.T * target["cost"](*there).max(1)
+                later = jax.nn.relu(target["cost"](*there).max(1))
+                cost = batch.costs[:, 1][None] + config.discount * t.bootstrap.T * later
                 metrics["loss/cost"] = ((p["cost"](*here) - cost[:, None]) ** 2).mean(2).sum()
             return sum(metrics.values()), metrics
 
@@ -148,9 +151,10 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             size = lambda v: jax.lax.stop_gradient(jnp.abs(v).mean(1, keepdims=True))  # noqa: E731
             merit, excess = q / size(q), jnp.zeros(spec.n_agents)
             if config.lagrange:
-                c = jnp.maximum(*jnp.moveaxis(critics["cost"](x, acted), 1, 0))
-                merit = (merit - scale[:, None] * c / jnp.maximum(size(c), 1e-6)) / (1.0 + scale[:, None])
-                excess = c.mean(1) / allowed - 1.0
+                c = jax.nn.relu(critics["cost"](x, acted).max(1))  # (N, B)
+                merit = (merit - scale[:, None] * c / jnp.maximum(size(c), allowed)) / (1.0 + scale[:, None])
+                calm = batch.costs[:, 0] <= 0  # a first state was not arrived in, so nothing was charged there
+                excess = jnp.where(calm, c / allowed - 1.0, 0.0).sum(1) / jnp.maximum(calm.sum(), 1)
             imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
             penalty = (own**2).mean((0, 2)).sum()
             loss = imitation - config.alpha * merit.mean(1).sum() + config.action_penalty * penalty
@@ -203,7 +207,10 @@ MA_TD3BC = Algorithm(
 MA_TD3BC_LAG = replace(
     MA_TD3BC,
     name="ma-td3bc-lag",
+    # 1: costs could be negative, the penalty had the same size at the limit as far above it, λ was read on all states
+    revision=2,
     presets={
-        name: {"lagrange": True, **p} for name, p in MA_TD3BC.presets.items() if name in ("default", "random", "mujoco")
+        name: {"lagrange": True, "multiplier_max": 10.0, **MA_TD3BC.presets[name]}
+        for name in ("default", "random", "mujoco")
     },
 )
