@@ -70,7 +70,7 @@ STUDIES = {
             ("bc", ""): [{"width": 256}, {"steps": 8_000}, {"lr": 3e-4, "steps": 8_000}],
             ("bc-safe", ""): [{"cost_limit": 0.5}, {"cost_limit": 2.0}, {"steps": 8_000}],
             ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"centralised_critic": True}],
-            ("ma-td3bc-lag", ""): [{"multiplier_rate": 0.1}, {"alpha": 10.0}, {"alpha": 10.0, "multiplier_rate": 0.1}],
+            ("ma-td3bc-lag", ""): [{"multiplier_max": 3.0}, {"multiplier_max": 30.0}, {"alpha": 10.0}],
             ("fisor", ""): [{"temperature_reward": 1.0}, {"expectile_danger": 0.7}, {"discount": 0.95}],
             # the study's learning rate first: its actors saturate, which is why the preset is another
             ("ma-cql", ""): [
@@ -108,9 +108,9 @@ STUDIES = {
             # the last of each: targets that follow fast enough for so few updates
             ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"steps": 20_000}, {"target_rate": 0.05}],
             ("ma-td3bc-lag", ""): [
-                {"multiplier_rate": 0.1},
+                {"multiplier_max": 3.0},
+                {"multiplier_max": 30.0},
                 {"alpha": 5.0},
-                {"steps": 20_000},
                 {"target_rate": 0.05},
             ],
             ("fisor", ""): [
