@@ -423,9 +423,9 @@ def bench(
         algorithms: these alone, as algorithm or algorithm:preset.
         steps: updates of every algorithm, for a quick trial.
         engine: processes on this machine, or Ray tasks.
-        workers: processes; one per `threads` cores by default.
+        workers: local processes; one per `threads` cores by default.
         threads: per worker or Ray task.
-        memory: GiB that a worker may hold before it is stopped.
+        memory: GiB that a local process may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
     from ringfence.bench import make_grid, paper
@@ -461,6 +461,9 @@ def bench(
 def _run_grid(grid, engine: str, workers: int | None, threads: int, memory: float | None, address: str | None) -> dict:
     """Cells by state after the run."""
     if engine == "ray":
+        for name, value in (("workers", workers), ("memory", memory)):
+            if value is not None:
+                raise UserError(f"--{name} is about local processes, Ray divides its cluster itself; leave it out.")
         from ringfence.bench.cluster import run_ray
 
         return run_ray(grid, address=address, threads=threads)

@@ -114,7 +114,7 @@ def _seeds(tables: dict[str, list[Standing]]) -> str:
     if low == high:
         return f"{high} seed{'s' * (high > 1)}"
     most = max(set(counts), key=counts.count)
-    return f"{low} to {high} seeds ({counts.count(most)} of {len(counts)} rows of {most})"
+    return f"{low} to {high} seeds, {counts.count(most)} of {len(counts)} rows with {most}"
 
 
 def _older(tables: dict[str, list[Standing]]) -> list[tuple[str, str, list[int]]]:
