@@ -10,10 +10,11 @@ is steered by it. What is in the file is not made again.
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import tempfile
 from pathlib import Path
+
+from _rows import append, measured, read
 
 from ringfence import evaluate, tasks, training
 from ringfence.data.make import make
@@ -49,10 +50,7 @@ def rows_of(tier: str, weights: list[float]):
             "planner": "guarded",
             "split": "validation",
             "episodes": EPISODES,
-            "return": round(r["return_mean"], 2),
-            "return_norm": round(r["return_norm"], 4),
-            "cost": round(r["cost_mean"], 4),
-            "avoidable_cost": round(r["avoidable_cost"], 4),
+            **measured(r),
         }
 
 
@@ -60,17 +58,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--tiers", nargs="*", choices=TIERS, default=list(TIERS))
     a = parser.parse_args()
-    there = list(csv.DictReader(OUT.open())) if OUT.exists() else []
-    done = {(r["task"], float(r["weight"])) for r in there}
+    done = {(r["task"], float(r["weight"])) for r in read(OUT)}
     for tier in a.tiers:
         left = [w for w in WEIGHTS if (f"simple_spread-{tier}", w) not in done]
         for row in rows_of(tier, left) if left else ():
-            fresh = not OUT.exists()
-            with OUT.open("a", newline="") as file:
-                writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-                if fresh:
-                    writer.writeheader()
-                writer.writerow(row)
+            append(OUT, row, FIELDS)
             print(*(f"{k}={row[k]}" for k in ("task", "weight", "return", "return_norm", "cost")), flush=True)
 
 

@@ -16,7 +16,6 @@ return, then the others, by lower cost. On robots planners are played shielded.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import multiprocessing
 import os
@@ -25,6 +24,8 @@ import time
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from _rows import append, measured, read
 
 ROOT = Path(__file__).resolve().parent.parent / "results" / "tuning"
 SEED = 100
@@ -166,10 +167,7 @@ def one(job: tuple) -> dict:
         "seed": SEED,
         "split": r["split"],
         "episodes": r["episodes"],
-        "return": round(r["return_mean"], 2),
-        "return_norm": round(r["return_norm"], 4),
-        "cost": round(r["cost_mean"], 4),
-        "avoidable_cost": round(r["avoidable_cost"], 4),
+        **measured(r),
         "train_seconds": round(seconds, 1),
     }
 
@@ -178,10 +176,6 @@ def pin(cores) -> None:
     """Give a worker one core of its own: small networks gain nothing from more."""
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {cores.get()})
-
-
-def rows_of(file: Path) -> list[dict]:
-    return list(csv.DictReader(file.open())) if file.exists() else []
 
 
 def ranked(study: Study, rows: list[dict]) -> dict[tuple, list[dict]]:
@@ -207,7 +201,7 @@ def main() -> None:
     a = parser.parse_args()
     study = STUDIES[a.study]
     out = ROOT / study.file
-    done = {(r["algorithm"], r["preset"], int(r["setting"]), r["task"]) for r in rows_of(out)}
+    done = {(r["algorithm"], r["preset"], int(r["setting"]), r["task"]) for r in read(out)}
     if not a.summary:
         jobs = [
             (name, preset, number, changes, task, study.episodes, study.planner)
@@ -222,18 +216,12 @@ def main() -> None:
         queue = spawn.Queue()
         for core in cores:
             queue.put(core)
-        out.parent.mkdir(parents=True, exist_ok=True)
         with ProcessPoolExecutor(len(cores), spawn, pin, (queue,)) as pool:
             for future in as_completed([pool.submit(one, job) for job in jobs]):
                 row = future.result()
-                fresh = not out.exists()
-                with out.open("a", newline="") as file:
-                    writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
-                    if fresh:
-                        writer.writeheader()
-                    writer.writerow(row)
+                append(out, row, FIELDS)
                 print(*(f"{k}={row[k]}" for k in FIELDS[:4] + FIELDS[4:5] + FIELDS[8:]), flush=True)
-    for (name, preset), rows in ranked(study, rows_of(out)).items():
+    for (name, preset), rows in ranked(study, read(out)).items():
         print(f"\n{name} {preset}")
         for r in rows:
             print(f"  setting {r['setting']} {r['changes']}  return {r['return']}, cost {r['cost']}")

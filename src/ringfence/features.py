@@ -71,7 +71,7 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         table = np.tile(np.arange(len(names)), (n, 1))
         agree = _reconcile_relative(tuple(names), n)
         return FeatureMap(
-            view, tuple(names), "observations", table, np.full_like(table, -1), OWN, agree, critic_weight=_slow(names)
+            view, tuple(names), "observations", table, np.full_like(table, -1), OWN, agree, critic_weight=_worth(names)
         )
     position = np.arange(2 * n).reshape(n, 2)
     velocity, landmark = position + 2 * n, position + 4 * n
@@ -79,7 +79,7 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
         names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
         table = np.tile(np.arange(6 * n), (n, 1))
-        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), critic_weight=_slow(names))
+        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), critic_weight=_worth(names))
     if view != "pruned":
         raise unknown("view", view, VIEWS)
     names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
@@ -94,11 +94,11 @@ def simple_spread(view: str, n_agents: int) -> FeatureMap:
         minus.append(m)
     agree = _reconcile_relative(tuple(names), n)
     return FeatureMap(
-        view, tuple(names), "state", np.array(plus), np.array(minus), OWN, agree, critic_weight=_slow(names)
+        view, tuple(names), "state", np.array(plus), np.array(minus), OWN, agree, critic_weight=_worth(names)
     )
 
 
-def _slow(names: list[str]) -> tuple[float, ...]:
+def _worth(names: list[str]) -> tuple[float, ...]:
     """A quarter for velocities. The reward is about positions, but a plan's velocities vary more than its positions
     do, in deviations: a critic that hears both alike steers plans to speeds that their positions do not follow."""
     return tuple(0.25 if name.split(".")[1].lstrip("d")[0] == "v" else 1.0 for name in names)

@@ -75,9 +75,10 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
-    hazard = _bound(task.hazard, spec, a.reads(config))
+    reads = a.reads(config)
+    hazard = _bound(task.hazard, spec, reads)
     a.check(config, hazard)
-    if store is not None and a.reads(config) == "costs":
+    if store is not None and reads == "costs":
         _refuse_blank_costs(a.name, task, store)
     return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
 

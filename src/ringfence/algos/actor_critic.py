@@ -90,6 +90,11 @@ class Transitions(eqx.Module):
     bootstrap: Array  # (B, 1): 0 after a terminal state, 1 otherwise; the time limit is no end
 
 
+def to_unit(action: Array, spec: Spec) -> Array:
+    """Actions of the task's bounds, told in [−1, 1]."""
+    return 2.0 * (action - spec.action_low) / (spec.action_high - spec.action_low) - 1.0
+
+
 def in_units(spec: Spec) -> Spec:
     """The same task with actions in [−1, 1], where weights, noise and searches mean the same in any bounds."""
     return replace(spec, action_low=-1.0, action_high=1.0)
@@ -100,7 +105,7 @@ def transitions(batch: Batch, norm: normalise.Normaliser, spec: Spec | None = No
     left as they are, to the last bit."""
     action = batch.actions[:, 0]
     if spec is not None and (spec.action_low, spec.action_high) != (-1.0, 1.0):
-        action = 2.0 * (action - spec.action_low) / (spec.action_high - spec.action_low) - 1.0
+        action = to_unit(action, spec)
     x = norm.state(batch.features[:, :2])
     alive = 1.0 - batch.terminated[:, :1].astype(jnp.float32)
     return Transitions(x[:, 0], action, batch.rewards[:, 0], x[:, 1], alive)

@@ -114,10 +114,6 @@ def proposed(actor: MLP, x: Array, noisy: Array, k: Array) -> Array:
     return actor(jnp.concatenate([x, noisy, level], -1))
 
 
-def to_unit(action: Array, spec: Spec) -> Array:
-    return 2.0 * (action - spec.action_low) / (spec.action_high - spec.action_low) - 1.0
-
-
 def from_unit(x: Array, spec: Spec) -> Array:
     return spec.action_low + (jnp.clip(x, -1.0, 1.0) + 1.0) / 2.0 * (spec.action_high - spec.action_low)
 
@@ -153,7 +149,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             better = jnp.exp(config.temperature_reward * (q_reward - v_reward)) * (q_danger <= 0)
             safer = jnp.exp(-config.temperature_danger * (q_danger - v_danger))
             weight = jax.lax.stop_gradient(jnp.minimum(jnp.where(feasible, better, safer), WEIGHT_MAX)).T
-            clean = to_unit(t.action, spec)
+            clean = ac.to_unit(t.action, spec)
             noised = diffusion.add_noise(clean, jnp.zeros(clean.shape, bool), jnp.asarray(alpha_bar), key)
             error = ((proposed(p["actor"], t.x, noised.x, noised.k) - clean) ** 2).sum(-1)
             losses["loss/actor"] = (weight * error).mean(0).sum()

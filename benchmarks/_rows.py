@@ -1,0 +1,34 @@
+"""Tables of trials that grow row by row, so that nothing is lost when a study is cut short. Imports nothing heavy:
+workers are pinned to a core before they start JAX."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    """All rows, none if there is no file yet."""
+    return list(csv.DictReader(file.open())) if file.exists() else []
+
+
+def append(file: Path, row: dict[str, Any], fields: tuple[str, ...]) -> None:
+    """Add a row; a new file begins with the names of its fields."""
+    fresh = not file.exists()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("a", newline="") as f:
+        writer = csv.DictWriter(f, fields, lineterminator="\n")
+        if fresh:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def measured(r: dict[str, Any]) -> dict[str, float]:
+    """What a table keeps of an evaluation."""
+    return {
+        "return": round(r["return_mean"], 2),
+        "return_norm": round(r["return_norm"], 4),
+        "cost": round(r["cost_mean"], 4),
+        "avoidable_cost": round(r["avoidable_cost"], 4),
+    }
