@@ -63,10 +63,12 @@ ROBOT_ROWS = (
     ("madiff", "mujoco", "MADIFF (no barrier)"),
     ("madiff", "mujoco+steady", "MADIFF, steady"),
     ("madiff", "mujoco+shielded", "MADIFF, shielded"),
+    ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
     ("icbf", "mujoco-paper", "ICBF-Diffuser `paper`"),
     ("icbf", "mujoco", "ICBF-Diffuser `split`"),
     ("icbf", "mujoco+steady", "`split`, steady"),
-    ("icbf", "mujoco+shielded", "**`split`, shielded**"),
+    ("icbf", "mujoco+shielded", "`split`, shielded"),
+    ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
 )
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.
@@ -148,8 +150,7 @@ def robots(groups: dict, ending: str) -> str:
         return "No results yet."
     lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
     for algorithm, variant, label in ROBOT_ROWS:
-        bound = variant.replace("mujoco", "mujoco-quantile", 1)  # preset of whoever has one for the quantile limits
-        found = [groups.get((n, algorithm, variant)) or groups.get((n, algorithm, bound), []) for n in names]
+        found = [groups.get((n, algorithm, variant), []) for n in names]
         if any(found):
             cells = (cell(rows, "cost_mean", 1) if rows else absent(variant) for rows in found)
             lines.append(f"| {label} | " + " | ".join(cells) + " |")

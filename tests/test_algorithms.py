@@ -249,6 +249,52 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(trained):
         evaluate.load(trained["icbf"], shield=3, replan=2)
 
 
+def test_an_adapting_margin_settles_at_its_rate(trained):
+    """However wrong foresight is, the share of unsafe states tends to the chosen one (Gibbs and Candès 2021)."""
+    _, policy = evaluate.load(trained["icbf"], margin=0.0, shield=1, adapt=0.2, rate=0.05)
+    told = dataclasses.replace(policy.hazard, clearance=lambda x: x[..., 0])
+    policy = dataclasses.replace(policy, hazard=told)
+    wrong = jnp.asarray([0.0, 0.01, 0.05])  # m that foresight is off by, and tenfold in every hundredth state
+
+    def step(margin, key):
+        more, now = jax.random.split(key)
+        error = wrong * jnp.abs(jax.random.normal(now, (3,))) * (1 + 9 * (jax.random.uniform(more, (3,)) < 0.01))
+        present = jnp.broadcast_to((margin - error)[:, None, None], (3, 3, 1))  # the shield keeps what it foresees
+        return policy.adapted(margin, present), (margin, present[:, 0, 0] < 0)
+
+    _, (margins, unsafe) = jax.lax.scan(step, jnp.full(3, 0.1), jax.random.split(jax.random.key(0), 8000))
+    np.testing.assert_allclose(unsafe[2000:].mean(0)[1:], 0.05, atol=0.01)
+    kept = margins[2000:].mean(0)
+    assert kept[0] < 1e-6 < 0.01 < kept[1] < 0.05 < kept[2]  # no more is kept than the errors ask for
+    assert float(policy.adapted(jnp.full(1, 0.2249), jnp.full((1, 3, 1), -1.0))[0]) == pytest.approx(
+        3 * 0.075
+    )  # bounded
+
+
+def test_a_margin_moves_only_where_it_should(trained, small_store):
+    seen, state = small_store.observations[None, 0], small_store.state[None, 0]
+    options = {"steps": 2, "shield": 2, "margin": 0.02}
+    _, fixed = evaluate.load(trained["icbf"], **options)
+    _, moving = evaluate.load(trained["icbf"], **options, adapt=0.2)
+    kept, plain = fixed.act(fixed.start(1), seen, state, jax.random.key(0))
+    memory, first = moving.act(moving.start(1), seen, state, jax.random.key(0))
+    np.testing.assert_array_equal(first.action, plain.action)  # nobody chose the first state
+    assert float(memory["margin"][0]) == float(kept["margin"][0]) == np.float32(0.02)
+    memory, _ = moving.act(memory, seen, state, jax.random.key(1))
+    kept, _ = fixed.act(kept, seen, state, jax.random.key(1))
+    unsafe = float(moving.hazard.clearance(moving.feature_map(seen, state)).min()) < 0
+    assert float(kept["margin"][0]) == np.float32(0.02)
+    assert float(memory["margin"][0]) == pytest.approx(0.02 + 0.2 * 0.075 * (unsafe - 0.0125))
+    for wrong, said in (
+        ({"adapt": 0.1, "shield": 1, "select": "barrier"}, "adapt=0.1 reads the clearance"),
+        ({"adapt": 0.1}, "a margin that nothing reads"),
+        ({"adapt": -0.1, "shield": 1}, "must not be negative"),
+        ({"adapt": 0.1, "shield": 1, "rate": 1.5}, "rate=1.5 must be a share"),
+    ):
+        with pytest.raises(UserError, match=said):
+            evaluate.load(trained["icbf"], **wrong)
+
+
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])
 def test_views(small_store, tmp_path, view, execution):
     changes = {**TINY["madiff"], "view": view, "steps": 2, "observe": "mixed"}

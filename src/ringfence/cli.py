@@ -217,7 +217,7 @@ def evaluate(
     split: Literal["test", "validation"] = "test",
     record: int = 4,
     step: int | None = None,
-    planner: Literal["plain", "guarded", "steady", "shielded"] = "plain",
+    planner: Literal["plain", "guarded", "steady", "shielded", "adaptive"] = "plain",
     plans: int | None = None,
     steps: int | None = None,
     sampler: str | None = None,
@@ -240,8 +240,8 @@ def evaluate(
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
         step: of the checkpoint that is played; the last one by default.
-        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one; steady and shielded
-            are for robots.
+        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one; steady, shielded
+            and adaptive are for robots.
         plans: drawn per step; the best safe one is followed.
         steps: of the sampler.
         sampler: ddim, ddpm or dpm++.

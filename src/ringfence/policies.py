@@ -26,6 +26,7 @@ from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.values import plan_value
 
+MAX_MARGIN = 3.0  # of an adapting margin, in the hazard's safe margins
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
@@ -45,6 +46,8 @@ class PlanOptions:
     select: Literal["clearance", "barrier", "both"] = "clearance"  # what a plan's safety is judged by
     margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
     share: float = 0.0  # of the hazard's own safe margin that is added to the margin: the same for every speed limit
+    adapt: float = 0.0  # the margin's step after an unsafe state, in the hazard's safe margins; 0: it stays
+    rate: float = 0.0125  # share of unsafe states at which an adapting margin settles: half of 25 in 1000
     prefix: int = 3  # rows of the plan that are judged
     shield: int = 0  # rounds that correct the actions which forward dynamics finds unsafe; 0: act as planned
     foresight: bool = True  # judge plans by where forward dynamics says they lead, not by what they say
@@ -58,14 +61,23 @@ class PlanOptions:
                 raise UserError(f"{name}={getattr(self, name)} must be at least {bound}.")
         if self.select not in ("clearance", "barrier", "both"):
             raise UserError(f"select='{self.select}' is unknown; choose clearance, barrier or both.")
-        for name in ("temperature", "ascent", "repair", "persist", "share"):
+        for name in ("temperature", "ascent", "repair", "persist", "share", "adapt"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if not 0 < self.rate < 1:
+            raise UserError(f"rate={self.rate} must be a share of states between 0 and 1.")
         if self.share > 0 and self.select != "clearance":
             raise UserError(
                 f"share={self.share} of a margin in m or m/s means nothing to select='{self.select}', as a barrier has "
                 "no unit; set share=0 or select='clearance'."
             )
+        if self.adapt and (self.select != "clearance" or self.execution == "decentralized"):
+            raise UserError(
+                f"adapt={self.adapt} reads the clearance of the whole team; use select='clearance' and "
+                "execution='centralized', or set adapt=0."
+            )
+        if self.adapt and self.plans == 1 and not self.shield and not self.repair:
+            raise UserError(f"adapt={self.adapt} moves a margin that nothing reads; set shield=10, or plans above 1.")
         if self.sampler not in diffusion.SAMPLERS:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):
@@ -73,6 +85,8 @@ class PlanOptions:
         if self.shield and (self.execution == "decentralized" or self.replan > 1):
             raise UserError("shield corrects a joint action at every step; use execution='centralized' and replan=1.")
 
+
+_SHIELDED = {"temperature": 0.3, "plans": 4, "shield": 10, "margin": 0.0, "share": 0.6}
 
 # Named sets of evaluation-time choices. `guarded` uses everything that is known at run time: value steers the samples,
 # the best safe one of eight plans is followed, and what it would do is corrected until it keeps its distance.
@@ -91,7 +105,9 @@ PLANNERS: dict[str, dict] = {
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
     # gradient on value, which rises with the very speed that is limited.
     "steady": {"temperature": 0.3},
-    "shielded": {"temperature": 0.3, "plans": 4, "shield": 10, "margin": 0.0, "share": 0.6},
+    "shielded": _SHIELDED,
+    # The same, but the margin is only where it begins: more is kept after an unsafe state, less while there is none.
+    "adaptive": _SHIELDED | {"adapt": 0.1},
 }
 
 
@@ -147,6 +163,7 @@ class Planner(eqx.Module):
             "past": jnp.zeros((batch, self.history, n, d)),
             "plan": jnp.zeros((batch, rows, n, d)),
             "age": jnp.zeros((), jnp.int32),
+            "margin": jnp.full(batch, self.margin),
         }
 
     def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
@@ -154,29 +171,41 @@ class Planner(eqx.Module):
         o = self.options
         present = self.feature_map(observations, state)
         first = memory["age"] == 0
-        past = memory["past"]
+        past, margin = memory["past"], memory["margin"]
+        if o.adapt:
+            margin = jnp.where(first, margin, self.adapted(margin, present))
         if self.history:
             past = jnp.where(first, jnp.repeat(present[:, None], self.history, 1), past)
         if o.replan == 1:
-            plan, info = self.plan(past, present, key)
+            plan, info = self.plan(past, present, margin, key)
             ahead = plan[:, self.history + 1]
         else:
             fresh = memory["age"] % o.replan == 0
             plan, info = jax.lax.cond(
                 fresh,
-                lambda: self.plan(past, present, key),
+                lambda: self.plan(past, present, margin, key),
                 lambda: (memory["plan"], self._no_news(present.shape[0])),
             )
             ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
         action = infer_action(self.networks["inverse"], self.normaliser, present, ahead)
         action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
         if o.shield:
-            action = self.shielded(plan)
+            action = self.shielded(plan, margin)
         if self.history:
             past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
-        return {"past": past, "plan": plan, "age": memory["age"] + 1}, PolicyStep(action, info)
+        return {"past": past, "plan": plan, "age": memory["age"] + 1, "margin": margin}, PolicyStep(action, info)
 
-    def plan(self, past: Array, present: Array, key: Key) -> tuple[Array, dict[str, Array]]:
+    def adapted(self, margin: Array, present: Array) -> Array:
+        """Margins (B,) after a look at where the last actions led, (B, N, D): m ← m + η (1[unsafe] − rate).
+
+        Adaptive conformal inference (Gibbs and Candès 2021) on the planner's own foresight: whatever its errors, the
+        share of unsafe states tends to `rate` as long as a margin within the bounds can prevent them.
+        """
+        o, unit = self.options, self.hazard.safe_margin
+        unsafe = self.hazard.clearance(present).min(-1) < 0
+        return jnp.clip(margin + o.adapt * unit * (unsafe - o.rate), 0.0, MAX_MARGIN * unit)
+
+    def plan(self, past: Array, present: Array, margin: Array, key: Key) -> tuple[Array, dict[str, Array]]:
         """Draw plans from the present (B, N, D) and pick one: (B, rows, N, D) features, and how it was picked."""
         o, (b, n, d), rows = self.options, present.shape, self.history + self.horizon
         context = jnp.concatenate([past, present[:, None]], 1)
@@ -185,7 +214,7 @@ class Planner(eqx.Module):
         visible = jnp.ones((b, copies, n), bool)
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), o.plans, 0), visible.shape)
-        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), jnp.repeat(margin, copies), key)
         x = x.reshape(b, copies, rows, n, d)
         if local:  # each agent judges the team plans that it imagined itself, by its own safety, and keeps its own part
             own = x.reshape(b, n, o.plans, rows, n, d)
@@ -194,7 +223,7 @@ class Planner(eqx.Module):
                 return parts[:, 0], self._no_news(b) | {"plans": parts}
             safety, value = self.judge(x)
             safety = jnp.stack([safety.reshape(b, n, o.plans, n)[:, i, :, i] for i in range(n)], -1)  # (B, P, N)
-            chosen = pick(safety, jnp.moveaxis(value.reshape(b, n, o.plans), 1, 2), self.margin)  # (B, N)
+            chosen = pick(safety, jnp.moveaxis(value.reshape(b, n, o.plans), 1, 2), margin[:, None, None])  # (B, N)
             plan = jnp.take_along_axis(parts, chosen[:, None, None, :, None], 1)[:, 0]
             clearance = jnp.take_along_axis(safety, chosen[:, None], 1)[:, 0].min(-1)
             return plan, {"plans": parts, "chosen": chosen, "clearance": clearance}
@@ -202,11 +231,11 @@ class Planner(eqx.Module):
             return x[:, 0], self._no_news(b) | {"plans": x}
         safety, value = self.judge(x)
         team = safety.min(-1)
-        chosen = pick(team, value, self.margin)
+        chosen = pick(team, value, margin[:, None])
         plan = jnp.take_along_axis(x, chosen[:, None, None, None, None], 1)[:, 0]
         return plan, {"plans": x, "chosen": chosen, "clearance": jnp.take_along_axis(team, chosen[:, None], 1)[:, 0]}
 
-    def sample(self, context: Array, visible: Array, key: Key) -> Array:
+    def sample(self, context: Array, visible: Array, margin: Array, key: Key) -> Array:
         """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D)."""
         o, (b, _, n, d) = self.options, context.shape
         rows = self.history + self.horizon
@@ -223,7 +252,7 @@ class Planner(eqx.Module):
         def steered(x: Array, k: Array) -> Array:
             clean = inpaint(predict(x, k))
             if o.ascent > 0 or o.repair > 0:
-                slope = jax.grad(lambda c: self.merit(inpaint(c)).sum())(clean)
+                slope = jax.grad(lambda c: self.merit(inpaint(c), margin).sum())(clean)
                 size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
                 slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
                 level = (1.0 - jnp.asarray(bar, jnp.float32)[k]) ** o.persist
@@ -238,7 +267,7 @@ class Planner(eqx.Module):
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
         return self.feature_map.agreed(x, self.history)
 
-    def merit(self, clean: Array) -> Array:
+    def merit(self, clean: Array, margin: Array) -> Array:
         """(B,) what gradient guidance climbs: value in deviations of the data's, and safety up to the margin."""
         o, total = self.options, jnp.zeros(clean.shape[0])
         x = self.agreed(self.normaliser.invert(clean))
@@ -246,7 +275,7 @@ class Planner(eqx.Module):
             ahead = x[:, self.history + 1 :]
             total = total + o.ascent * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]
         if o.repair > 0:
-            short = jnp.minimum(self.safety(self.foreseen(x)) - self.margin, 0.0)
+            short = jnp.minimum(self.safety(self.foreseen(x)) - margin[:, None, None], 0.0)
             total = total + o.repair * short.sum((1, 2))
         return total
 
@@ -276,7 +305,7 @@ class Planner(eqx.Module):
         state = foresee(self.networks["forward"], self.normaliser, state, action, self.feature_map.joint)
         return self.agreed(jnp.concatenate([known, state[:, None]], 1))[:, -1]
 
-    def shielded(self, plan: Array) -> Array:
+    def shielded(self, plan: Array, margin: Array) -> Array:
         """Joint action (B, N, A) of the plan (B, rows, N, D), corrected until its foreseen rows keep the margin.
 
         Polyak's steps on the shortfall f(a) = Σ min(safety − margin, 0) over agents and rows, whose goal is 0:
@@ -290,7 +319,7 @@ class Planner(eqx.Module):
             for p in range(actions.shape[1]):
                 state = self.foreseen_step(known, state, actions[:, p])
                 rows.append(state)
-            return jnp.minimum(self.safety(jnp.stack(rows, 1)) - self.margin, 0.0).sum((1, 2))
+            return jnp.minimum(self.safety(jnp.stack(rows, 1)) - margin[:, None, None], 0.0).sum((1, 2))
 
         def correct(actions: Array, _) -> tuple[Array, None]:
             f, back = jax.vjp(shortfall, actions)
@@ -333,7 +362,7 @@ class Planner(eqx.Module):
         }
 
 
-def pick(safety: Array, value: Array, margin: float) -> Array:
+def pick(safety: Array, value: Array, margin: Array | float) -> Array:
     """argmax of value among plans (axis 1) with safety ≥ margin; where there is none, argmax of safety."""
     fine = safety >= margin
     best = jnp.where(fine, value, -jnp.inf).argmax(1)

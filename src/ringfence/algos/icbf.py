@@ -121,7 +121,6 @@ PRESETS: dict[str, dict] = {
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "mujoco": _MUJOCO,
     "paper": _PAPER,
-    "mujoco-quantile": _MUJOCO | {"barrier_weight": 3.0},  # where enough data is safe to leave something to imitate
     "mujoco-paper": _MUJOCO | _PAPER,
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
     "madiff-unet": {

@@ -247,9 +247,13 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
                 found = evaluate.evaluate(run, episodes=episodes, record=record, **EVALUATIONS[name])
                 if found["variant"] != variant:
                     raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
-            seconds = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
-            seconds |= adopted.get(current, {})
-            _record(current, out, "done", seconds)
+            told = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
+            told |= adopted.get(current, {})
+            before = current.status(out)
+            if before.get("state") == "done":  # only played again: what it took to train stays said
+                told |= {k: before[k] for k in ("train_seconds", "adopted") if k in before}
+                told["eval_seconds"] += before.get("eval_seconds", 0.0)
+            _record(current, out, "done", told)
             tell("done", left.pop(0))
             begun = time.perf_counter()
             if left:

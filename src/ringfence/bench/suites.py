@@ -14,6 +14,7 @@ EVALUATIONS: dict[str, dict] = {
     "guarded": {"planner": "guarded"},
     "steady": {"planner": "steady"},
     "shielded": {"planner": "shielded"},
+    "adaptive": {"planner": "adaptive"},
 }
 
 
@@ -80,9 +81,9 @@ SUITES = {
             Entry("fisor"),
             Entry("omar"),
             Entry("ma-cql"),
-            Entry("madiff", evaluations=("plain", "steady", "shielded")),
+            Entry("madiff", evaluations=("plain", "steady", "shielded", "adaptive")),
             Entry("icbf", "mujoco-paper"),
-            Entry("icbf", evaluations=("plain", "steady", "shielded")),
+            Entry("icbf", evaluations=("plain", "steady", "shielded", "adaptive")),
         ),
         episodes=20,
     ),
