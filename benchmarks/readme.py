@@ -69,6 +69,9 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+steady", "`split`, steady"),
     ("icbf", "mujoco+shielded", "`split`, shielded"),
     ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
+    ("icbf", "mujoco-quantile", "`split` with λ = 3"),
+    ("icbf", "mujoco-quantile+steady", "`split` with λ = 3, steady"),
+    ("icbf", "mujoco-quantile+shielded", "`split` with λ = 3, shielded"),
 )
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.
@@ -79,8 +82,9 @@ IN_README = (
     ("ma-td3bc", "mujoco", "MA-TD3+BC"),
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
     ("madiff", "mujoco+shielded", "MADIFF, shielded"),
-    ("icbf", "mujoco", "`split`"),
-    ("icbf", "mujoco+shielded", "**`split`, shielded**"),
+    ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
+    ("icbf", "mujoco+shielded", "`split`, shielded"),
+    ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
 )
 # Pan et al. 2022, means as tabulated in MADIFF's repository; on the public files.
 PUBLISHED = {
@@ -99,9 +103,9 @@ def main() -> None:
     measured = grouped("mujoco")
     for protocol, ending in (("native", ""), ("quantile", "-quantile")):
         put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
+        put("README.md", f"robots-{protocol}", robots_short(measured, ending))
     robots_searched = searched(RESULTS / "tuning" / "robots.csv", "halfcheetah_2x3-medium-quantile")
     put("docs/benchmark.md", "robots-search", robots_searched)
-    put("README.md", "robots", robots_short(measured))
     put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
     put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
     speed = []
@@ -122,11 +126,11 @@ def grouped(suite: str) -> dict:
     return groups
 
 
-def robots_short(groups: dict) -> str:
+def robots_short(groups: dict, ending: str) -> str:
     """One line per task, one column per method: return / cost, and how many seeds they are of where that is not the
     usual number."""
     lines = ["| | " + " | ".join(label for *_, label in IN_README) + " |", "|---|" + "---|" * len(IN_README)]
-    names = [f"{robot}-{level}" for robot in ROBOTS for level in LEVELS]
+    names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
     found = {(n, a, v): groups.get((n, a, v), []) for n in names for a, v, _ in IN_README}
     counts = [len(rows) for (_, _, variant), rows in found.items() if rows and variant != "reference"]
     usual = max(set(counts), key=counts.count)

@@ -194,6 +194,7 @@ def test_names_of_variants_follow_values(trained):
         ({"planner": "guarded", "steps": 2}, "split+guarded+steps2"),
         ({"margin": 0, "plans": "2"}, "split+plans2+margin0.0"),
         ({"ascent": "1e1"}, "split+ascent10.0"),
+        ({"planner": "adaptive", "adapt": 0.2}, "split+adaptive+adapt0.2"),
     ):
         assert evaluate.evaluate(run, episodes=1, **{"steps": 2, **options})["variant"].replace("+steps2", "") == (
             name.replace("+steps2", "")

@@ -76,8 +76,6 @@ class PlanOptions:
                 f"adapt={self.adapt} reads the clearance of the whole team; use select='clearance' and "
                 "execution='centralized', or set adapt=0."
             )
-        if self.adapt and self.plans == 1 and not self.shield and not self.repair:
-            raise UserError(f"adapt={self.adapt} moves a margin that nothing reads; set shield=10, or plans above 1.")
         if self.sampler not in diffusion.SAMPLERS:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
         if self.execution not in ("centralized", "decentralized"):
@@ -137,6 +135,8 @@ class Planner(eqx.Module):
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
             )
         judged = o.plans > 1 or o.repair > 0 or o.shield > 0
+        if o.adapt and not judged:
+            raise UserError(f"adapt={o.adapt} moves a margin that nothing reads; set shield=10, or plans above 1.")
         if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if judged and o.select != "barrier" and not self.hazard.has_formula:
@@ -203,7 +203,8 @@ class Planner(eqx.Module):
         """
         o, unit = self.options, self.hazard.safe_margin
         unsafe = self.hazard.clearance(present).min(-1) < 0
-        return jnp.clip(margin + o.adapt * unit * (unsafe - o.rate), 0.0, MAX_MARGIN * unit)
+        most = max(MAX_MARGIN * unit, self.margin)
+        return jnp.clip(margin + o.adapt * unit * (unsafe - o.rate), 0.0, most)
 
     def plan(self, past: Array, present: Array, margin: Array, key: Key) -> tuple[Array, dict[str, Array]]:
         """Draw plans from the present (B, N, D) and pick one: (B, rows, N, D) features, and how it was picked."""

@@ -120,6 +120,8 @@ PRESETS: dict[str, dict] = {
     "split": {},
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "mujoco": _MUJOCO,
+    # Where enough data is safe to leave something to imitate. Better on the Ants, far worse on HalfCheetah: no default.
+    "mujoco-quantile": _MUJOCO | {"barrier_weight": 3.0},
     "paper": _PAPER,
     "mujoco-paper": _MUJOCO | _PAPER,
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU

@@ -26,6 +26,10 @@ class Entry:
     preset: str = ""  # empty: the one made for the task where there is one, else the default
     evaluations: tuple[str, ...] = ("plain",)
     tiers: tuple[str, ...] = ()  # empty: all
+    protocol: str = ""  # of the tasks it is played on; empty: all
+
+    def plays(self, task: Task) -> bool:
+        return (not self.tiers or task.tier in self.tiers) and self.protocol in ("", task.protocol)
 
     @property
     def name(self) -> str:
@@ -84,6 +88,7 @@ SUITES = {
             Entry("madiff", evaluations=("plain", "steady", "shielded", "adaptive")),
             Entry("icbf", "mujoco-paper"),
             Entry("icbf", evaluations=("plain", "steady", "shielded", "adaptive")),
+            Entry("icbf", "mujoco-quantile", ("plain", "steady", "shielded"), protocol="quantile"),
         ),
         episodes=20,
     ),
