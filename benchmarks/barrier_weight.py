@@ -11,6 +11,7 @@ much of the limit the shield should keep in hand: λ and planners on several tie
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import os
 import tempfile
@@ -55,9 +56,9 @@ LIMIT = 25.0
 EPISODES = 10
 
 
-def one(job: tuple[str, float, int]) -> list[dict]:
-    """Train one run and play it with every planner; rows of the file."""
-    name, weight, seed = job
+def one(job: tuple[str, float, int, list[str]]) -> list[dict]:
+    """Train one run and play it with the planners that are not in the file; its rows."""
+    name, weight, seed, planners = job
     from ringfence import evaluate, tasks, training
     from ringfence.data.make import make
 
@@ -70,8 +71,8 @@ def one(job: tuple[str, float, int]) -> list[dict]:
             algorithm, store, preset="mujoco", seeds=(seed,), changes=changes, out=folder, quiet=True
         )
         seconds = time.perf_counter() - begun
-        for planner, options in PLANNERS.items():
-            r = evaluate.evaluate(run, episodes=EPISODES, split="validation", **options)
+        for planner in planners:
+            r = evaluate.evaluate(run, episodes=EPISODES, split="validation", **PLANNERS[planner])
             rows.append(
                 {
                     "task": name,
@@ -114,8 +115,11 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true")
     a = parser.parse_args()
     if not a.summary:
-        done = {(r["task"], float(r["weight"]), int(r["seed"])) for r in read(OUT)}
-        jobs = [(t, w, s) for s in a.seeds for t in a.tasks for w in a.weights if (t, w, s) not in done]
+        done = {(r["task"], float(r["weight"]), int(r["seed"]), r["planner"]) for r in read(OUT)}
+        jobs = []
+        for t, w, s in itertools.product(a.tasks, a.weights, a.seeds):
+            if left := [planner for planner in PLANNERS if (t, w, s, planner) not in done]:
+                jobs.append((t, w, s, left))
         spawn = multiprocessing.get_context("spawn")
         cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count()))
         queue = spawn.Queue()
