@@ -24,6 +24,15 @@ def append(file: Path, row: dict[str, Any], fields: tuple[str, ...]) -> None:
         writer.writerow(row)
 
 
+def write(file: Path, rows: list[dict[str, Any]]) -> None:
+    """The whole table at once, in place of what was there; fields are those of its first row."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w", newline="") as f:
+        writer = csv.DictWriter(f, rows[0], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
 def measured(r: dict[str, Any]) -> dict[str, float]:
     """What a table keeps of an evaluation."""
     return {

@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import multiprocessing
-import os
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 
+from _pool import finished
 from _rows import append, measured, read
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "barrier_weight.csv"
@@ -88,14 +86,8 @@ def one(job: tuple[str, float, int, list[str]]) -> list[dict]:
     return rows
 
 
-def pin(cores) -> None:
-    """Give a worker one core of its own: small networks gain nothing from more."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {cores.get()})
-
-
 def summary(rows: list[dict]) -> None:
-    """Every task's rows by share and λ, all seeds beside each other."""
+    """Every task's rows by planner and λ, all seeds beside each other."""
     found: dict[tuple, list[dict]] = {}
     for r in rows:
         found.setdefault((r["task"], r["planner"], float(r["weight"])), []).append(r)
@@ -120,16 +112,10 @@ def main() -> None:
         for t, w, s in itertools.product(a.tasks, a.weights, a.seeds):
             if left := [planner for planner in PLANNERS if (t, w, s, planner) not in done]:
                 jobs.append((t, w, s, left))
-        spawn = multiprocessing.get_context("spawn")
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count()))
-        queue = spawn.Queue()
-        for core in cores:
-            queue.put(core)
-        with ProcessPoolExecutor(len(cores), spawn, pin, (queue,)) as pool:
-            for future in as_completed([pool.submit(one, job) for job in jobs]):
-                for row in future.result():
-                    append(OUT, row, FIELDS)
-                    print(*(f"{k}={row[k]}" for k in FIELDS), flush=True)
+        for rows in finished(one, jobs):
+            for row in rows:
+                append(OUT, row, FIELDS)
+                print(*(f"{k}={row[k]}" for k in FIELDS), flush=True)
     summary(read(OUT))
 
 

@@ -8,12 +8,12 @@ logged actions, as a share of the speed limit. On logged steps that it foresees 
 from __future__ import annotations
 
 import argparse
-import csv
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from _rows import write
 
 from ringfence import evaluate, tasks
 from ringfence.data.make import make
@@ -59,10 +59,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
     rows = [r for path in sorted(a.runs) for r in rows_of(path)]
-    with open(a.out, "w", newline="") as f:
-        writer = csv.DictWriter(f, rows[0], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write(a.out, rows)
     for r in rows:
         print(*(f"{k}={r[k]}" for k in ("task", "ahead", "error_0.5", "error_0.95", "error_0.99")), flush=True)
 

@@ -17,14 +17,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from _pool import finished
 from _rows import append, measured, read
 
 ROOT = Path(__file__).resolve().parent.parent / "results" / "tuning"
@@ -172,12 +170,6 @@ def one(job: tuple) -> dict:
     }
 
 
-def pin(cores) -> None:
-    """Give a worker one core of its own: small networks gain nothing from more."""
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {cores.get()})
-
-
 def ranked(study: Study, rows: list[dict]) -> dict[tuple, list[dict]]:
     """(algorithm, preset) -> rows on the study's task, best first."""
     found: dict[tuple, list[dict]] = {}
@@ -211,16 +203,9 @@ def main() -> None:
             for task in (study.task, *(study.further.get(name, ()) if number in (0, 1, 4) else ()))
             if (name, preset, number, task) not in done
         ]
-        spawn = multiprocessing.get_context("spawn")
-        cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count()))
-        queue = spawn.Queue()
-        for core in cores:
-            queue.put(core)
-        with ProcessPoolExecutor(len(cores), spawn, pin, (queue,)) as pool:
-            for future in as_completed([pool.submit(one, job) for job in jobs]):
-                row = future.result()
-                append(out, row, FIELDS)
-                print(*(f"{k}={row[k]}" for k in FIELDS[:4] + FIELDS[4:5] + FIELDS[8:]), flush=True)
+        for row in finished(one, jobs):
+            append(out, row, FIELDS)
+            print(*(f"{k}={row[k]}" for k in FIELDS[:5] + FIELDS[8:]), flush=True)
     for (name, preset), rows in ranked(study, read(out)).items():
         print(f"\n{name} {preset}")
         for r in rows:

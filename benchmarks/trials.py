@@ -10,29 +10,17 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
 import json
 from pathlib import Path
+
+from _rows import write
 
 from ringfence import algos
 from ringfence.policies import PlanOptions
 from ringfence.runs import Run
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "mujoco.csv"
-FIELDS = (
-    "task",
-    "transitions",
-    "algorithm",
-    "seed",
-    "changes",
-    "planner",
-    "episodes",
-    "return",
-    "cost",
-    "cost_cvar10",
-    "seconds",
-)
 
 
 def differing(values: dict, defaults) -> str:
@@ -71,10 +59,9 @@ def main() -> None:
     a = parser.parse_args()
     rows = [r for path in sorted(a.runs) if (path / "results.json").exists() for r in rows_of(Run(path))]
     rows.sort(key=lambda r: (r["task"], r["algorithm"], r["changes"]))
-    with open(a.out, "w", newline="") as f:
-        writer = csv.DictWriter(f, FIELDS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    if not rows:
+        raise SystemExit("None of these folders has an evaluation on validation resets; add --split validation.")
+    write(a.out, rows)
     print(f"{len(rows)} evaluations: {a.out}")
 
 

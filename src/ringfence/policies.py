@@ -171,9 +171,9 @@ class Planner(eqx.Module):
         o = self.options
         present = self.feature_map(observations, state)
         first = memory["age"] == 0
-        past, margin = memory["past"], memory["margin"]
+        past, margin = memory["past"], jnp.full(present.shape[0], self.margin)  # known to the compiler unless it moves
         if o.adapt:
-            margin = jnp.where(first, margin, self.adapted(margin, present))
+            margin = jnp.where(first, margin, self.adapted(memory["margin"], present))
         if self.history:
             past = jnp.where(first, jnp.repeat(present[:, None], self.history, 1), past)
         if o.replan == 1:
