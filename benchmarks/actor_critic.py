@@ -31,7 +31,7 @@ def ours(algorithm: str, store, updates: int) -> tuple[float, float]:
     task = tasks.from_store(store)
     job = training.make_job(algorithm, task, None, {}, store)
     c = job.config
-    data = training.windows_of(store, task, c.view, None, c.discount, None, c.horizon, 0)
+    data = training.windows_of(store, task, c)
     state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))

@@ -60,7 +60,7 @@ def trial(store, task, changes: dict, updates: int):
     """((job, state), ms per update) after `updates`, the first ten not timed."""
     job = training.make_job("madiff", task, None, changes, store)
     c = job.config
-    data = training.windows_of(store, task, c.view, None, c.discount, c.condition, c.horizon, c.critic_updates)
+    data = training.windows_of(store, task, c)
     state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))

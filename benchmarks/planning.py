@@ -24,7 +24,6 @@ from ringfence.envs import SimpleSpread
 from ringfence.evaluate import make_policy, plan_latency
 from ringfence.policies import PLANNERS
 from ringfence.tasks import Task
-from ringfence.windows import WindowData
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "planning.json"
 TEAMS = (3, 6, 12, 24)
@@ -50,8 +49,8 @@ def measure_team(n: int, updates: int) -> tuple[dict[str, float], tuple]:
     """Milliseconds per update (batch 128), seconds to compile it, and the job and state for planning."""
     task = team_task(n)
     store = random_store(task, 400)
-    job = training.make_job("icbf", task, None, {}, store)
-    data = WindowData(store, job.feature_map, job.config.discount, job.config.condition, job.config.horizon, updates=10)
+    job = training.make_job("icbf", task, None, {"critic_updates": 10, "dynamics_updates": 10}, store)
+    data = training.windows_of(store, task, job.config)
     state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard)
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))

@@ -69,9 +69,6 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+steady", "`split`, steady"),
     ("icbf", "mujoco+shielded", "`split`, shielded"),
     ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
-    ("icbf", "mujoco-quantile", "`split` with λ = 3"),
-    ("icbf", "mujoco-quantile+steady", "`split` with λ = 3, steady"),
-    ("icbf", "mujoco-quantile+shielded", "`split` with λ = 3, shielded"),
 )
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the README's table.

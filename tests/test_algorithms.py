@@ -17,9 +17,9 @@ from ringfence.windows import WindowData, draw
 TINY = {
     "icbf": dict(steps=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8, bank=64, bank_batch=16,
                  inverse_width=16, horizon=4, diffusion_steps=20, critic_updates=20,
-                 barrier_start=0.0, barrier_full=0.2),
+                 dynamics_updates=20, dynamics_width=16, barrier_start=0.0, barrier_full=0.2),
     "madiff": dict(steps=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20,
-                   critic_updates=20),
+                   critic_updates=20, dynamics_updates=20, dynamics_width=16),
     "bc": dict(steps=12, batch=32, width=16, depth=1),
     "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
     "ma-td3bc": dict(steps=12, batch=32, width=16, centralised_critic=True, delay=2, target_noise=0.2),

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from ringfence.types import Array, Metrics, PyTree
+from ringfence.types import Array, Key, Metrics, PyTree
 
 
 @dataclass(frozen=True)
@@ -60,3 +60,30 @@ def average(ema: PyTree, params: PyTree, decay: float, step: Array) -> PyTree:
     """Exponential moving average that follows closely at first and settles to `decay`."""
     d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
     return jax.tree.map(lambda a, p: d * a + (1.0 - d) * p, ema, params)
+
+
+def regress(
+    loss: Callable[[PyTree, PyTree, Array], Array],
+    net: PyTree,
+    data: PyTree,
+    rows: int,
+    key: Key,
+    updates: int,
+    batch: int,
+    rate: float,
+) -> PyTree:
+    """`net` after `updates` steps of Adam on loss(net, data, picked), with `batch` of `rows` row numbers each;
+    the rate falls along a cosine to a fiftieth."""
+    adam = optax.adam(optax.cosine_decay_schedule(rate, updates, 0.02))
+
+    @jax.jit
+    def run(net: PyTree, data: PyTree) -> PyTree:
+        def step(carry, key):
+            net, moments = carry
+            picked = jax.random.randint(key, (batch,), 0, rows)
+            moves, moments = adam.update(jax.grad(loss)(net, data, picked), moments)
+            return (optax.apply_updates(net, moves), moments), None
+
+        return jax.lax.scan(step, (net, adam.init(net)), jax.random.split(key, updates))[0][0]
+
+    return run(net, data)

@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import diffusion
+from ringfence.dynamics import foresee
 from ringfence.errors import UserError, unknown
 from ringfence.features import FeatureMap
 from ringfence.hazards import BoundHazard, least
-from ringfence.nets.heads import barrier_on, foresee, infer_action
+from ringfence.nets.heads import barrier_on, infer_action
 from ringfence.normalise import Normaliser
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.values import plan_value
@@ -115,6 +116,7 @@ class Planner(eqx.Module):
     networks: dict[str, Any]  # denoiser, inverse, maybe barrier
     normaliser: Normaliser
     critic: dict[str, Any]  # what states are worth
+    dynamics: dict[str, Any]  # where actions lead
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     history: int = eqx.field(static=True)
@@ -303,7 +305,7 @@ class Planner(eqx.Module):
 
     def foreseen_step(self, known: Array, state: Array, action: Array) -> Array:
         """Where actions (B, N, A) lead from states (B, N, D), all agents agreeing; `known` (B, now+1, N, D) before."""
-        state = foresee(self.networks["forward"], self.normaliser, state, action, self.feature_map.joint)
+        state = foresee(self.dynamics, state, action, self.feature_map.joint)
         return self.agreed(jnp.concatenate([known, state[:, None]], 1))[:, -1]
 
     def shielded(self, plan: Array, margin: Array) -> Array:

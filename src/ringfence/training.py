@@ -26,6 +26,7 @@ from ringfence import algos, features, hazards, tasks
 from ringfence.data.audit import APART, disagreement
 from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
+from ringfence.dynamics import fit_dynamics
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.files import owned, whole
 from ringfence.progress import Progress
@@ -153,7 +154,7 @@ def train(
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
-    windows = _windows(job, data, quiet) if left else None  # a finished run needs no critic fitted to its data again
+    windows = _windows(job, data, quiet) if left else None  # a finished run needs nothing fitted to its data again
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
     if together and left:
@@ -168,52 +169,74 @@ def train(
 
 
 def _windows(job: Job, data: EpisodeStore, quiet: bool) -> WindowData:
-    updates = getattr(job.config, "critic_updates", 0)
-    if updates and not quiet:
-        print(f"{data.card['task']}: what its states are worth, {updates} updates of a critic first", file=sys.stderr)
-    return windows_of(
-        data,
-        job.task,
-        job.config.view,
-        getattr(job.config, "cost_limit", None),
-        getattr(job.config, "discount", 1.0),
-        getattr(job.config, "condition", None),
-        job.config.horizon,
-        updates,
-    )
+    critic, acts = (getattr(job.config, name, 0) for name in ("critic_updates", "dynamics_updates"))
+    if critic and not quiet:
+        told = f"what its states are worth and what its actions do, {critic} and {acts} updates first"
+        print(f"{data.card['task']}: {told}", file=sys.stderr)
+    return windows_of(data, job.task, job.config)
+
+
+def windows_of(data: EpisodeStore, task: Task, config) -> WindowData:
+    """Device data of a job, with the critic and the dynamics that its config asks for; the last ones are kept, since
+    tables train several algorithms on one store."""
+    told = {
+        "cost_limit": None,
+        "discount": 1.0,
+        "condition": None,
+        "critic_updates": 0,
+        "dynamics_updates": 0,
+        "dynamics_width": 0,
+    }
+    told = {k: getattr(config, k, default) for k, default in told.items()}
+    return _windows_of(data, task, config.view, config.horizon, **told)
 
 
 @functools.lru_cache(maxsize=1)
-def windows_of(
+def _windows_of(
     data: EpisodeStore,
     task: Task,
     view: str,
+    horizon: int,
     cost_limit: float | None,
     discount: float,
     condition: str | None,
-    horizon: int,
-    updates: int,
+    critic_updates: int,
+    dynamics_updates: int,
+    dynamics_width: int,
 ) -> WindowData:
-    """Device data of a job; the last one is kept, since tables train several algorithms on one store."""
     used = data if cost_limit is None else data.select(within(data.episode_costs, cost_limit))
-    about = (data, task.name, view, cost_limit, discount, updates)
-    critic = _last_critic.get(about)
-    seen = task.feature_map(view, data)
-    windows = WindowData(used, seen, discount, condition, horizon, updates, critic, seen.critic_weight)
+    rows, seen = (data, task.name, view, cost_limit), task.feature_map(view, data)
+    valued, acted = (*rows, discount, critic_updates), (*rows, dynamics_updates, dynamics_width)
+    critic = _kept("critic", valued)
+    windows = WindowData(used, seen, discount, condition, horizon, critic_updates, critic, seen.critic_weight)
     if windows.critic is not None:
-        _last_critic.clear()
-        _last_critic[about] = windows.critic
+        _last["critic"] = valued, windows.critic
+    if dynamics_updates:
+        windows.dynamics = _kept("dynamics", acted)
+        if windows.dynamics is None:
+            x, actions, row = (windows.arrays[k] for k in ("features", "actions", "row"))
+            windows.dynamics = fit_dynamics(
+                x, actions, row, jax.random.key(0), dynamics_updates, dynamics_width, seen.joint
+            )
+        _last["dynamics"] = acted, windows.dynamics
     return windows
+
+
+# Fitting critic and dynamics takes longer than the rest of the preparation; algorithms that differ in their condition
+# share them. What it is -> (about what, itself).
+_last: dict[str, tuple[tuple, PyTree]] = {}
+
+
+def _kept(what: str, about: tuple) -> PyTree:
+    """The last critic or dynamics, if it was fitted to the same; else None."""
+    known, made = _last.get(what, (None, None))
+    return made if known == about else None
 
 
 def within(costs: np.ndarray, limit: float, least: float = 0.01) -> np.ndarray:
     """(E,) bool: the episodes whose cost is within the limit; if they are too few to learn from, the `least` share of
     all with the lowest cost."""
     return costs <= max(limit, np.quantile(costs, least, method="higher"))
-
-
-# Fitting a critic takes longer than the rest of the preparation; algorithms that differ in their condition share it.
-_last_critic: dict[tuple, dict] = {}
 
 
 @dataclass(frozen=True)

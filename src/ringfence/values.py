@@ -14,12 +14,12 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from scipy.special import ndtri
 from scipy.stats import rankdata
 
 from ringfence.nets.mlp import MLP
 from ringfence.normalise import varying
+from ringfence.optim import regress
 from ringfence.types import Array, Key
 
 Condition = Literal["advantage", "return"]
@@ -61,24 +61,15 @@ def fit_critic(
         "scale": jnp.asarray(scale, jnp.float32),
         "value": value,
     }
-    adam = optax.adam(optax.cosine_decay_schedule(4e-3, updates, 0.02))
 
-    def loss(net: MLP, x: Array, y: Array) -> Array:
+    def loss(net: MLP, data: tuple[Array, Array], rows: Array) -> Array:
+        x, y = data[0][rows], data[1][rows]
         out = net((x - critic["mean"]) / critic["scale"]).mean(-2)
         return ((out - (y - value[:, 0]) / value[:, 1]) ** 2).mean()
 
-    @jax.jit
-    def run(net: MLP, features: Array, targets: Array) -> MLP:
-        def step(carry, key):
-            net, moments = carry
-            rows = jax.random.randint(key, (batch,), 0, features.shape[0])
-            moves, moments = adam.update(jax.grad(loss)(net, features[rows], targets[rows]), moments)
-            return (optax.apply_updates(net, moves), moments), None
-
-        keys = jax.random.split(jax.random.fold_in(key, 1), updates)
-        return jax.lax.scan(step, (net, adam.init(net)), keys)[0][0]
-
-    return critic | {"net": run(critic["net"], features, targets)}
+    data = features, targets
+    net = regress(loss, critic["net"], data, len(features), jax.random.fold_in(key, 1), updates, batch, 4e-3)
+    return critic | {"net": net}
 
 
 def blank_critic(features: int) -> dict[str, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ringfence import values
 from ringfence.data.store import EpisodeStore
-from ringfence.types import Array, Batch, Key
+from ringfence.types import Array, Batch, Key, PyTree
 
 NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
 MIN_COHORT = 30  # return scores are ranks among at least this many steps
@@ -26,6 +26,7 @@ class WindowData:
     M = T + E rows of states, T steps. `arrays` is a pytree of device arrays that jitted functions take as an
     argument, so that the data is never baked into a compiled program. `critic` is what states are worth (values.py);
     it is fitted here unless it is given, and only if an algorithm is conditioned on value or ranks plans by it.
+    `dynamics` is what actions do (dynamics.py), where somebody has fitted it.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class WindowData:
         x = jnp.asarray(np.asarray(features(store.observations, store.state), np.float32))
         self.steps = store.steps
         self.critic = critic
+        self.dynamics: PyTree = None
         scores = np.zeros(store.steps)
         if condition is not None:
             togo = returns_to_go(team, store.lengths, discount)

@@ -26,10 +26,9 @@ class Entry:
     preset: str = ""  # empty: the one made for the task where there is one, else the default
     evaluations: tuple[str, ...] = ("plain",)
     tiers: tuple[str, ...] = ()  # empty: all
-    protocol: str = ""  # of the tasks it is played on; empty: all
 
     def plays(self, task: Task) -> bool:
-        return (not self.tiers or task.tier in self.tiers) and self.protocol in ("", task.protocol)
+        return not self.tiers or task.tier in self.tiers
 
     @property
     def name(self) -> str:
@@ -88,7 +87,6 @@ SUITES = {
             Entry("madiff", evaluations=("plain", "steady", "shielded", "adaptive")),
             Entry("icbf", "mujoco-paper"),
             Entry("icbf", evaluations=("plain", "steady", "shielded", "adaptive")),
-            Entry("icbf", "mujoco-quantile", ("plain", "steady", "shielded"), protocol="quantile"),
         ),
         episodes=20,
     ),
