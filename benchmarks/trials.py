@@ -39,6 +39,7 @@ def rows_of(run: Run) -> list[dict]:
                     "task": r["task"],
                     "transitions": told["data"].get("transitions"),
                     "algorithm": r["algorithm"],
+                    "revision": told.get("revision", 1),
                     "seed": r["seed"],
                     "changes": config,
                     "planner": differing(r["options"], PlanOptions()),

@@ -22,7 +22,14 @@ BATCH = 128  # small and often: at equal time it learns contacts that 512 at hal
 
 
 def fit_dynamics(
-    features: Array, actions: Array, row: Array, key: Key, updates: int, width: int, joint: bool = False
+    features: Array,
+    actions: Array,
+    row: Array,
+    key: Key,
+    updates: int,
+    width: int,
+    joint: bool = False,
+    quiet: bool = True,
 ) -> PyTree:
     """g_φi of every agent: {'net', 'mean', 'scale', 'step_mean', 'step_scale'}, statistics (D,) pooled over agents.
 
@@ -48,7 +55,8 @@ def fit_dynamics(
         return optax.losses.huber_loss(_step(net, frozen, before, actions[step], joint), moved, delta=1.0).mean()
 
     net = _network(kn, n, d, actions.shape[-1], width, joint)
-    return frozen | {"net": regress(loss, net, (features, actions, row), len(row), kf, updates, BATCH, 4e-3)}
+    label = "" if quiet else "forward dynamics, what actions do"
+    return frozen | {"net": regress(loss, net, (features, actions, row), len(row), kf, updates, BATCH, 4e-3, label)}
 
 
 def blank_dynamics(agents: int, features: int, action: int, width: int, joint: bool = False) -> PyTree:

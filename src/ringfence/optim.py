@@ -9,7 +9,10 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from ringfence.progress import Progress
 from ringfence.types import Array, Key, Metrics, PyTree
+
+CHUNKS = 40  # a regression is in, one after the other, so that its progress can be told
 
 
 @dataclass(frozen=True)
@@ -71,19 +74,27 @@ def regress(
     updates: int,
     batch: int,
     rate: float,
+    label: str = "",
 ) -> PyTree:
     """`net` after `updates` steps of Adam on loss(net, data, picked), with `batch` of `rows` row numbers each;
-    the rate falls along a cosine to a fiftieth."""
+    the rate falls along a cosine to a fiftieth. Progress is shown under a `label`."""
     adam = optax.adam(optax.cosine_decay_schedule(rate, updates, 0.02))
+    keys = jax.random.split(key, updates)
 
     @jax.jit
-    def run(net: PyTree, data: PyTree) -> PyTree:
-        def step(carry, key):
+    def advance(carry, data: PyTree, keys: Array, start: int, stop: int):
+        def step(i, carry):
             net, moments = carry
-            picked = jax.random.randint(key, (batch,), 0, rows)
+            picked = jax.random.randint(keys[i], (batch,), 0, rows)
             moves, moments = adam.update(jax.grad(loss)(net, data, picked), moments)
-            return (optax.apply_updates(net, moves), moments), None
+            return optax.apply_updates(net, moves), moments
 
-        return jax.lax.scan(step, (net, adam.init(net)), jax.random.split(key, updates))[0][0]
+        return jax.lax.fori_loop(start, stop, step, carry)
 
-    return run(net, data)
+    carry, chunk = (net, adam.init(net)), max(1, updates // CHUNKS)
+    with Progress(label, updates, quiet=not label) as bar:
+        for start in range(0, updates, chunk):
+            stop = min(start + chunk, updates)
+            carry = jax.block_until_ready(advance(carry, data, keys, start, stop))
+            bar.advance(stop - start)
+    return carry[0]

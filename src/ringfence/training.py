@@ -7,10 +7,8 @@ not, and chunk lengths change nothing.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import json
 import operator
-import sys
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -154,7 +152,8 @@ def train(
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
-    windows = _windows(job, data, quiet) if left else None  # a finished run needs nothing fitted to its data again
+    # A finished run needs nothing fitted to its data again.
+    windows = windows_of(data, job.task, job.config, quiet) if left else None
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
     if together and left:
@@ -168,69 +167,49 @@ def train(
     return runs
 
 
-def _windows(job: Job, data: EpisodeStore, quiet: bool) -> WindowData:
-    critic, acts = (getattr(job.config, name, 0) for name in ("critic_updates", "dynamics_updates"))
-    if critic and not quiet:
-        told = f"what its states are worth and what its actions do, {critic} and {acts} updates first"
-        print(f"{data.card['task']}: {told}", file=sys.stderr)
-    return windows_of(data, job.task, job.config)
+def windows_of(data: EpisodeStore, task: Task, config, quiet: bool = True) -> WindowData:
+    """Device data of a job, with the critic and the dynamics that its config asks for.
 
+    The last ones are kept: tables train several algorithms on one store, and fitting takes longer than all the rest.
+    """
+    limit, condition = getattr(config, "cost_limit", None), getattr(config, "condition", None)
+    discount, updates = getattr(config, "discount", 1.0), getattr(config, "critic_updates", 0)
+    fitted, width = getattr(config, "dynamics_updates", 0), getattr(config, "dynamics_width", 0)
+    rows = (data, task, config.view, limit)
+    valued, acted = (*rows, discount, updates), (*rows, fitted, width)
+    seen = task.feature_map(config.view, data)
 
-def windows_of(data: EpisodeStore, task: Task, config) -> WindowData:
-    """Device data of a job, with the critic and the dynamics that its config asks for; the last ones are kept, since
-    tables train several algorithms on one store."""
-    told = {
-        "cost_limit": None,
-        "discount": 1.0,
-        "condition": None,
-        "critic_updates": 0,
-        "dynamics_updates": 0,
-        "dynamics_width": 0,
-    }
-    told = {k: getattr(config, k, default) for k, default in told.items()}
-    return _windows_of(data, task, config.view, config.horizon, **told)
+    def fit() -> WindowData:
+        used = data if limit is None else data.select(within(data.episode_costs, limit))
+        known = _kept("critic", valued)
+        return WindowData(used, seen, discount, condition, config.horizon, updates, known, seen.critic_weight, quiet)
 
-
-@functools.lru_cache(maxsize=1)
-def _windows_of(
-    data: EpisodeStore,
-    task: Task,
-    view: str,
-    horizon: int,
-    cost_limit: float | None,
-    discount: float,
-    condition: str | None,
-    critic_updates: int,
-    dynamics_updates: int,
-    dynamics_width: int,
-) -> WindowData:
-    used = data if cost_limit is None else data.select(within(data.episode_costs, cost_limit))
-    rows, seen = (data, task.name, view, cost_limit), task.feature_map(view, data)
-    valued, acted = (*rows, discount, critic_updates), (*rows, dynamics_updates, dynamics_width)
-    critic = _kept("critic", valued)
-    windows = WindowData(used, seen, discount, condition, horizon, critic_updates, critic, seen.critic_weight)
+    windows = _kept("windows", (*valued, acted, condition, config.horizon), fit)
     if windows.critic is not None:
-        _last["critic"] = valued, windows.critic
-    if dynamics_updates:
-        windows.dynamics = _kept("dynamics", acted)
-        if windows.dynamics is None:
-            x, actions, row = (windows.arrays[k] for k in ("features", "actions", "row"))
-            windows.dynamics = fit_dynamics(
-                x, actions, row, jax.random.key(0), dynamics_updates, dynamics_width, seen.joint
-            )
-        _last["dynamics"] = acted, windows.dynamics
+        _kept("critic", valued, lambda: windows.critic)
+    if fitted:
+        x, actions, row = (windows.arrays[k] for k in ("features", "actions", "row"))
+        windows.dynamics = _kept(
+            "dynamics",
+            acted,
+            lambda: fit_dynamics(x, actions, row, jax.random.key(0), fitted, width, seen.joint, quiet),
+        )
     return windows
 
 
-# Fitting critic and dynamics takes longer than the rest of the preparation; algorithms that differ in their condition
-# share them. What it is -> (about what, itself).
-_last: dict[str, tuple[tuple, PyTree]] = {}
+_last: dict[str, tuple[tuple, Any]] = {}  # what was fitted last: what it is -> (about what, itself)
 
 
-def _kept(what: str, about: tuple) -> PyTree:
-    """The last critic or dynamics, if it was fitted to the same; else None."""
+def _kept(what: str, about: tuple, make: Callable[[], Any] | None = None) -> Any:
+    """The last of its kind if it is about the same; else a new one that `make` makes, or None."""
     known, made = _last.get(what, (None, None))
-    return made if known == about else None
+    if known == about:
+        return made
+    if make is None:
+        return None
+    _last.pop(what, None)  # there may be no room for two
+    _last[what] = about, make()
+    return _last[what][1]
 
 
 def within(costs: np.ndarray, limit: float, least: float = 0.01) -> np.ndarray:

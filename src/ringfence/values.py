@@ -37,6 +37,7 @@ def fit_critic(
     batch: int = 512,
     period: int = 1,
     weight: tuple[float, ...] | None = None,
+    quiet: bool = True,
 ) -> dict[str, Array]:
     """{'net', 'mean', 'scale', 'value'}: regression of (reward on arrival, return-to-go) on states.
 
@@ -68,7 +69,8 @@ def fit_critic(
         return ((out - (y - value[:, 0]) / value[:, 1]) ** 2).mean()
 
     data = features, targets
-    net = regress(loss, critic["net"], data, len(features), jax.random.fold_in(key, 1), updates, batch, 4e-3)
+    label = "" if quiet else "critic, what states are worth"
+    net = regress(loss, critic["net"], data, len(features), jax.random.fold_in(key, 1), updates, batch, 4e-3, label)
     return critic | {"net": net}
 
 

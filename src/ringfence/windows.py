@@ -39,6 +39,7 @@ class WindowData:
         updates: int = 8000,
         critic: dict[str, Array] | None = None,
         critic_weight: tuple[float, ...] | None = None,
+        quiet: bool = True,
     ):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
@@ -60,9 +61,8 @@ class WindowData:
                 arrived[starts + np.arange(store.episodes)] = team[starts]
                 arrived, ahead = jnp.asarray(arrived), jnp.asarray(ahead)
                 longest = int(store.lengths.max()) + 1
-                self.critic = values.fit_critic(
-                    x, arrived, ahead, jax.random.key(0), updates=updates, period=longest, weight=critic_weight
-                )
+                told = {"updates": updates, "period": longest, "weight": critic_weight, "quiet": quiet}
+                self.critic = values.fit_critic(x, arrived, ahead, jax.random.key(0), **told)
             if condition == "advantage":
                 value = values.values_of(self.critic, x)
                 scores = values.normal_scores(values.advantages(value, team, row, last, horizon, discount))
