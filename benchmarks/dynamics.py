@@ -23,7 +23,7 @@ from ringfence.windows import WindowData
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "dynamics.csv"
 FIELDS = ("task", "width", "updates", "entry", "deviation", "rms", "error_0.9", "error_0.99", "seconds")
 TASKS = ("simple_spread-medium", "halfcheetah_2x3-poor", "ant_2x4-medium")
-BUDGETS = ((128, 2_000), (128, 8_000), (128, 40_000), (256, 8_000), (256, 40_000))
+BUDGETS = ((128, 2_000), (128, 8_000), (128, 40_000), (256, 40_000))
 STEPS = 50_000
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _rows import write
+from _rows import read, write
 
 from ringfence import evaluate, tasks
 from ringfence.data.make import make
@@ -21,6 +21,7 @@ from ringfence.runs import Run
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "foresight.csv"
 LEVELS = (0.5, 0.9, 0.95, 0.975, 0.99)
+ABOUT = ("task", "algorithm", "seed", "revision")
 STEPS, AHEAD, NEAR = 20_000, 3, 0.3
 
 
@@ -47,6 +48,7 @@ def rows_of(path: Path) -> list[dict]:
         foreseen, came = least(state), least(seen(k + 1))
         near = np.abs(foreseen) < NEAR
         told = {"task": job.task.name, "algorithm": job.algorithm.name, "seed": Run(path).config["seed"]}
+        told |= {"revision": Run(path).config.get("revision", 1)}
         told |= {"limit": job.task.hazard.limit, "ahead": k + 1, "steps": int(near.sum())}
         told |= {f"error_{q}": round(float(np.quantile((foreseen - came)[near], q)), 4) for q in LEVELS}
         rows.append(told)
@@ -59,7 +61,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
     rows = [r for path in sorted(a.runs) for r in rows_of(path)]
-    write(a.out, rows)
+    about = {tuple(str(r[k]) for k in ABOUT) for r in rows}
+    kept = [r for r in read(a.out) if tuple(r[k] for k in ABOUT) not in about]  # of other tasks or revisions
+    write(a.out, sorted(kept + rows, key=lambda r: (r["task"], int(r["revision"]), int(r["ahead"]))))
     for r in rows:
         print(*(f"{k}={r[k]}" for k in ("task", "ahead", "error_0.5", "error_0.95", "error_0.99")), flush=True)
 

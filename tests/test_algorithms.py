@@ -285,7 +285,7 @@ def test_a_margin_moves_only_where_it_should(trained, small_store):
     kept, _ = fixed.act(kept, seen, state, jax.random.key(1))
     unsafe = float(moving.hazard.clearance(moving.feature_map(seen, state)).min()) < 0
     assert float(kept["margin"][0]) == np.float32(0.02)
-    assert float(memory["margin"][0]) == pytest.approx(0.02 + 0.2 * 0.075 * (unsafe - 0.0125))
+    assert float(memory["margin"][0]) == pytest.approx(0.02 + 0.2 * 0.075 * (unsafe - moving.options.rate))
     for wrong, said in (
         ({"adapt": 0.1, "shield": 1, "select": "barrier"}, "adapt=0.1 reads the clearance"),
         ({"adapt": 0.1}, "a margin that nothing reads"),

@@ -48,7 +48,7 @@ class PlanOptions:
     margin: float = 0.02  # least safety score that is good enough (m or m/s for clearance)
     share: float = 0.0  # of the hazard's own safe margin that is added to the margin: the same for every speed limit
     adapt: float = 0.0  # the margin's step after an unsafe state, in the hazard's safe margins; 0: it stays
-    rate: float = 0.00625  # share of unsafe states at which an adapting margin settles: half of 25 in 1000
+    rate: float = 0.00625  # share of unsafe states at which an adapting margin settles: a quarter of 25 in 1000
     prefix: int = 3  # rows of the plan that are judged
     shield: int = 0  # rounds that correct the actions which forward dynamics finds unsafe; 0: act as planned
     foresight: bool = True  # judge plans by where forward dynamics says they lead, not by what they say
