@@ -27,6 +27,7 @@ STEPS, AHEAD, NEAR = 20_000, 3, 0.3
 
 def rows_of(path: Path) -> list[dict]:
     job, policy = evaluate.load(path, planner="shielded")
+    run = Run(path).config
     store, _ = make(tasks.get(job.task.name))
     rng = np.random.default_rng(0)
     episode = rng.integers(0, store.episodes, STEPS)
@@ -47,9 +48,9 @@ def rows_of(path: Path) -> list[dict]:
         state = policy.foreseen_step(now[:, None], state, jnp.asarray(store.actions[step + k]))
         foreseen, came = least(state), least(seen(k + 1))
         near = np.abs(foreseen) < NEAR
-        told = {"task": job.task.name, "algorithm": job.algorithm.name, "seed": Run(path).config["seed"]}
-        told |= {"revision": Run(path).config.get("revision", 1)}
-        told |= {"limit": job.task.hazard.limit, "ahead": k + 1, "steps": int(near.sum())}
+        told = {"task": job.task.name, "algorithm": job.algorithm.name, "seed": run["seed"]}
+        told |= {"revision": run.get("revision", 1), "limit": job.task.hazard.limit}
+        told |= {"ahead": k + 1, "steps": int(near.sum())}
         told |= {f"error_{q}": round(float(np.quantile((foreseen - came)[near], q)), 4) for q in LEVELS}
         rows.append(told)
     return rows

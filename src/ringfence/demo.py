@@ -20,9 +20,8 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     episodes = 50 if quick else 200
     store, path = make(task, 20_000 if quick else None)
     console.print(f"data        {store.episodes:,} episodes, return {store.returns.mean():.1f}: {path}", soft_wrap=True)
-    small = {"steps": 60, "batch": 32, "barrier_batch": 16, "width": 64, "critic_updates": 100} | {
-        "dynamics_updates": 100
-    }
+    small = {"steps": 60, "batch": 32, "barrier_batch": 16, "width": 64}
+    small |= {"critic_updates": 100, "dynamics_updates": 100}
     shared = {"out": out / "runs", "changes": small if quick else {}}
     cloned = training.train("bc", store, out=out / "runs", changes={"steps": 60} if quick else {})[0]
     plain = training.train("madiff", store, **shared)[0]

@@ -172,9 +172,9 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 
 # Least and largest value that a field of this name may have, in whatever config it is.
 RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps", "inverse_width"), (1, None))
-RANGES |= dict.fromkeys(("dynamics_updates", "dynamics_width"), (1, None))
 RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "bank", "bank_batch", "gradient_batch"), (1, None))
-RANGES |= dict.fromkeys(("critic_updates", "search_iterations", "search_samples", "cql_samples"), (1, None))
+RANGES |= dict.fromkeys(("critic_updates", "dynamics_updates", "dynamics_width"), (1, None))
+RANGES |= dict.fromkeys(("search_iterations", "search_samples", "cql_samples"), (1, None))
 RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
 RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
 RANGES |= dict.fromkeys(("history", "warmup", "barrier_weight", "delta", "cql_weight", "cql_noise"), (0, None))

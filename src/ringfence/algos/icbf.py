@@ -160,7 +160,7 @@ def init(
 ) -> PyTree:
     """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
     for the statistics, which is all that a checkpoint's template needs."""
-    kd, kb, ki, _, ks = jax.random.split(key, 5)
+    kd, kb, ki, _, ks = jax.random.split(key, 5)  # the fourth was forward dynamics': others start as they always did
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
 
@@ -301,18 +301,14 @@ def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Confi
     return loss, (jnp.where(mask, plan, clean), noised, mask)
 
 
-def steps_of(batch: Batch, now: int) -> tuple[Array, Array, Array, Array]:
-    """Before, after (B, P, N, D), action (B, P, N, A) and valid (B, P, 1) of the first P steps of the windows."""
-    last = min(now + INVERSE_STEPS, batch.features.shape[1] - 1)
-    before, after = batch.features[:, now:last], batch.features[:, now + 1 : last + 1]
-    return before, after, batch.actions[:, now:last], batch.valid[:, now + 1 : last + 1, None].astype(jnp.float32)
-
-
 def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, key: Key, config: Config) -> Array:
     """L^P = E ‖a_i − f_φi(s̃_i,t, s̃_i,t+1)‖² on data pairs, summed over the action and averaged over agents."""
-    before, after, action, valid = steps_of(batch, config.history)
+    now = config.history
+    last = min(now + INVERSE_STEPS, batch.features.shape[1] - 1)
+    before, after = batch.features[:, now:last], batch.features[:, now + 1 : last + 1]
+    valid = batch.valid[:, now + 1 : last + 1, None].astype(jnp.float32)
     inferred = infer_action(params["inverse"], norm, before, after, key, config.inverse_noise)
-    error = ((inferred - action) ** 2).sum(-1)
+    error = ((inferred - batch.actions[:, now:last]) ** 2).sum(-1)
     return (error * valid).sum() / (valid.sum() * error.shape[-1])
 
 
@@ -556,7 +552,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 
 
 # 1: the scale of the critic that ranks plans missed some agents' views of states, or some moments. 2: forward dynamics
-# was trained with the planner, on as few rows.
+# was trained with the planner, on fewer rows.
 REVISION = 3
 ICBF = Algorithm(
     "icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, reads=reads, revision=REVISION

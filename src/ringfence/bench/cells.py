@@ -216,7 +216,7 @@ def make_grid(
     for name in names:
         task = tasks.get(name)
         for e in chosen.entries:
-            if not e.plays(task) or (only and not set(only) & set(e.names(task))):
+            if not e.plays(task.tier) or (only and not set(only) & set(e.names(task))):
                 continue
             played = tuple((e.variant(task, v), v) for v in e.evaluations)
             preset = e.preset_for(task)

@@ -27,8 +27,9 @@ class Entry:
     evaluations: tuple[str, ...] = ("plain",)
     tiers: tuple[str, ...] = ()  # empty: all
 
-    def plays(self, task: Task) -> bool:
-        return not self.tiers or task.tier in self.tiers
+    def plays(self, tier: str) -> bool:
+        """Whether it is played on tasks of this tier."""
+        return not self.tiers or tier in self.tiers
 
     @property
     def name(self) -> str:

@@ -223,7 +223,7 @@ def _entry_job(entry: suites.Entry) -> str:
 def _planned(suite: str, task: str, job: str) -> bool:
     """Whether the suite has this job on this task; jobs it does not know are expected on every task."""
     entries = [e for e in _suite(suite) if _entry_job(e) == job]
-    return not entries or any(not e.tiers or _tier(task) in e.tiers for e in entries)
+    return not entries or any(e.plays(_tier(task)) for e in entries)
 
 
 def _lacking(suite: str, task: str, job: str, run: Run) -> list[str]:
@@ -231,7 +231,7 @@ def _lacking(suite: str, task: str, job: str, run: Run) -> list[str]:
     preset = run.config["preset"]
     known = {v.removeprefix(preset).removeprefix("+") or "plain" for v in run.results if v.startswith(preset)}
     entries = [e for e in _suite(suite) if _entry_job(e) == _job(task, job)]
-    return [v for e in entries for v in e.evaluations if not e.tiers or _tier(task) in e.tiers if v not in known]
+    return [v for e in entries for v in e.evaluations if e.plays(_tier(task)) and v not in known]
 
 
 def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
