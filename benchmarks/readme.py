@@ -107,9 +107,11 @@ def main() -> None:
     put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
-        speed += [(r["name"], r["value"], r["unit"], r["command"]) for r in json.loads(file.read_text())]
-    lines = ["| what | measured | command |", "|---|---|---|"]
-    lines += [f"| {name} | {value:.4g} {unit} | `{command}` |" for name, value, unit, command in speed]
+        speed += json.loads(file.read_text())
+    lines = ["| what | measured | processor | command |", "|---|---|---|---|"]
+    for r in speed:
+        processor = r["machine"].split(",")[0].replace("Intel(R) Xeon(R) Processor", "Xeon").replace("AMD ", "")
+        lines.append(f"| {r['name']} | {r['value']:.4g} {r['unit']} | {processor} | `{r['command']}` |")
     put("docs/performance.md", "performance", "\n".join(lines))
 
 

@@ -115,10 +115,16 @@ def test_all_is_the_smallest_clearance(rows):
     unsafe, safe = bound.labels(x)
     np.testing.assert_array_equal(unsafe, labels[0][0] | labels[1][0])
     np.testing.assert_array_equal(safe, labels[0][1] & labels[1][1])  # metres and m/s by margins of their own
-    assert (safe & (bound.clearance(x) < bound.safe_margin)).any()
     clearance = jax.jit(bound.clearance)
-    np.testing.assert_allclose(clearance(x), np.minimum(*each), atol=1e-6)
-    assert (clearance(jax.jit(bound.endanger)(x, jax.random.key(1))) < 0).all()
+    np.testing.assert_allclose(clearance(x), np.minimum(each[0], each[1] * 0.075 / 0.16), atol=1e-6)
+    np.testing.assert_array_equal(safe, clearance(x) >= bound.safe_margin)  # so one share of the margin suits both
+    made = jax.jit(bound.endanger)(x, jax.random.key(1))
+    assert (clearance(made) < 0).all()
+    for part, before in zip(parts, labels, strict=True):  # each hazard gets examples of its own
+        now = hazards.bind(part, table.names, 3).labels(made)[0]
+        assert (np.asarray(now) & ~np.asarray(before[0])).any()
+    with pytest.raises(UserError, match="safe_margin above 0"):
+        hazards.bind(hazards.All((parts[0], hazards.SpeedLimit(0.8, ("own.vx",), 0.0))), table.names, 3)
     with pytest.raises(UserError, match="a formula for each"):
         hazards.bind(hazards.All((hazards.CostColumn(),)), table.names, 3)
     with pytest.raises(UserError, match="at least one hazard"):

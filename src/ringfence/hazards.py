@@ -49,7 +49,7 @@ class CostColumn:
 @dataclass(frozen=True)
 class All:
     """Every hazard at once: unsafe for any is unsafe, and safe is what every one calls safe by its own margin. The
-    clearance is the smallest one, of quantities that should share a unit where plans are judged by it."""
+    clearance is the smallest one, in the unit of the first: metres and m/s are compared by their safe margins."""
 
     hazards: tuple[Separation | SpeedLimit, ...]
 
@@ -108,14 +108,23 @@ def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
     if not parts or not all(p.has_formula for p in parts):
         raise UserError("All(...) needs at least one hazard and a formula for each; leave CostColumn out of it.")
 
+    unit = parts[0].safe_margin
+    if any(p.safe_margin != unit for p in parts) and not all(p.safe_margin > 0 for p in parts):
+        raise UserError("All(...) compares its hazards by their safe margins; give each a safe_margin above 0.")
+    scales = [1.0 if p.safe_margin == unit else unit / p.safe_margin for p in parts]
+
     def endanger(x: Array, key: Key) -> Array:
-        return parts[0].endanger(x, key)
+        """Each by a hazard drawn at random."""
+        k1, k2 = jax.random.split(key)
+        made = jnp.stack([p.endanger(x, k1) for p in parts])
+        pick = jax.random.randint(k2, x.shape[:-1], 0, len(parts))
+        return jnp.take_along_axis(made, pick[None, ..., None], axis=0)[0]
 
     return BoundHazard(
         hazard,
-        lambda x: least([p.clearance(x) for p in parts]),
+        lambda x: least([s * p.clearance(x) for s, p in zip(scales, parts, strict=True)]),
         endanger,
-        max(p.safe_margin for p in parts),
+        unit,
         tuple(parts),
     )
 
