@@ -156,9 +156,12 @@ def test_random_actions_score_as_published():
 
 
 def test_share_of_resets_in_contact():
-    position = SimpleSpread().reset(jax.random.key(1), 100_000).position
-    share = float(in_contact(position).any((-1, -2)).mean())
+    env, n = SimpleSpread(), 100_000
+    first = env.reset(jax.random.key(1), n)
+    share = float(in_contact(first.position).any((-1, -2)).mean())
     assert abs(share - 0.176) < 4 * np.sqrt(0.176 * 0.824 / 100_000) + 5e-4  # the figure is rounded to 0.1 %
+    still = jax.jit(env.step)(first, jnp.zeros((n, env.n_agents, 2)))[1].cost > 0  # after a step of doing nothing
+    assert abs(float(still.mean()) - 0.007) < 4 * np.sqrt(0.007 / n) + 5e-4
 
 
 # ---------------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,54 @@
+"""What is in every data set of the tasks: the numbers of docs/data.md.
+
+python benchmarks/data_sets.py        # writes results/data.csv
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from _rows import write
+
+from ringfence import tasks
+from ringfence.bench.suites import SUITES
+from ringfence.data.audit import disagreement
+from ringfence.data.make import make
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "data.csv"
+
+
+def row(name: str) -> dict:
+    """Returns, costs and limits of a task's whole data set."""
+    task = tasks.get(name)
+    store, _ = make(task)
+    returns, costs, lengths = store.returns, store.episode_costs, store.lengths
+    return {
+        "task": name,
+        "transitions": store.steps,
+        "episodes": store.episodes,
+        "steps_mean": round(float(lengths.mean()), 1),
+        "return_mean": round(float(returns.mean()), 2),
+        "return_std": round(float(returns.std()), 2),
+        "return_min": round(float(returns.min()), 2),
+        "return_max": round(float(returns.max()), 2),
+        "cost_mean": round(float(costs.mean()), 3),
+        "terminated": round(float(np.add.reduceat(store.terminated, [0, *store.episode_ends[:-1]]).mean()), 4),
+        "disagreement": round(disagreement(store, task), 4),  # share of steps whose cost is not what the hazard says
+        "speed_limit": store.card.get("speed_limit", ""),
+        "return_ceiling": round(store.card["return_ceiling"], 1) if "return_ceiling" in store.card else "",
+    }
+
+
+def main() -> None:
+    rows = []
+    for suite in SUITES.values():
+        for name in suite.tasks:
+            if name not in {r["task"] for r in rows}:
+                rows.append(row(name))
+                print(*(f"{k}={v}" for k, v in rows[-1].items()), flush=True)
+    write(OUT, rows)
+
+
+if __name__ == "__main__":
+    main()
