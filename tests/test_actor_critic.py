@@ -1,7 +1,5 @@
 """The actor-critic baselines: what their losses ask for, on networks small enough to compute by hand."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -100,32 +98,6 @@ def test_expectile_is_asymmetric():
     sample, grid = jnp.asarray([0.0, 1.0]), jnp.linspace(0, 1, 1001)
     best = grid[jnp.argmin(fisor.expectile(sample[None] - grid[:, None], 0.9).sum(1))]
     assert abs(float(best) - 0.9) < 2e-3
-
-
-def test_units_of_actions_are_inverse():
-    spec = Spec("t", 1, 2, ("a",), -0.5, 2.0, 25)
-    a = jnp.asarray([[-0.5, 2.0], [0.0, 1.0]])
-    np.testing.assert_allclose(fisor.from_unit(ac.to_unit(a, spec), spec), a, atol=1e-6)
-    assert float(jnp.abs(ac.to_unit(a, spec)).max()) == 1.0
-
-
-@pytest.mark.parametrize("learner, more", [(td3bc, {"target_noise": 0.2}), (omar, {"cql_actions": "policy"})])
-def test_bounds_of_actions_change_no_lesson(learner, more):
-    """Actions told in other units teach the same networks."""
-    config = learner.Config(width=4, batch=8, **more)
-    k = jax.random.split(jax.random.key(0), 3)
-    action = jax.random.uniform(k[0], (8, 1, 2, 2), minval=-1.0)
-    zeros, one = jnp.zeros((8, 2)), jnp.ones((8, 1), bool)
-    x = jax.random.normal(k[1], (8, 2, 2, 3))
-    new = []
-    for spec, told in ((SPEC, action), (replace(SPEC, action_low=2.0, action_high=8.0), 5.0 + 3.0 * action)):
-        state = learner.init(k[2], spec, config, None, None, None)
-        plain = Normaliser(jnp.zeros(3), jnp.ones(3), jnp.zeros((1, 3)), jnp.ones((1, 3)), 0, "displacement")
-        state["frozen"] = {"normaliser": plain}
-        batch = Batch(x, told, zeros == 0, zeros[:, 0], zeros, jnp.ones((8, 1, 2)), ~one)
-        new.append(learner.make_update(config, spec, None, None)(state, batch, k[2])[0]["params"])
-    for a, b in zip(*map(jax.tree.leaves, new)):
-        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
 def test_threshold_of_the_multiplier():

@@ -60,6 +60,22 @@ def test_contract(name, trained):
     np.testing.assert_array_equal(*actions)
 
 
+@pytest.mark.parametrize("name", algos.ALGORITHMS)
+def test_policies_act_within_any_bounds(name, trained):
+    """What was learned between −1 and 1 is played between the bounds of the task."""
+    options = {"planner": "guarded", "steps": 2, "plans": 2, "shield": 1} if name in ("icbf", "madiff") else {}
+    _, policy = evaluate.load(trained[name], **options)
+    env, acted = tasks.get("simple_spread-random").env, []
+    state = env.reset(jax.random.key(0), 5)
+    seen, whole = env.observe(state), env.global_state(state)
+    for low, high in ((-1.0, 1.0), (2.0, 8.0)):
+        spec = dataclasses.replace(policy.spec, action_low=low, action_high=high)
+        told = dataclasses.replace(policy, spec=spec)
+        act = jax.jit(lambda key, told=told: told.act(told.start(5), seen, whole, key)[1].action)
+        acted.append(np.asarray(act(jax.random.key(1))))
+    np.testing.assert_allclose(acted[1], 5 + 3 * acted[0], atol=1e-4)
+
+
 def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path):
     """To the last bit, with a chunk length that does not divide the checkpoint's step."""
 

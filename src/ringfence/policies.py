@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import diffusion
+from ringfence import diffusion, normalise
 from ringfence.dynamics import foresee
 from ringfence.errors import UserError, unknown
 from ringfence.features import FeatureMap
@@ -189,13 +189,13 @@ class Planner(eqx.Module):
                 lambda: (memory["plan"], self._no_news(present.shape[0])),
             )
             ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
-        action = infer_action(self.networks["inverse"], self.normaliser, present, ahead)
-        action = jnp.clip(action, self.spec.action_low, self.spec.action_high)
+        action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         if o.shield:
             action = self.shielded(plan, margin)
         if self.history:
             past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
-        return {"past": past, "plan": plan, "age": memory["age"] + 1, "margin": margin}, PolicyStep(action, info)
+        memory = {"past": past, "plan": plan, "age": memory["age"] + 1, "margin": margin}
+        return memory, PolicyStep(from_unit(action, self.spec), info)
 
     def adapted(self, margin: Array, present: Array) -> Array:
         """Margins (B,) after a look at where the last actions led, (B, N, D): m ← m + η (1[unsafe] − rate).
@@ -293,12 +293,12 @@ class Planner(eqx.Module):
         return self.tracked(x)[0] if o.foresight else x[:, now + 1 : last]
 
     def tracked(self, x: Array) -> tuple[Array, Array]:
-        """States (B, P, N, D), actions (B, P, N, A) when inverse dynamics tracks the first P = prefix rows of plans."""
+        """States (B, P, N, D), actions (B, P, N, A) in [−1, 1]: inverse dynamics tracks P = prefix rows of plans."""
         now = self.history
         state, states, actions = x[:, now], [], []
         for row in range(now + 1, min(now + 1 + self.options.prefix, x.shape[1])):
             action = infer_action(self.networks["inverse"], self.normaliser, state, x[:, row])
-            actions.append(jnp.clip(action, self.spec.action_low, self.spec.action_high))
+            actions.append(jnp.clip(action, -1.0, 1.0))
             state = self.foreseen_step(x[:, : now + 1], state, actions[-1])
             states.append(state)
         return jnp.stack(states, 1), jnp.stack(actions, 1)
@@ -309,7 +309,7 @@ class Planner(eqx.Module):
         return self.agreed(jnp.concatenate([known, state[:, None]], 1))[:, -1]
 
     def shielded(self, plan: Array, margin: Array) -> Array:
-        """Joint action (B, N, A) of the plan (B, rows, N, D), corrected until its foreseen rows keep the margin.
+        """Joint action (B, N, A) in [−1, 1] of the plan (B, rows, N, D), corrected until foreseen rows keep the margin.
 
         Polyak's steps on the shortfall f(a) = Σ min(safety − margin, 0) over agents and rows, whose goal is 0:
         a ← a − f ∇f / ‖∇f‖², within the action bounds. Where nothing falls short the plan's own action is kept.
@@ -329,7 +329,7 @@ class Planner(eqx.Module):
             slope = back(jnp.ones_like(f))[0]
             size = jnp.maximum((slope**2).sum((1, 2, 3)), 1e-6)
             moved = actions - (f / size)[:, None, None, None] * slope
-            return jnp.clip(moved, self.spec.action_low, self.spec.action_high), None
+            return jnp.clip(moved, -1.0, 1.0), None
 
         return jax.lax.scan(correct, actions, length=o.shield)[0][:, 0]
 
@@ -385,13 +385,12 @@ class Direct(eqx.Module):
 
     def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
         x = self.normaliser.state(self.feature_map(observations, state))
-        return memory, PolicyStep(squash(self.actor(x), self.spec), {})
+        return memory, PolicyStep(from_unit(jnp.tanh(self.actor(x)), self.spec), {})
 
 
-def squash(x: Array, spec: Spec) -> Array:
-    """tanh into [action_low, action_high]."""
-    middle, half = (spec.action_high + spec.action_low) / 2, (spec.action_high - spec.action_low) / 2
-    return middle + half * jnp.tanh(x)
+def from_unit(action: Array, spec: Spec) -> Array:
+    """Actions in [−1, 1], as everything learns them, in the task's bounds."""
+    return normalise.from_unit(action, spec.action_low, spec.action_high)
 
 
 class Constant(eqx.Module):

@@ -48,7 +48,8 @@ def mean_of_runs(
 
     Two sources of chance are added in quadrature: which resets were drawn (percentile bootstrap, a reset drawn for all
     runs at once) and which runs were trained (Student's t of the runs' means, R − 1 degrees of freedom). A bootstrap
-    over two or three runs would cover a half or three quarters where it says 95 %. One run leaves the second part out: it is unknown.
+    over two or three runs would cover a half or three quarters where it says 95 %. One run leaves the second part out:
+    it is unknown.
     """
     x = np.asarray(x, np.float64)
     counted = np.ones_like(x) if counted is None else np.asarray(counted, np.float64)

@@ -239,6 +239,9 @@ def _misfit(store: EpisodeStore, env: Env) -> str:
     ):
         if here != there:
             return f"has {here} {what}, its simulator {there}"
+    low, high = store.card["action_low"], store.card["action_high"]
+    if (low, high) != (-1.0, 1.0):
+        return f"has actions from {low:g} to {high:g}, its simulator from -1 to 1"
     names = store.card["state_names"]
     if names and list(names) != list(env.state_names):
         k = next(k for k, (a, b) in enumerate(zip(names, env.state_names)) if a != b)

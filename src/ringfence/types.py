@@ -70,10 +70,10 @@ class Spec:
 
 
 class Batch(NamedTuple):
-    """Windows of data, in physical units; with history, H counts its rows too."""
+    """Windows of data, in physical units but for actions; with history, H counts its rows too."""
 
     features: Array  # (B, H, N, D) s̃_i at t .. t+H-1; the tail past the episode's end repeats the last state
-    actions: Array  # (B, H-1, N, A) the action between rows h and h+1 (0 where padded)
+    actions: Array  # (B, H-1, N, A) the action between rows h and h+1, its bounds at −1 and 1 (0 where padded)
     valid: Array  # (B, H) bool: the row is not past the episode's end; history before its start repeats the first state
     score: Array  # (B,) normal score of the window's value among the data: the condition y
     costs: Array  # (B, H) cost charged on arriving in the row; −1 in an episode's first state, where nobody arrived

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import values
+from ringfence import normalise, values
 from ringfence.data.store import EpisodeStore
 from ringfence.types import Array, Batch, Key, PyTree
 
@@ -48,6 +48,7 @@ class WindowData:
         team = store.rewards.mean(1)
         row, last = step + episode, store.episode_ends[episode] + episode
         x = jnp.asarray(np.asarray(features(store.observations, store.state), np.float32))
+        bounds = store.card["action_low"], store.card["action_high"]
         self.steps = store.steps
         self.critic = critic
         self.dynamics: PyTree = None
@@ -70,7 +71,7 @@ class WindowData:
                 scores = return_scores(togo, time)
         self.arrays = {
             "features": x,  # (M, N, D)
-            "actions": jnp.asarray(store.actions),  # (T, N, A)
+            "actions": normalise.to_unit(jnp.asarray(store.actions), *bounds),  # (T, N, A)
             "rewards": jnp.asarray(store.rewards),  # (T, N)
             "terminated": jnp.asarray(store.terminated),  # (T,)
             "scores": jnp.asarray(scores, jnp.float32),  # (T,)

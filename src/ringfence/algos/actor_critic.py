@@ -6,8 +6,6 @@ its own reward, as in OMAR's study (Pan et al. 2022); with `joint`, Q_i reads ev
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,7 +14,7 @@ import numpy as np
 from ringfence import normalise
 from ringfence.nets import MLP
 from ringfence.optim import Optimiser, fresh
-from ringfence.policies import Direct, squash
+from ringfence.policies import Direct
 from ringfence.types import Array, Batch, Key, PyTree, Spec
 from ringfence.windows import WindowData, at
 
@@ -90,25 +88,11 @@ class Transitions(eqx.Module):
     bootstrap: Array  # (B, 1): 0 after a terminal state, 1 otherwise; the time limit is no end
 
 
-def to_unit(action: Array, spec: Spec) -> Array:
-    """Actions of the task's bounds, told in [−1, 1]."""
-    return 2.0 * (action - spec.action_low) / (spec.action_high - spec.action_low) - 1.0
-
-
-def in_units(spec: Spec) -> Spec:
-    """The same task with actions in [−1, 1], where weights, noise and searches mean the same in any bounds."""
-    return replace(spec, action_low=-1.0, action_high=1.0)
-
-
-def transitions(batch: Batch, norm: normalise.Normaliser, spec: Spec | None = None) -> Transitions:
-    """The present step of each window; given the spec, actions are told in [−1, 1]. Those bounded so anyway are
-    left as they are, to the last bit."""
-    action = batch.actions[:, 0]
-    if spec is not None and (spec.action_low, spec.action_high) != (-1.0, 1.0):
-        action = to_unit(action, spec)
+def transitions(batch: Batch, norm: normalise.Normaliser) -> Transitions:
+    """The present step of each window."""
     x = norm.state(batch.features[:, :2])
     alive = 1.0 - batch.terminated[:, :1].astype(jnp.float32)
-    return Transitions(x[:, 0], action, batch.rewards[:, 0], x[:, 1], alive)
+    return Transitions(x[:, 0], batch.actions[:, 0], batch.rewards[:, 0], x[:, 1], alive)
 
 
 def joint(x: Array) -> Array:
@@ -140,9 +124,9 @@ def make_actor(key: Key, spec: Spec, width: int) -> MLP:
     return MLP(key, (spec.feature_dim, width, width, spec.action_dim), groups=spec.n_agents, final_scale=3e-3)
 
 
-def act(actor: MLP, x: Array, spec: Spec) -> Array:
-    """Actions (B, N, A) on standardised states (B, N, D)."""
-    return squash(actor(x), spec)
+def act(actor: MLP, x: Array) -> Array:
+    """Actions (B, N, A) in [−1, 1] on standardised states (B, N, D)."""
+    return jnp.tanh(actor(x))
 
 
 def fit_states(data: WindowData | None, spec: Spec, key: Key) -> normalise.Normaliser:

@@ -13,7 +13,7 @@ from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
 from ringfence.optim import Optimiser, average, fresh
-from ringfence.policies import Direct, squash
+from ringfence.policies import Direct
 from ringfence.types import Algorithm, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData
 
@@ -70,7 +70,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     opt = _optimiser(config)
 
     def loss(params: PyTree, frozen: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-        action = squash(params["actor"](frozen["normaliser"].state(batch.features[:, 0])), spec)
+        action = ac.act(params["actor"], frozen["normaliser"].state(batch.features[:, 0]))
         value = ((action - batch.actions[:, 0]) ** 2).sum(-1).mean()
         return value, {"loss/cloning": value}
 

@@ -29,6 +29,7 @@ from ringfence.nets import MLP
 from ringfence.nets.embedding import sinusoidal
 from ringfence.normalise import Normaliser
 from ringfence.optim import Optimiser
+from ringfence.policies import from_unit
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
 from ringfence.windows import WindowData
 
@@ -114,10 +115,6 @@ def proposed(actor: MLP, x: Array, noisy: Array, k: Array) -> Array:
     return actor(jnp.concatenate([x, noisy, level], -1))
 
 
-def from_unit(x: Array, spec: Spec) -> Array:
-    return spec.action_low + (jnp.clip(x, -1.0, 1.0) + 1.0) / 2.0 * (spec.action_high - spec.action_low)
-
-
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; one Adam step on every network."""
     opt, alpha_bar = optimiser(config), diffusion.cosine_schedule(config.diffusion_steps)
@@ -149,9 +146,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             better = jnp.exp(config.temperature_reward * (q_reward - v_reward)) * (q_danger <= 0)
             safer = jnp.exp(-config.temperature_danger * (q_danger - v_danger))
             weight = jax.lax.stop_gradient(jnp.minimum(jnp.where(feasible, better, safer), WEIGHT_MAX)).T
-            clean = ac.to_unit(t.action, spec)
-            noised = diffusion.add_noise(clean, jnp.zeros(clean.shape, bool), jnp.asarray(alpha_bar), key)
-            error = ((proposed(p["actor"], t.x, noised.x, noised.k) - clean) ** 2).sum(-1)
+            noised = diffusion.add_noise(t.action, jnp.zeros(t.action.shape, bool), jnp.asarray(alpha_bar), key)
+            error = ((proposed(p["actor"], t.x, noised.x, noised.k) - t.action) ** 2).sum(-1)
             losses["loss/actor"] = (weight * error).mean(0).sum()
             more = {"feasible": feasible.mean(), "weight": weight.mean(), "error": error.mean()}
             return sum(losses.values()), losses | more
@@ -196,10 +192,10 @@ class Proposer(eqx.Module):
         bar = np.asarray(self.alpha_bar)
         shape = (b * s, n, self.spec.action_dim)
         drawn = diffusion.sample(predict, lambda z: z, shape, bar, key, len(bar), "ddpm")
-        actions = jnp.moveaxis(from_unit(drawn, self.spec).reshape(b, s, n, -1), 1, 2)  # (B, N, S, A)
+        actions = jnp.moveaxis(jnp.clip(drawn, -1.0, 1.0).reshape(b, s, n, -1), 1, 2)  # (B, N, S, A)
         q = jnp.moveaxis(self.danger(x, actions).max(1), 0, 1)  # (B, N, S)
         best = jnp.take_along_axis(actions, q.argmin(-1)[..., None, None], 2)[:, :, 0]
-        return memory, PolicyStep(best, {})
+        return memory, PolicyStep(from_unit(best, self.spec), {})
 
 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, options=None) -> Proposer:

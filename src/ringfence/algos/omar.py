@@ -21,7 +21,6 @@ from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.optim import Optimiser
-from ringfence.policies import squash
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData
 
@@ -98,14 +97,13 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
     x (B, N, D), own (B, N, A), standard normal noise (B, N or 1, iterations, S, A).
     """
     first = critic.first(spec.n_agents)
-    low, high = spec.action_low, spec.action_high
 
     def value(actions: Array) -> Array:
         return jnp.moveaxis(first(x, actions)[:, 0], 0, 1)  # (B, N, S)
 
     mean, deviation, elites = jnp.zeros(own.shape), jnp.full(own.shape, config.search_deviation), None
     for i in range(config.search_iterations):
-        actions = jnp.clip(mean[:, :, None] + deviation[:, :, None] * noise[:, :, i], low, high)
+        actions = jnp.clip(mean[:, :, None] + deviation[:, :, None] * noise[:, :, i], -1.0, 1.0)
         if elites is not None:
             actions = jnp.concatenate([actions, elites], 2)
         q = value(actions)
@@ -125,31 +123,29 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
     opt = optimiser(config)
-    given, spec = spec, ac.in_units(spec)
-    low, high = spec.action_low, spec.action_high
-    uniform_density = -spec.action_dim * jnp.log(high - low)
+    uniform_density = -spec.action_dim * jnp.log(2.0)
 
     def noisy(key: Key, action: Array) -> tuple[Array, Array]:
         """Samples (B, N, S, A) around the actors' actions, and their log densities (B, N, S)."""
         shape = (*action.shape[:2], config.cql_samples, action.shape[-1])
         noise = config.cql_noise * jax.random.normal(key, shape)
         density = -0.5 * (noise / config.cql_noise) ** 2 - jnp.log(config.cql_noise) - 0.5 * jnp.log(2 * jnp.pi)
-        return jnp.clip(action[:, :, None] + noise, low, high), density.sum(-1)
+        return jnp.clip(action[:, :, None] + noise, -1.0, 1.0), density.sum(-1)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         ku, kp, kn, ks = jax.random.split(key, 4)
-        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
+        t = ac.transitions(batch, state["frozen"]["normaliser"])
         params, target = state["params"], state["target"]
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
-            t.ahead, ac.act(target["actor"], t.ahead, spec)
+            t.ahead, ac.act(target["actor"], t.ahead)
         ).min(1)
         b, n, a = t.action.shape
-        drawn = jax.random.uniform(ku, (b, 1, config.cql_samples, a), minval=low, maxval=high)
+        drawn = jax.random.uniform(ku, (b, 1, config.cql_samples, a), minval=-1.0, maxval=1.0)
         drawn = jnp.broadcast_to(drawn, (b, n, config.cql_samples, a))
         densities = jnp.full((b, n, config.cql_samples), uniform_density)
         if config.cql_actions == "policy":
-            here, d_here = noisy(kp, ac.act(params["actor"], t.x, spec))
-            ahead, d_ahead = noisy(kn, ac.act(params["actor"], t.ahead, spec))
+            here, d_here = noisy(kp, ac.act(params["actor"], t.x))
+            ahead, d_ahead = noisy(kn, ac.act(params["actor"], t.ahead))
             drawn = jnp.concatenate([drawn, here, ahead], 2)
             densities = jnp.concatenate([densities, d_here, d_ahead], 2)
         # The logged action rides along as one more sample: the critic is then read once.
@@ -170,7 +166,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         critics, moments, norms = opt.update({"critic": grads}, state["opt"], {"critic": params["critic"]})
         critic, searched = critics["critic"], None
         if config.coefficient > 0:
-            own = ac.act(params["actor"], t.x, spec)
+            own = ac.act(params["actor"], t.x)
             # Agents learn apart, so they may share the random numbers, which cost as much as the search itself.
             noise = jax.random.normal(ks, (b, 1, config.search_iterations, config.search_samples, a))
             look = lambda *part: rectified(critic, *part, config, spec)  # noqa: E731
@@ -178,7 +174,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
         def actor_loss(actor) -> tuple[Array, Metrics]:
             logits = actor(t.x)
-            own = squash(logits, spec)
+            own = jnp.tanh(logits)
             loss = config.action_penalty * (own**2).mean((0, 2)).sum()
             # A saturated actor learns nothing any more, and at the study's rate some agent of most runs saturates.
             effort = config.logit_penalty * (logits**2).mean((0, 2))

@@ -110,19 +110,18 @@ def threshold(config: Config, spec: Spec) -> float:
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
     opt, allowed = optimiser(config), threshold(config, spec)
-    given, spec = spec, ac.in_units(spec)
 
     def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
         return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        t = ac.transitions(batch, state["frozen"]["normaliser"], given)
+        t = ac.transitions(batch, state["frozen"]["normaliser"])
         params, target = state["params"], state["target"]
-        next_action = ac.act(target["actor"], t.ahead, spec)
+        next_action = ac.act(target["actor"], t.ahead)
         if config.target_noise > 0:
             bound = config.target_noise_clip
             noise = jnp.clip(config.target_noise * jax.random.normal(key, next_action.shape), -bound, bound)
-            next_action = jnp.clip(next_action + noise, spec.action_low, spec.action_high)
+            next_action = jnp.clip(next_action + noise, -1.0, 1.0)
         here, there = critic_inputs(t.x, t.action), critic_inputs(t.ahead, next_action)
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](*there).min(1)
 
@@ -141,7 +140,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         scale = state["multiplier"]
 
         def actor_loss(actor) -> tuple[Array, tuple[Metrics, Array]]:
-            own = ac.act(actor, t.x, spec)
+            own = ac.act(actor, t.x)
             x = t.x
             if config.centralised_critic:
                 x, acted = ac.joint(t.x), ac.joint_actions(t.action, own)
