@@ -128,6 +128,9 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
         tensorboard=True,
     )
     assert all(list((run.path / "tensorboard").glob("events*")) for run in together)
+    more = dict(changes=changes, quiet=True, together=True)
+    both = training.train("bc", small_store, seeds=(0, 2), out=tmp_path / "b", **more)  # a seed beside those there
+    assert [run.metrics[-1]["step"] for run in both] == [12, 12]
     for x, y in zip(apart, together):
         assert x.metrics[-1]["loss/cloning"] == pytest.approx(y.metrics[-1]["loss/cloning"], rel=1e-4)
 
@@ -304,7 +307,10 @@ def test_a_margin_moves_only_where_it_should(trained, small_store):
     assert float(memory["margin"][0]) == pytest.approx(0.02 + 0.2 * 0.075 * (unsafe - moving.options.rate))
     for wrong, said in (
         ({"adapt": 0.1, "shield": 1, "select": "barrier"}, "adapt=0.1 reads the clearance"),
-        ({"adapt": 0.1}, "a margin that nothing reads"),
+        ({"adapt": 0.1}, "adapt=0.1 is read by nothing that was asked for; set shield=10"),
+        ({"margin": 0.1}, "margin=0.1 is read by nothing"),
+        ({"persist": 0.5, "shield": 1}, "persist=0.5 is read by nothing that was asked for; set ascent"),
+        ({"rate": 0.1, "shield": 1}, "rate=0.1 is read by nothing that was asked for; set adapt"),
         ({"adapt": -0.1, "shield": 1}, "must not be negative"),
         ({"adapt": 0.1, "shield": 1, "rate": 1.5}, "rate=1.5 must be a share"),
     ):
@@ -345,6 +351,16 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         training.train("icbf", small_store, out=tmp_path, changes={**TINY["icbf"], "retention": 1.0})
     with pytest.raises(UserError, match="another run"):
         training.train("icbf", small_store, out=run.path.parents[2], changes={**TINY["icbf"], "lr": 0.1})
+    more = dataclasses.replace(small_store, rewards=small_store.rewards + 1)  # under the same name
+    with pytest.raises(UserError, match="another run .its data's content differs"):
+        training.train("icbf", more, out=run.path.parents[2], changes=TINY["icbf"])
+    with pytest.raises(UserError, match="width=100 must be a multiple of 16"):
+        training.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100})
+    blank = {"card": {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}}}
+    blank = dataclasses.replace(small_store, costs=0 * small_store.costs, **blank)
+    for name in ("icbf", "fisor", "bc-safe", "ma-td3bc-lag"):
+        with pytest.raises(UserError, match=f"{name} is told no danger"):
+            training.train(name, blank, out=tmp_path, changes=TINY[name])
     with pytest.raises(UserError, match="planner"):
         evaluate.evaluate(run, planner="gaurded")
     with pytest.raises(UserError, match="share=0.6 of a margin.*select='barrier'"):

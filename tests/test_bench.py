@@ -90,6 +90,15 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
     assert after["eval_seconds"] > before["eval_seconds"]
 
 
+def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
+    cell = grid.Cell("simple_spread-expert", "bc", "default", 0, (), (("default", "plain"),))
+    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}, "step": 7}
+    Run(cell.folder(tmp_path)).add_result("default", told)
+    assert cell.state(tmp_path, 4) == "to do"
+    Run(cell.folder(tmp_path)).add_result("default", {**told, "step": cell.config.steps})
+    assert cell.state(tmp_path, 4) == "done"
+
+
 @pytest.mark.parametrize(("task", "state"), [("ant_4x2-poor", "to do"), ("halfcheetah_2x3-poor", "done")])
 def test_a_result_that_hides_falls_is_played_again(tmp_path, task, state):
     cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "plain"),))
@@ -372,9 +381,16 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     grid.make_reference(names[0], g.out, 1, 1000)
     told = [Run(c.folder(g.out)).config for c in g.cells]
     assert [t["task"] for t in told] == names and told[0]["hazard"]["limit"] > told[1]["hazard"]["limit"]
-    for cell in g.cells:  # results alone, as a copied folder has them, teach nobody
-        shutil.rmtree(cell.folder(g.out) / "ckpt")
-    assert grid.adopt(other, g.out) is None
+    shutil.rmtree(other.folder(g.out))
+    card = grid.data_of(other.task, 1000).card
+    assert grid.adopt(other, g.out, card | {"simulator": "another"}) is None  # what other steps taught
+    told = native.folder(g.out) / "config.json"
+    now = told.read_text()
+    told.write_text(json.dumps(json.loads(now) | {"revision": 0}))
+    assert grid.adopt(other, g.out, card) is None  # or an older algorithm
+    told.write_text(now)
+    shutil.rmtree(native.folder(g.out) / "ckpt")  # results alone, as a copied folder has them, teach nobody
+    assert grid.adopt(other, g.out, card) is None
 
 
 def test_a_stale_cell_is_named_and_stops_no_other(tmp_path):

@@ -63,6 +63,7 @@ def test_places_that_cannot_be_written_are_refused(tmp_path, monkeypatch, capsys
         ([*make, "--out", ""], "names no file"),
         (["bench", "status", "file"], "no results folder"),
         ([*bench, "--out", "file"], "'file' is a file"),
+        ([*bench, "--steps", "10"], "--steps 10 makes other rows than the suite's own"),
         ([*bench, "--out", "new", "--threads", "0"], "threads=0 must be at least 1"),
         ([*bench, "--out", "new", "--engine", "ray", "--memory", "4"], "--memory is about local processes"),
         (["report", "file/x"], "does not exist"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from ringfence import stats
 from ringfence.algos import ICBF
 from ringfence.errors import UserError
 from ringfence.report import animation, build_report
+from ringfence.report import page as page_of
 from ringfence.report.table import sections
 from ringfence.runs import Run
 
@@ -140,6 +142,20 @@ def test_what_is_no_row_is_refused(runs):
     (runs[1].path / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match="'split' were played for 2 and for 20 episodes"):
         sections(runs)
+
+
+def test_what_was_played_before_training_went_on_is_dated(runs):
+    told = json.loads((runs[0].path / "config.json").read_text())
+    for run in runs[:2]:
+        told = json.loads((run.path / "config.json").read_text())
+        (run.path / "config.json").write_text(json.dumps(told | {"config": told["config"] | {"steps": 30}}))
+    results = runs[0].results
+    results["split"]["step"] = 10
+    (runs[0].path / "results.json").write_text(json.dumps(results))
+    (section,) = sections(runs)
+    seeds = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
+    assert seeds["split@step10"] == (0,) and seeds["split"] == (1,)
+    assert any("--step 10" in line and str(runs[0].path) in line for line in page_of.commands(section, Path("r.html")))
 
 
 def test_a_run_that_is_older_than_a_field_had_its_default(runs):

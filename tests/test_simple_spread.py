@@ -130,6 +130,16 @@ def test_episode_is_truncated_with_the_original():
     assert flags == [False] * 24 + [True]
 
 
+@pytest.mark.parametrize("action", [1, [0.0, 0.0, 0.0], [0.0, np.nan]])
+def test_actions_that_are_no_force_are_refused(action):
+    env = parallel_env()
+    env.reset(seed=0)
+    with pytest.raises(UserError, match="two finite numbers"):
+        env.step(dict.fromkeys(env.agents, action))
+    with pytest.raises(UserError, match="several shapes"):
+        env.step({a: np.zeros(2 + k) for k, a in enumerate(env.agents)})
+
+
 def test_the_integrators_differ_in_what_the_first_action_moves():
     action = jnp.ones((4, 3, 2))
     for name, moves in (("velocity_first", True), ("position_first", False)):

@@ -435,3 +435,20 @@ def test_a_file_larger_than_memory_is_refused_before_it_is_read(tmp_path, small_
     monkeypatch.setattr(store_module, "_memory", lambda: 1000.0)
     with pytest.raises(StoreError, match="GiB of arrays, this machine has 0.0 GiB of memory; take a larger"):
         EpisodeStore.load(small_store.save(tmp_path / "s.h5"))
+
+
+def test_places_far_from_the_origin_are_warned_of(small_store):
+    from ringfence.data.audit import audit
+
+    def coarse(store):
+        return [w for w in audit(store).warnings if "subtract an origin" in w]
+
+    assert not coarse(small_store)
+    far = small_store.observations + np.float32(5.4e6) * np.eye(1, 18, 4, dtype=np.float32)[0]  # a northing in metres
+    assert coarse(dataclasses.replace(small_store, observations=far))[0].startswith("Observation entries 4 are so far")
+
+
+def test_content_tells_steps_apart(small_store):
+    same = dataclasses.replace(small_store, costs=small_store.costs.copy())
+    other = dataclasses.replace(small_store, costs=small_store.costs + 1)
+    assert small_store.content == same.content != other.content

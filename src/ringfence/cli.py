@@ -431,6 +431,10 @@ def bench(
     from ringfence.bench import make_grid, paper
 
     only_tasks, only = sum(tasks, []), sum(algorithms, [])
+    if steps is not None and out_dir is None:
+        raise UserError(
+            f"--steps {steps} makes other rows than the suite's own; give a folder of their own with --out."
+        )
     root, parts = out_dir or Path("results"), {suite: only_tasks}
     if suite == "paper":
         parts, only = paper.parts(only_tasks), only or list(paper.METHODS)
@@ -445,9 +449,11 @@ def bench(
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
         if counts["done"] and suite != "paper":
             bench_results(folder)
+        if lacking := grid.references():
+            _complain(f"The reference rows of {', '.join(lacking)} could not be made; see above.")
         if counts["failed"] or counts["to do"]:
             bench_status(folder)
-            complete = False
+        complete = complete and not (lacking or counts["failed"] or counts["to do"])
     if suite == "paper":
         bench_paper(root)
     if idle:

@@ -190,6 +190,12 @@ def complete(result: dict, task: Task) -> bool:
     return "termination_rate" in result or task.env is None or not task.env.terminates
 
 
+def of_last_step(result: dict, config: dict) -> bool:
+    """Whether a stored result is of a run's last step, by its config; a foreign one may tell none."""
+    steps = config.get("steps")
+    return steps is None or result.get("step", steps) == steps
+
+
 def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
     """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
     view = task.feature_map("pruned")
@@ -397,9 +403,10 @@ def evaluate(
         "parameters": _parameters(policy),
     }
     run.add_result(variant, result)
+    for kind in ("npz", "gif"):
+        (run.path / f"rollout-{variant}.{kind}").unlink(missing_ok=True)  # it would show what was played before
     if record:
         keep = {k: v[:record] for k, v in played.items()}
-        (run.path / f"rollout-{variant}.gif").unlink(missing_ok=True)  # it would show another recording
         with whole(run.path / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, **keep)
     return result

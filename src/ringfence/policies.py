@@ -137,8 +137,14 @@ class Planner(eqx.Module):
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
             )
         judged = o.plans > 1 or o.repair > 0 or o.shield > 0
-        if o.adapt and not judged:
-            raise UserError(f"adapt={o.adapt} moves a margin that nothing reads; set shield=10, or plans above 1.")
+        idle = () if judged else ("margin", "share", "select", "prefix", "foresight", "adapt")
+        idle += () if o.ascent or o.repair else ("persist",)
+        idle += () if o.adapt else ("rate",)
+        needs = {"persist": "ascent or repair", "rate": "adapt"}
+        for name in idle:
+            if getattr(o, name) != getattr(PlanOptions(), name):
+                remedy = needs.get(name, "shield=10, or plans above 1")
+                raise UserError(f"{name}={getattr(o, name)} is read by nothing that was asked for; set {remedy}.")
         if judged and o.select != "clearance" and "barrier" not in self.networks:
             raise UserError(f"select='{o.select}' needs a barrier, which this model has not; use select='clearance'.")
         if judged and o.select != "barrier" and not self.hazard.has_formula:
@@ -264,11 +270,11 @@ class Planner(eqx.Module):
 
         shape = (b, rows, n, d)
         x = diffusion.sample(steered, inpaint, shape, bar, key, o.steps, o.sampler, o.temperature)
-        return self.agreed(self.normaliser.invert(x)) if o.reconcile else self.normaliser.invert(x)
+        return self.agreed(self.normaliser.invert(x))
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
-        return self.feature_map.agreed(x, self.history)
+        return self.feature_map.agreed(x, self.history) if self.options.reconcile else x
 
     def merit(self, clean: Array, margin: Array) -> Array:
         """(B,) what gradient guidance climbs: value in deviations of the data's, and safety up to the margin."""

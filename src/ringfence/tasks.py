@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
@@ -31,7 +31,6 @@ class Task:
     protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
     action_high: float = 1.0
-    extra: dict = field(default_factory=dict, hash=False, compare=False)
 
     def normalised_return(self, r):
         return (r - self.return_min) / (self.return_max - self.return_min)

@@ -22,7 +22,7 @@ import numpy as np
 
 from ringfence import algos, features, hazards, tasks
 from ringfence.data.audit import APART, disagreement
-from ringfence.data.origin import other_data
+from ringfence.data.origin import other_data, regenerated
 from ringfence.data.store import EpisodeStore
 from ringfence.dynamics import fit_dynamics
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
@@ -77,6 +77,11 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     reads = a.reads(config)
     hazard = _bound(task.hazard, spec, reads)
     a.check(config, hazard)
+    if store is not None and reads != "nothing" and not hazard.has_formula and not store.costs.any():
+        raise UserError(
+            f"{a.name} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard with "
+            "a formula; give EpisodeStore one of them, or train an algorithm that reads none."
+        )
     if store is not None and reads == "costs":
         _refuse_blank_costs(a.name, task, store)
     return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
@@ -157,7 +162,7 @@ def train(
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
     if together and left:
-        _loop(job, windows, runs, seeds, options)
+        _loop(job, windows, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
     for run, seed in zip(runs, seeds):
         if run in left and not together:
@@ -363,7 +368,8 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
 
 
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
-    mine = json.loads(json.dumps(job.describe(seed, data.card)))
+    card = data.card if regenerated(data.card) else data.card | {"content": data.content}
+    mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
         there = {"revision": 1, "widths": mine["widths"]} | run.config  # older runs tell neither
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]

@@ -22,6 +22,7 @@ from typing import Any
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
 from ringfence.bench.suites import EVALUATIONS, SUITES
 from ringfence.data.make import make
+from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import RunConflict, UserError, unknown
 from ringfence.files import whole
@@ -82,12 +83,12 @@ class Cell:
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
         """Evaluations that the folder does not hold yet."""
-        known = Run(self.folder(out)).results
+        known, config = Run(self.folder(out)).results, dataclasses.asdict(self.config)
 
         def there(variant: str, name: str) -> bool:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
-            same = same and evaluate.complete(r, tasks.get(self.task))
+            same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
             return same and (not r["options"] or same_options(r["options"], EVALUATIONS[name]))
 
         return [e for e in self.evaluations if not there(*e)]
@@ -138,6 +139,11 @@ class Grid:
                 left.setdefault(cell.group, []).append(cell)
         return list(left.values())
 
+    def references(self) -> dict[str, int | None]:
+        """Tasks whose reference rows are not there yet, with the size of their data."""
+        sizes, folder = {c.task: c.transitions for c in self.cells}, self.out / "reference"
+        return {t: n for t, n in sizes.items() if not reference.there(tasks.get(t), folder, self.episodes, n)}
+
     def open(self) -> None:
         """Make the folder, or check that it holds results of this suite and protocol."""
         mine = about(self.suite, self.episodes)
@@ -176,7 +182,7 @@ def statuses(out: str | Path) -> list[dict]:
     one that failed early has nothing else."""
     read_about(Path(out))
     found = []
-    begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/*/{name}.json")}
+    begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):
         file = folder / "status.json"
         told = read_json(file, "is damaged; delete it") if file.exists() else {"state": "under way"}
@@ -264,7 +270,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
         try:
             store = data_of(current.task, current.transitions)
             for cell in left:
-                if twin := adopt(cell, out):
+                if twin := adopt(cell, out, store.card):
                     adopted[cell] = {"adopted": str(twin.folder(out).relative_to(out))}
             training.train(
                 current.algorithm,
@@ -291,13 +297,17 @@ def data_of(task: str, transitions: int | None) -> EpisodeStore:
     return make(tasks.get(task), transitions)[0]
 
 
-def adopt(cell: Cell, out: Path) -> Cell | None:
-    """Begin a cell with what its twin has learned, where that is there, and return the twin; its training is then over
-    at once."""
+def adopt(cell: Cell, out: Path, card: dict) -> Cell | None:
+    """Begin a cell on data of this card with what its twin has learned, where that is there, of the same data and by
+    the same revision, and return the twin; its training is then over at once."""
     twin = cell.twin()
     if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
         return None
     there, here = Run(twin.folder(out)), Run(cell.folder(out))
+    told = there.config
+    apart = {name for name, *_ in other_data(told["data"], card)} - {"task", "hazard"}
+    if apart or told.get("revision", 1) != algos.get(cell.algorithm).revision:
+        return None
     learned = [file for _, file in there.checkpoints()[-1:]]
     if not learned:  # results without what was learned, as a copied folder has them
         return None

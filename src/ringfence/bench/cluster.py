@@ -36,7 +36,9 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
         for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
             make_reference(name, grid.out, grid.episodes, transitions)
         cells = [c for group in grid.groups() for c in group]
-        waiting = {make_cell.remote(c, grid.episodes, begun(c, grid.out)): c for c in cells}
+        later = {c.twin(): c for c in cells if c.twin() in cells}  # they take what their twins will have learned
+        submit = lambda c: make_cell.remote(c, grid.episodes, begun(c, grid.out))  # noqa: E731
+        waiting = {submit(c): c for c in cells if c not in later.values()}
         with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
             while waiting:
                 (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -45,6 +47,8 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
                     unpack(ray.get(ready), cell.folder(grid.out))
                 except ray.exceptions.RayError as error:
                     record_failure(cell, grid.out, f"{type(error).__name__}: {str(error).splitlines()[0]}", str(error))
+                if other := later.pop(cell, None):
+                    waiting[submit(other)] = other
                 bar.advance(1)
     return grid.count()
 
@@ -101,8 +105,12 @@ def unpack(packed: bytes, folder: Path) -> None:
     """Put a returned run folder in place, whole or not at all."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     part = folder.with_name(f".{folder.name}.part")
-    shutil.rmtree(part, ignore_errors=True)
+    old = folder.with_name(f".{folder.name}.old")
+    for left in (part, old):
+        shutil.rmtree(left, ignore_errors=True)
     with tarfile.open(fileobj=io.BytesIO(packed)) as tar:
         tar.extractall(part, filter="data")
-    shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists():
+        folder.replace(old)
     part.replace(folder)
+    shutil.rmtree(old, ignore_errors=True)

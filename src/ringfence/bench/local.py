@@ -15,7 +15,6 @@ import threading
 import time
 from pathlib import Path
 
-from ringfence import reference, tasks
 from ringfence.bench.cells import Cell, Grid, record_failure
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
@@ -43,8 +42,8 @@ def run_local(
     with owned(grid.out, grid.taken) as lock:
         groups = grid.groups()
         jobs: queue.Queue[dict] = queue.Queue()
-        for job in _references(grid):
-            jobs.put(job)
+        for task, size in grid.references().items():
+            jobs.put({"reference": task, "transitions": size, "out": str(grid.out), "episodes": grid.episodes})
         for group in groups:
             jobs.put({"cells": [encode(c) for c in group], "out": str(grid.out), "episodes": grid.episodes})
         total = sum(len(g) for g in groups)
@@ -64,15 +63,6 @@ def run_local(
                     hand.join(30)
                 raise
     return grid.count()
-
-
-def _references(grid: Grid) -> list[dict]:
-    sizes = {c.task: c.transitions for c in grid.cells}
-    return [
-        {"reference": t, "transitions": n, "out": str(grid.out), "episodes": grid.episodes}
-        for t, n in sizes.items()
-        if not reference.there(tasks.get(t), grid.out / "reference", grid.episodes, n)
-    ]
 
 
 class _Pool:

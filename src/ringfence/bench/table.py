@@ -11,6 +11,7 @@ from pathlib import Path
 
 from ringfence.bench.cells import read_about
 from ringfence.errors import UserError
+from ringfence.evaluate import of_last_step
 from ringfence.files import whole
 from ringfence.runs import Run, read_json
 
@@ -30,11 +31,11 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
     for file in sorted((out / "reference").glob("*/reference.json")):
         for name, r in read_json(file, "is damaged; delete it").items():
             found.append({**r, "algorithm": name, "variant": "reference", "seed": 0, "run": str(file.relative_to(out))})
-    for file in sorted((out / "cells").glob("*/*/*/results.json")):
+    for file in sorted((out / "cells").glob("*/*/[!.]*/results.json")):
         run = Run(file.parent)
         for r in run.results.values():
-            if r["split"] != about["split"]:
-                continue  # settings were chosen there; no table is made of it
+            if r["split"] != about["split"] or not of_last_step(r, run.config["config"]):
+                continue  # settings were chosen there, or training went on; no table is made of it
             for name in ("protocol", "episodes"):
                 if r[name] != about[name]:
                     raise UserError(

@@ -11,6 +11,7 @@ from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
 
 APART = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
+COARSE = 0.01  # of an entry's deviation: the distance of neighbouring numbers above which it is told coarsely
 
 
 class Audit(NamedTuple):
@@ -80,6 +81,13 @@ def audit(store: EpisodeStore) -> Audit:
     constant = np.flatnonzero(np.ptp(flat[:: max(1, len(flat) // 100_000)], axis=0) < 1e-9)
     if len(constant):
         warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
+    spread, far = flat.std(0, dtype=np.float64), np.spacing(np.abs(flat).max(0).astype(np.float32))
+    coarse = np.flatnonzero((spread > 0) & (far > COARSE * spread))
+    if len(coarse):
+        warnings.append(
+            f"Observation entries {', '.join(map(str, coarse))} are so far from 0 that single precision tells their "
+            "values apart poorly; subtract an origin before making the store."
+        )
     if s.terminated.any() and not s.truncated.any() and np.ptp(lengths) == 0:
         warnings.append("All episodes terminate at the same length: these are probably time limits (truncated).")
     return Audit(facts, warnings, list(card.get("warnings", [])))

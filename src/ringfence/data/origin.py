@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 # What a card says of where its steps come from; the rest describes them, and later versions describe more.
-ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard")
+ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard", "content")
+
+
+def regenerated(card: dict) -> bool:
+    """Whether `ringfence data make` made the steps: the same anywhere, but for a processor's rounding."""
+    return str(card.get("provenance", "")).startswith("regenerated")
 
 
 def other_data(here: dict, there: dict) -> list[tuple[str, object, object]]:

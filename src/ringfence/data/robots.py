@@ -75,7 +75,7 @@ def config_for(env: SafeMuJoCo) -> RobotsConfig:
 
 
 class Memory(NamedTuple):
-    """Everything the learner has seen, in a ring of M transitions."""
+    """Everything the learner has seen, with room for M transitions."""
 
     state: Array  # (M, S)
     action: Array  # (M, N, A)

@@ -14,6 +14,8 @@ The cost of step t belongs to the state that step t leads to.
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import json
 import os
 from dataclasses import dataclass, field
@@ -95,6 +97,17 @@ class EpisodeStore:
     def hazard(self) -> hazards.Hazard:
         """The definition of danger in the card; CostColumn when the card has none."""
         return hazards.from_dict(self.card["hazard"])
+
+    @functools.cached_property
+    def content(self) -> str:
+        """Digest of all arrays: other steps have another."""
+        digest = hashlib.blake2b(digest_size=8)
+        for name in (*ARRAYS, *OPTIONAL):
+            array = getattr(self, name)
+            if array is not None:
+                digest.update(f"{name} {array.shape} {array.dtype}".encode())
+                digest.update(np.ascontiguousarray(array).data)
+        return digest.hexdigest()
 
     def select(self, keep: np.ndarray) -> EpisodeStore:
         """The episodes where `keep` (E,) is true."""

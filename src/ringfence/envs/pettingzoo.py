@@ -87,6 +87,10 @@ class SimpleSpreadParallel(_Parallel):
     def step(self, actions: dict[str, Any]) -> Dicts:
         """Advance by 0.1 s with one action (2,) per agent."""
         joint = _joint(self.agents, actions)
+        if joint.shape[2:] != (2,) or not np.isfinite(joint).all():
+            raise UserError(
+                f"step() got actions {dict(actions)}; give every agent two finite numbers, its force along x and y."
+            )
         self._state, transition = self._step(self._state, joint)
         self._steps += 1
         agents, over = self.agents, self._steps >= self.core.episode_length
@@ -212,4 +216,7 @@ def _joint(agents: list[str], actions: dict[str, Any]) -> np.ndarray:
     missing = [a for a in agents if a not in actions]
     if missing:
         raise UserError(f"step() got no action for {', '.join(missing)}; pass one entry per live agent.")
-    return np.stack([np.asarray(actions[a], np.float32) for a in agents])[None]
+    given = [np.asarray(actions[a], np.float32) for a in agents]
+    if len({a.shape for a in given}) > 1:
+        raise UserError(f"step() got actions of several shapes, {', '.join(str(a.shape) for a in given)}; give one.")
+    return np.stack(given)[None]

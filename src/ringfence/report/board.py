@@ -19,6 +19,7 @@ from ringfence import tasks
 from ringfence.bench import suites
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
+from ringfence.evaluate import of_last_step
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
 from ringfence.runs import Run, read_json
 
@@ -267,8 +268,8 @@ def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entr
         fields, config = apart.get((algorithm, preset), []), config_of(told)
         words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
-            if "@" in variant and summary.get("split") != split:
-                continue  # settings were chosen there; no table is made of it
+            if ("@" in variant and summary.get("split") != split) or not of_last_step(summary, config):
+                continue  # settings were chosen there, or training went on; no table is made of it
             shown = variant
             if told["preset"] != preset:
                 shown = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)

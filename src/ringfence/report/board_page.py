@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from ringfence import stats
 from ringfence.algos import ALGORITHMS
+from ringfence.data.origin import regenerated
 from ringfence.files import whole
 from ringfence.report import board_figures, figures
 from ringfence.report.board import Board, Method, read
@@ -170,7 +171,7 @@ def _section(board: Board, task: str, k: int, rows: list[Standing], rows_to_beat
         "scatter": Markup(drawn) if drawn else None,
         "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],
         "card": facts(card),
-        "regenerated": "regenerated" in str(card.get("provenance", "")),
+        "regenerated": regenerated(card),
     }
 
 

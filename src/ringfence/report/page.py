@@ -12,7 +12,9 @@ import jinja2
 from markupsafe import Markup
 
 from ringfence import __version__, algos, tasks
+from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
+from ringfence.evaluate import of_last_step
 from ringfence.files import whole
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
@@ -97,7 +99,7 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "differences": differences(section),
         "environments": environments(section.runs),
         "card": facts(section.card),
-        "regenerated": "regenerated" in str(section.card.get("provenance", "")),
+        "regenerated": regenerated(section.card),
     }
 
 
@@ -250,7 +252,7 @@ def commands(section: Section, out: Path) -> list[str]:
     """Shell lines that make this section's numbers again."""
     card, lines = section.card, []
     data = section.task
-    if "regenerated" in str(card.get("provenance", "")):
+    if regenerated(card):
         steps = card.get("size", card.get("transitions"))
         full = tasks.TASKS[section.task].transitions if section.task in tasks.TASKS else None
         if card.get("seed", 0) == 0 and steps in (None, full):
@@ -288,7 +290,8 @@ def commands(section: Section, out: Path) -> list[str]:
             given = f"--set {given}" if given else ""
             given = given if planner == "plain" else f"--planner {planner} {given}".strip()
             split = " --split validation" if row.split == "validation" else ""
-            how = f"--episodes {result['episodes']}{split} {given}".strip()
+            step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
+            how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
             evaluations.setdefault((how,), []).append(shlex.quote(str(run.path)))
     lines += [f"ringfence eval {' '.join(dict.fromkeys(paths))} {how}" for (how,), paths in evaluations.items()]
     roots = dict.fromkeys(shlex.quote(str(r.path.parent.parent)) for r in section.runs)

@@ -12,6 +12,7 @@ from pathlib import Path
 from ringfence.algos import ALGORITHMS
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
+from ringfence.evaluate import of_last_step
 from ringfence.report.pooling import Numbers, mean_of, pool
 from ringfence.runs import Run, read_json
 
@@ -23,7 +24,6 @@ NAMES = {
     "ma-td3bc-lag": "MA-TD3+BC, Lagrange",
     "fisor": "FISOR",
     "ma-cql": "MA-CQL",
-    "ma-icq": "MA-ICQ",
     "omar": "OMAR",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
@@ -98,7 +98,9 @@ def _section(task: str, runs: list[Run]) -> Section:
         results[run.path] = run.results
         if not results[run.path]:
             raise UserError(f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first.")
-    entries = [(run, name, {"variant": name, **r}) for run in runs for name, r in results[run.path].items()]
+    entries = [
+        (run, _dated(name, r, run), {"variant": name, **r}) for run in runs for name, r in results[run.path].items()
+    ]
     for run, name, result in entries:
         _check(f"'{run.path}' variant '{name}'", result, task)
         if result["split"] not in SPLITS:
@@ -133,6 +135,12 @@ def _section(task: str, runs: list[Run]) -> Section:
     )
     _paint(section)
     return section
+
+
+def _dated(variant: str, result: dict, run: Run) -> str:
+    """A variant's name with the step of the checkpoint that was played, where training went on since."""
+    known = "@step" in variant or of_last_step(result, run.config["config"])
+    return variant if known else f"{variant}@step{result['step']}"
 
 
 def _check(who: str, result: dict, task: str) -> None:
@@ -223,7 +231,7 @@ def _row(variant: str, members: list[tuple[Run, dict]], fields: dict) -> Row:
 
 def plain_variant(variant: str) -> str:
     """A variant's name without what a table says elsewhere: `default+plans4@validation` -> `plans4`."""
-    return re.sub(r"^default\b\+?", "", variant).removesuffix("@validation")
+    return re.sub(r"^default\b\+?|@validation\b", "", variant)
 
 
 def place(algorithm: str, preset: str, variant: str) -> tuple:
