@@ -19,6 +19,7 @@ _WHERE = {
     "train": "ringfence.training",
     "load": "ringfence.evaluate",
     "Controller": "ringfence.evaluate",
+    "play": "ringfence.parallel",
     "build_report": "ringfence.report",
 }
 __all__ = list(_WHERE)

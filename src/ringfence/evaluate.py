@@ -98,7 +98,7 @@ def _rollout_native(
     and costs are 0 and its state stays."""
     sim = env.simulate(episodes)
     sim.reset([(root, k) for k in range(episodes)])
-    act = _act if _foreign(policy) else jax.jit(_act)
+    act = act_with if _foreign(policy) else jax.jit(act_with)
     memory = policy.start(episodes)
     states = [sim.state().astype(np.float32)]
     steps, info, lengths = [], [], np.zeros(episodes, int)
@@ -124,7 +124,7 @@ def _rollout_native(
     return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
 
 
-def _act(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
+def act_with(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
     """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
     return policy.act(memory, observations, state, key)
 
@@ -263,7 +263,7 @@ class Controller:
     def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
         self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(seed)
-        self._act = jax.jit(_act)
+        self._act = jax.jit(act_with)
         self.reset()
 
     def reset(self) -> None:
@@ -274,12 +274,12 @@ class Controller:
         """(N, A) joint action within the task's bounds. Arrays of another shape than the run's are refused, and so is
         what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow NaN."""
         width, state_width = self.job.widths
-        seen = _given("observations", observations, (self.job.spec.n_agents, width))
+        seen = given_as("observations", observations, (self.job.spec.n_agents, width))
         if state is not None and state_width == 0:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."
             )
-        whole = None if state is None else _given("state", state, (state_width,))
+        whole = None if state is None else given_as("state", state, (state_width,))
         if None in self.job.widths:
             self._reaches(seen, whole)
         self._key, key = jax.random.split(self._key)
@@ -299,7 +299,7 @@ class Controller:
             raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
 
 
-def _given(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np.ndarray:
+def given_as(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np.ndarray:
     """What a controller is given, as numbers of the expected shape; None stands for a width that nobody knows."""
     letters = "NO" if len(expected) == 2 else "S"
     wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
@@ -339,6 +339,7 @@ def load_job(run: Run) -> training.Job:
             told["task"],
             None,
             hazards.from_dict(told["hazard"]),
+            cost_limit=float(card.get("cost_limit", 1.0)),
             action_low=card["action_low"],
             action_high=card["action_high"],
         )

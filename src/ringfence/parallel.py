@@ -1,0 +1,176 @@
+"""Play a trained policy in anybody's simulator, through PettingZoo's parallel API."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from ringfence import evaluate
+from ringfence.errors import UserError
+from ringfence.progress import Progress
+from ringfence.runs import Run
+from ringfence.training import Job
+
+Cost = Callable[[dict[str, dict]], float]
+
+
+def play(
+    run: Run | str,
+    make_env: Callable[[], Any],
+    *,
+    episodes: int = 20,
+    planner: str = "plain",
+    seed: int = 0,
+    cost: Cost | None = None,
+    at_once: int = 16,
+    quiet: bool = True,
+    **options,
+) -> dict:
+    """Returns, costs and their intervals over `episodes` episodes of a simulator; nothing is stored.
+
+    `make_env()` makes a PettingZoo `ParallelEnv` whose agents, in the order of `possible_agents`, are those of the
+    run's data, and who begin and end together. `at_once` of them are stepped side by side, so that one compiled call
+    acts in all. Episode k is reset with the seed 7 000 001 + k; `seed` moves the policy's noise. `planner` and
+    `options` are as in `evaluate.load`.
+
+    A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
+    agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); where there
+    are none, 1 if the run's hazard calls the state unsafe that the step leads to.
+
+    The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
+    """
+    for name, value in (("episodes", episodes), ("at_once", at_once)):
+        if value < 1:
+            raise UserError(f"{name}={value} must be at least 1.")
+    job, policy = evaluate.load(run, planner=planner, **options)
+    envs = [make_env() for _ in range(min(at_once, episodes))]
+    act, key, begun = jax.jit(evaluate.act_with), jax.random.key(seed), time.perf_counter()
+    label = jax.jit(lambda seen, state: job.hazard.labels(job.feature_map(seen, state))[0].any(-1))
+    played: list[_Episode] = []
+    formula = job.hazard.has_formula
+    with Progress(f"{job.algorithm.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
+        for first in range(0, episodes, len(envs)):
+            seeds = range(first, min(first + len(envs), episodes))
+            table = [_Episode(env, job, evaluate.RESETS["test"] + k) for env, k in zip(envs, seeds)]
+            if formula:
+                for episode, unsafe in zip(table, np.asarray(label(*_seen(table)))):
+                    episode.unsafe_start = bool(unsafe)
+            memory = policy.start(len(table))
+            while any(e.running for e in table):
+                key, now = jax.random.split(key)
+                memory, decided = act(policy, memory, *_seen(table), now)
+                for episode, action in zip(table, np.asarray(decided.action)):
+                    if episode.running:
+                        episode.step(action, cost)
+                if any(e.owes for e in table):
+                    if not formula:
+                        raise UserError(
+                            "step() tells no cost, and the run's hazard has no formula to say what is unsafe; pass "
+                            "cost=, a function of the agents' infos."
+                        )
+                    for episode, unsafe in zip(table, np.asarray(label(*_seen(table)))):
+                        episode.charge(float(unsafe))
+            played += table
+            bar.advance(len(table))
+    result = evaluate.summarise(_together(played), job.task, np.array([e.unsafe_start for e in played]))
+    for name in ("return_norm", "cost_norm", "constants"):
+        del result[name]
+    return result | {
+        "task": job.task.name,
+        "cost_limit": job.task.cost_limit,
+        "seed": seed,
+        "eval_seconds": time.perf_counter() - begun,
+    }
+
+
+class _Episode:
+    """One episode under way: what its agents see, and what they have earned and cost."""
+
+    def __init__(self, env: Any, job: Job, seed: int):
+        lacking = [name for name in ("possible_agents", "reset", "step") if not hasattr(env, name)]
+        if lacking:
+            raise UserError(
+                f"make_env() made a {type(env).__name__} without {lacking[0]}; give a PettingZoo ParallelEnv."
+            )
+        self.env, self.job, self.agents = env, job, list(env.possible_agents)
+        if len(self.agents) != job.spec.n_agents:
+            raise UserError(
+                f"{type(env).__name__} has {len(self.agents)} agents, the run was trained with {job.spec.n_agents}."
+            )
+        if job.widths[1] and not hasattr(env, "state"):
+            raise UserError(
+                f"The run reads a global state, which {type(env).__name__} lacks; give it a state() method."
+            )
+        self.rewards: list[float] = []
+        self.costs: list[float] = []
+        self.terminated = self.unsafe_start = False
+        self.running = True
+        self._look(env.reset(seed=seed)[0])
+
+    @property
+    def owes(self) -> bool:
+        """The last step told no cost."""
+        return len(self.costs) < len(self.rewards)
+
+    def charge(self, cost: float) -> None:
+        """Set the cost of the last step, if nobody has."""
+        if self.owes:
+            self.costs.append(cost)
+
+    def step(self, action: np.ndarray, cost: Cost | None) -> None:
+        """Act (N, A) and take note of what came of it."""
+        told = self.env.step(dict(zip(self.agents, action)))
+        if len(told) not in (5, 6):
+            raise UserError(
+                f"step() of {type(self.env).__name__} returned {len(told)} things; a ParallelEnv's are five."
+            )
+        seen, rewards, *costs, terminations, truncations, infos = told
+        ended = [bool(terminations.get(a) or truncations.get(a)) for a in self.agents]
+        if any(ended) and not all(ended):
+            gone = self.agents[ended.index(True)]
+            raise UserError(f"{gone} ended at step {len(self.rewards) + 1} before its team; agents must end together.")
+        self.rewards.append(float(np.mean([rewards[a] for a in self.agents])))
+        each = costs[0] if costs else {a: i["cost"] for a, i in infos.items() if "cost" in i}
+        if cost is not None:
+            self.costs.append(float(cost(infos)))
+        elif each:
+            self.costs.append(float(max(each.values())))
+        if not np.isfinite([*self.rewards[-1:], *self.costs[-1:]]).all():
+            raise UserError(f"Step {len(self.rewards)} has a reward or cost that is not finite; repair the simulator.")
+        self.running = not all(ended)
+        self.terminated = all(bool(terminations.get(a)) for a in self.agents)
+        if self.running or seen:
+            self._look(seen)
+        elif self.owes:  # costs that were told need no last state
+            raise UserError(
+                "step() tells neither a cost nor the state that an episode ends in; return the last observations."
+            )
+
+    def _look(self, seen: dict) -> None:
+        n, (width, state_width) = self.job.spec.n_agents, self.job.widths
+        there = [seen[a] for a in self.agents]
+        self.seen = evaluate.given_as("observations", there, (n, width))
+        self.state = evaluate.given_as("state", self.env.state(), (state_width,)) if state_width else None
+
+
+def _seen(table: list[_Episode]) -> tuple[np.ndarray, np.ndarray | None]:
+    """(B, N, O) and (B, S), or None without a state."""
+    return np.stack([e.seen for e in table]), None if table[0].state is None else np.stack([e.state for e in table])
+
+
+def _together(played: list[_Episode]) -> dict[str, np.ndarray]:
+    """`rewards`, `costs` (E, L), `steps`, `terminated` (E,); nothing happens after an episode's end."""
+    longest = max(len(e.rewards) for e in played)
+
+    def padded(name: str) -> np.ndarray:
+        return np.stack([np.pad(x := np.array(getattr(e, name)), (0, longest - len(x))) for e in played])
+
+    counts = {
+        "steps": np.array([len(e.rewards) for e in played]),
+        "terminated": np.array([e.terminated for e in played]),
+    }
+    return {"rewards": padded("rewards"), "costs": padded("costs")} | counts

@@ -1,0 +1,136 @@
+"""Somebody else's simulator, played through PettingZoo's parallel API: here our own, behind that face."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ringfence import evaluate, play, training
+from ringfence.data import EpisodeStore
+from ringfence.envs.pettingzoo import SimpleSpreadParallel
+from ringfence.errors import UserError
+from ringfence.features import simple_spread
+from ringfence.hazards import Separation
+
+TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
+
+
+@pytest.fixture(scope="module")
+def run(small_store, tmp_path_factory):
+    """Cloning of data that nobody here simulates: another name, costs instead of a formula."""
+    card = {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}, "cost_limit": 3}
+    own = dataclasses.replace(small_store, card=card)
+    return training.train("bc", own, out=tmp_path_factory.mktemp("own"), changes=TINY, quiet=True)[0]
+
+
+class Watched(SimpleSpreadParallel):
+    """Keeps its own books."""
+
+    books: list[list[tuple[float, float]]] = []
+
+    def reset(self, seed=None, options=None):
+        self.kept = []
+        self.books.append(self.kept)
+        return super().reset(seed, options)
+
+    def step(self, actions):
+        told = super().step(actions)
+        self.kept.append((np.mean(list(told[1].values())), told[4]["agent_0"]["cost"]))
+        return told
+
+
+def test_what_is_summed_is_what_the_simulator_told(run):
+    Watched.books = []
+    result = play(run, Watched, episodes=3, at_once=2)
+    books = np.array(Watched.books)  # (E, L, 2)
+    np.testing.assert_allclose(result["per_episode"]["return"], books[..., 0].sum(1), atol=2e-3)
+    np.testing.assert_allclose(result["per_episode"]["cost"], books[..., 1].sum(1))
+    assert result["episodes"] == 3 and result["cost_limit"] == 3 and result["steps_mean"] == 25
+    assert result["termination_rate"] == 0 and "return_norm" not in result
+    alone = play(run, Watched, episodes=3, at_once=1)  # cloning draws nothing: side by side or not is the same
+    np.testing.assert_allclose(alone["per_episode"]["return"], result["per_episode"]["return"], atol=2e-3)
+    charged = play(run, Watched, episodes=1, cost=lambda infos: 2.0)
+    assert charged["cost_mean"] == 50
+
+
+class Own(SimpleSpreadParallel):
+    """Agents see what they see, costs are not told, and the task may end by itself."""
+
+    end = 25
+
+    def _observations(self):
+        return {a: x[: len(simple_spread("decentralized", 3).names)] for a, x in super()._observations().items()}
+
+    def step(self, actions):
+        seen, reward, terminated, truncated, infos = super().step(actions)
+        self.said = [i["cost"] for i in infos.values()]
+        if self._steps == self.end:
+            self.agents, terminated = [], dict.fromkeys(reward, True)
+        return seen, reward, terminated, truncated, dict.fromkeys(reward, {})
+
+
+def test_the_hazard_counts_where_the_simulator_does_not(played, tmp_path):
+    names = simple_spread("decentralized", 3).names
+    store = EpisodeStore.from_episodes(
+        played["observations"][..., : len(names)], played["actions"], played["rewards"], played["costs"],
+        card={"task": "seen", "observation_names": list(names), "hazard": Separation(0.3)},
+    )  # fmt: skip
+    run = training.train("bc", store, out=tmp_path, changes=TINY, quiet=True)[0]
+    counted = []
+
+    class Counted(Own):
+        def step(self, actions):
+            told = super().step(actions)
+            counted.append(max(self.said))
+            return told
+
+    result = play(run, Counted, episodes=40, at_once=20)
+    assert 0 < result["cost_mean"] * 40 == pytest.approx(sum(counted))
+    Own.end = 7
+    try:
+        ended = play(run, Own, episodes=4)
+    finally:
+        Own.end = 25
+    assert ended["termination_rate"] == 1 and ended["steps_mean"] == 7
+
+    class Mute(Own):
+        def step(self, actions):
+            seen, *told = super().step(actions)
+            return (seen if self.agents else {}), *told
+
+    with pytest.raises(UserError, match="neither a cost nor the state that an episode ends in"):
+        play(run, Mute, episodes=1)
+
+
+def test_a_simulator_that_does_not_fit_is_refused(run):
+    def made(**names):
+        return type("Odd", (SimpleSpreadParallel,), names)
+
+    def early(self, actions):
+        told = SimpleSpreadParallel.step(self, actions)
+        return (*told[:2], {**told[2], "agent_1": True}, *told[3:])
+
+    def silent(self, actions):
+        return (*SimpleSpreadParallel.step(self, actions)[:4], dict.fromkeys(self.possible_agents, {}))
+
+    def broken(self, actions):
+        told = SimpleSpreadParallel.step(self, actions)
+        return (told[0], dict.fromkeys(told[1], float("nan")), *told[2:])
+
+    cases = (
+        (lambda: object(), "without possible_agents; give a PettingZoo ParallelEnv"),
+        (lambda: SimpleSpreadParallel(n_agents=2), "has 2 agents, the run was trained with 3"),
+        (made(_observations=lambda self: dict.fromkeys(self.possible_agents, np.zeros(5))), r"shape \(3, 5\)"),
+        (made(step=early), "agent_1 ended at step 1 before its team"),
+        (made(step=silent), "pass cost=, a function of the agents' infos"),
+        (made(step=broken), "Step 1 has a reward or cost that is not finite"),
+        (made(step=lambda self, actions: (1, 2)), "returned 2 things"),
+    )
+    for make_env, said in cases:
+        with pytest.raises(UserError, match=said):
+            play(run, make_env, episodes=1)
+    with pytest.raises(UserError, match="episodes=0 must be at least 1"):
+        play(run, SimpleSpreadParallel, episodes=0)
+    assert evaluate.load_job(run).task.cost_limit == 3
