@@ -54,6 +54,13 @@ def test_what_is_summed_is_what_the_simulator_told(run):
     charged = play(run, Watched, episodes=1, cost=lambda infos: 2.0)
     assert charged["cost_mean"] == 50
 
+    class Apart(SimpleSpreadParallel):
+        def step(self, actions):
+            seen, reward, *told = super().step(actions)
+            return seen, reward, {a: 0.5 * k for k, a in enumerate(reward)}, *told
+
+    assert play(run, Apart, episodes=1)["cost_mean"] == 25  # the largest of costs that step() tells beside rewards
+
 
 class Own(SimpleSpreadParallel):
     """Agents see what they see, costs are not told, and the task may end by itself."""
