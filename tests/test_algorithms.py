@@ -251,8 +251,8 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(trained):
     told = {"steps": 2, "prefix": 2, "foresight": True}
     acted, foreseen = {}, {}
     for name, options in {"none": {}, "easy": {"margin": -9.0}, "hard": {"margin": 0.3}}.items():
-        shield = {} if name == "none" else {"shield": 8}
-        _, policy = evaluate.load(trained["icbf"], **told, **options, **shield)
+        corrected = {"steps": 2} if name == "none" else {**told, **options, "shield": 8}
+        _, policy = evaluate.load(trained["icbf"], **corrected)
         _, out = policy.act(policy.start(64), env.observe(state), env.global_state(state), jax.random.key(1))
         acted[name] = out.action
         now = policy.feature_map(env.observe(state), env.global_state(state))

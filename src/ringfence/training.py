@@ -77,13 +77,8 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     reads = a.reads(config)
     hazard = _bound(task.hazard, spec, reads)
     a.check(config, hazard)
-    if store is not None and reads != "nothing" and not hazard.has_formula and not store.costs.any():
-        raise UserError(
-            f"{a.name} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard with "
-            "a formula; give EpisodeStore one of them, or train an algorithm that reads none."
-        )
-    if store is not None and reads == "costs":
-        _refuse_blank_costs(a.name, task, store)
+    if store is not None and reads != "nothing" and not store.costs.any():
+        _refuse_blank_costs(a.name, task, store, reads)
     return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
 
 
@@ -107,9 +102,15 @@ def _bound(hazard: hazards.Hazard, spec: Spec, reads: str) -> hazards.BoundHazar
         return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
 
 
-def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore) -> None:
-    """Refuse costs that were never filled in: who learns from them alone would call every step safe."""
-    if store.costs.any():
+def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: str) -> None:
+    """Refuse costs that were never filled in to who would call every step safe: those who learn from them alone, and
+    everybody where no formula says more."""
+    if isinstance(task.hazard, hazards.CostColumn):
+        raise UserError(
+            f"{algorithm} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard "
+            "with a formula; give EpisodeStore one of them, or train an algorithm that reads none."
+        )
+    if reads == "labels":
         return
     unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
     if unsafe > (APART if "mujoco" in task.presets else 0.0):
