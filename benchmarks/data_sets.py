@@ -1,13 +1,10 @@
-"""What is in every data set of the tasks: the numbers of docs/data.md.
-
-python benchmarks/data_sets.py        # writes results/data.csv
-"""
+"""What is in every data set of the tasks, the numbers of docs/data.md: `python benchmarks/data_sets.py` writes
+results/data.csv."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 from _rows import write
 
 from ringfence import tasks
@@ -33,7 +30,7 @@ def row(name: str) -> dict:
         "return_min": round(float(returns.min()), 2),
         "return_max": round(float(returns.max()), 2),
         "cost_mean": round(float(costs.mean()), 3),
-        "terminated": round(float(np.add.reduceat(store.terminated, [0, *store.episode_ends[:-1]]).mean()), 4),
+        "terminated": round(float(store.episode_terminated.mean()), 4),
         "disagreement": round(disagreement(store, task), 4),  # share of steps whose cost is not what the hazard says
         "speed_limit": store.card.get("speed_limit", ""),
         "return_ceiling": round(store.card["return_ceiling"], 1) if "return_ceiling" in store.card else "",
@@ -42,11 +39,9 @@ def row(name: str) -> dict:
 
 def main() -> None:
     rows = []
-    for suite in SUITES.values():
-        for name in suite.tasks:
-            if name not in {r["task"] for r in rows}:
-                rows.append(row(name))
-                print(*(f"{k}={v}" for k, v in rows[-1].items()), flush=True)
+    for name in (task for suite in SUITES.values() for task in suite.tasks):
+        rows.append(row(name))
+        print(*(f"{k}={v}" for k, v in rows[-1].items()), flush=True)
     write(OUT, rows)
 
 

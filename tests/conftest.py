@@ -21,12 +21,22 @@ from ringfence import hazards
 from ringfence.data.behaviour import collect
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
+from ringfence.features import simple_spread
 
 
 @pytest.fixture(scope="session")
 def played() -> dict[str, np.ndarray]:
     """Forty episodes of Simple Spread under uniform actions, as arrays (E, L, ...)."""
     return collect(SimpleSpread(), "random", 40, jax.random.key(7))
+
+
+@pytest.fixture(scope="session")
+def own_store(played) -> EpisodeStore:
+    """The same episodes as anybody's own logs: what agents see, by name, a hazard, and no state."""
+    names = simple_spread("decentralized", 3).names
+    seen = played["observations"][..., : len(names)]
+    card = {"task": "my-robots", "observation_names": list(names), "hazard": hazards.Separation(0.3)}
+    return EpisodeStore.from_episodes(seen, played["actions"], played["rewards"], played["costs"], card=card)
 
 
 @pytest.fixture(scope="session")

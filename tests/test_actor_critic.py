@@ -1,5 +1,7 @@
 """The actor-critic baselines: what their losses ask for, on networks small enough to compute by hand."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -98,6 +100,25 @@ def test_expectile_is_asymmetric():
     sample, grid = jnp.asarray([0.0, 1.0]), jnp.linspace(0, 1, 1001)
     best = grid[jnp.argmin(fisor.expectile(sample[None] - grid[:, None], 0.9).sum(1))]
     assert abs(float(best) - 0.9) < 2e-3
+
+
+@pytest.mark.parametrize("learner, more", [(td3bc, {"target_noise": 0.2}), (omar, {"cql_actions": "policy"})])
+def test_bounds_of_actions_change_no_lesson(learner, more):
+    """Batches tell actions between −1 and 1, so the task's own bounds are nothing to a learner."""
+    config = learner.Config(width=4, batch=8, **more)
+    k = jax.random.split(jax.random.key(0), 3)
+    action = jax.random.uniform(k[0], (8, 1, 2, 2), minval=-1.0)
+    zeros, one = jnp.zeros((8, 2)), jnp.ones((8, 1), bool)
+    x = jax.random.normal(k[1], (8, 2, 2, 3))
+    new = []
+    for spec in (SPEC, replace(SPEC, action_low=2.0, action_high=8.0)):
+        state = learner.init(k[2], spec, config, None, None, None)
+        plain = Normaliser(jnp.zeros(3), jnp.ones(3), jnp.zeros((1, 3)), jnp.ones((1, 3)), 0, "displacement")
+        state["frozen"] = {"normaliser": plain}
+        batch = Batch(x, action, zeros == 0, zeros[:, 0], zeros, jnp.ones((8, 1, 2)), ~one)
+        new.append(learner.make_update(config, spec, None, None)(state, batch, k[2])[0]["params"])
+    for a, b in zip(*map(jax.tree.leaves, new)):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
 def test_threshold_of_the_multiplier():

@@ -422,17 +422,9 @@ def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
     assert not list((run.path / "ckpt").glob("*.part"))
 
 
-def test_own_data_without_a_simulator(played, tmp_path):
+def test_own_data_without_a_simulator(own_store, tmp_path):
     """Anybody's logs: a store with named features, a hazard, a policy that acts; nothing of Simple Spread is known."""
-    from ringfence.data import EpisodeStore
-    from ringfence.features import simple_spread
-    from ringfence.hazards import Separation
-
-    names = simple_spread("decentralized", 3).names
-    store = EpisodeStore.from_episodes(
-        played["observations"][..., : len(names)], played["actions"], played["rewards"], played["costs"],
-        card={"task": "my-robots", "observation_names": list(names), "hazard": Separation(0.3)},
-    )  # fmt: skip
+    store = own_store
     run = training.train("icbf", store, out=tmp_path, changes={**TINY["icbf"], "steps": 2}, quiet=True)[0]
     _, policy = evaluate.load(run, plans=2, steps=2)
     seen = jnp.asarray(store.observations[:4])

@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from ringfence import evaluate, play, training
-from ringfence.data import EpisodeStore
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
 from ringfence.features import simple_spread
-from ringfence.hazards import Separation
 
 TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -78,13 +76,8 @@ class Own(SimpleSpreadParallel):
         return seen, reward, terminated, truncated, dict.fromkeys(reward, {})
 
 
-def test_the_hazard_counts_where_the_simulator_does_not(played, tmp_path):
-    names = simple_spread("decentralized", 3).names
-    store = EpisodeStore.from_episodes(
-        played["observations"][..., : len(names)], played["actions"], played["rewards"], played["costs"],
-        card={"task": "seen", "observation_names": list(names), "hazard": Separation(0.3)},
-    )  # fmt: skip
-    run = training.train("bc", store, out=tmp_path, changes=TINY, quiet=True)[0]
+def test_the_hazard_counts_where_the_simulator_does_not(own_store, tmp_path):
+    run = training.train("bc", own_store, out=tmp_path, changes=TINY, quiet=True)[0]
     counted = []
 
     class Counted(Own):

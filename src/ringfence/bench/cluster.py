@@ -36,9 +36,10 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
         for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
             make_reference(name, grid.out, grid.episodes, transitions)
         cells = [c for group in grid.groups() for c in group]
-        later = {c.twin(): c for c in cells if c.twin() in cells}  # they take what their twins will have learned
+        ours = set(cells)
+        later = {c.twin(): c for c in cells if c.twin() in ours}  # they take what their twins will have learned
         submit = lambda c: make_cell.remote(c, grid.episodes, begun(c, grid.out))  # noqa: E731
-        waiting = {submit(c): c for c in cells if c not in later.values()}
+        waiting = {submit(c): c for c in cells if c.twin() not in ours}
         with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
             while waiting:
                 (ready,), _ = ray.wait(list(waiting), num_returns=1)
