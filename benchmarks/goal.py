@@ -50,9 +50,9 @@ def table(folder: Path = RESULTS) -> str:
         reached_on.append(reached)
     counts = [sum(column) for column in zip(*reached_on)]
     lines.append(
-        f"\n✗: not reached. Of {len(reached_on)} tasks the interval is within the limit on {counts[0]}, the return is at least "
-        f"that of the data within the limit on {counts[1]} (or there is no such data), and the cost is below that of "
-        f"every baseline with {100 * SHARE:.0f} % of the return on {counts[2]}."
+        f"\n✗: not reached. Of {len(reached_on)} tasks the interval is within the limit on {counts[0]}, the return is at "
+        f"least that of the data within the limit on {counts[1]} (or there is no such data), and the cost is below that "
+        f"of every baseline with {100 * SHARE:.0f} % of the return on {counts[2]}."
     )
     return "\n".join(lines)
 
