@@ -48,11 +48,11 @@ def table(folder: Path = RESULTS) -> str:
         marked = [f"{c} ✗" if not ok else c for c, ok in zip(cells[1:4], reached)]
         lines.append("| " + " | ".join((task, cells[0], *marked, cells[4])) + " |")
         reached_on.append(reached)
-    counts = [sum(column) for column in zip(*reached_on)]
+    within, matched, cheaper = (sum(column) for column in zip(*reached_on))
     lines.append(
-        f"\n✗: not reached. Of {len(reached_on)} tasks the interval is within the limit on {counts[0]}, the return is at "
-        f"least that of the data within the limit on {counts[1]} (or there is no such data), and the cost is below that "
-        f"of every baseline with {100 * SHARE:.0f} % of the return on {counts[2]}."
+        f"\n✗: not reached. Of {len(reached_on)} tasks the interval is within the limit on {within}, the return is at "
+        f"least that of the data within the limit on {matched} (or there is no such data), and the cost is below that "
+        f"of every baseline with {100 * SHARE:.0f} % of the return on {cheaper}."
     )
     return "\n".join(lines)
 
