@@ -1,0 +1,63 @@
+"""The README's film: two runs on the same test reset, side by side, with speed and limit drawn in.
+
+python benchmarks/film.py LEFT VARIANT RIGHT VARIANT    # run folders with recordings of robots -> docs/images/rollout.gif
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from itertools import islice
+from pathlib import Path
+
+from PIL import Image, ImageDraw
+
+from ringfence.evaluate import load_job
+from ringfence.report import video
+from ringfence.report.animation import recording
+from ringfence.report.table import NAMES
+from ringfence.runs import Run
+
+OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "rollout.gif"
+STEPS = 160  # from the start
+HEAD = 20  # pixels
+COLOURS = 48
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sides", nargs=4, metavar=("LEFT VARIANT RIGHT VARIANT", "", "", ""))
+    told = parser.parse_args().sides
+    os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
+    halves = [half(Run(Path(path)), variant) for path, variant in zip(told[::2], told[1::2])]
+    films = [pair(*frames) for frames in zip(*halves)]
+    shown = round(1000 * video.DT * video.EVERY)  # ms
+    films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
+    print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
+
+
+def half(run: Run, variant: str) -> list[Image.Image]:
+    """Frames with a title: the method, and what its whole episode came to."""
+    env, kept = load_job(run).task.env, recording(run, variant)
+    states, costs, rewards = kept["states"][0], kept["costs"][0], kept["rewards"][0]
+    planner = variant.partition("+")[2]
+    name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)
+    title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
+    made = []
+    for frame in islice(video.frames(env, states[:STEPS], costs), STEPS // video.EVERY):
+        whole = Image.new("RGB", (frame.width, frame.height + HEAD), "white")
+        whole.paste(frame, (0, HEAD))
+        ImageDraw.Draw(whole).text((10, 5), title, fill=(20, 20, 20))
+        made.append(whole)
+    return made
+
+
+def pair(left: Image.Image, right: Image.Image) -> Image.Image:
+    both = Image.new("RGB", (left.width + right.width + 8, left.height), "white")
+    both.paste(left, (0, 0))
+    both.paste(right, (left.width + 8, 0))
+    return both.quantize(COLOURS)
+
+
+if __name__ == "__main__":
+    main()
