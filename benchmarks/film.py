@@ -1,6 +1,6 @@
 """The README's film: two runs on the same test reset, side by side, with speed and limit drawn in.
 
-python benchmarks/film.py LEFT VARIANT RIGHT VARIANT    # run folders with recordings of robots -> docs/images/rollout.gif
+python benchmarks/film.py LEFT VARIANT RIGHT VARIANT    # run folders with recordings -> docs/images/rollout.gif
 """
 
 from __future__ import annotations
