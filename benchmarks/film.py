@@ -1,13 +1,15 @@
 """The README's film: two runs on the same test reset, side by side, with speed and limit drawn in.
 
 python benchmarks/film.py LEFT VARIANT RIGHT VARIANT    # run folders with recordings -> docs/images/rollout.gif
+
+The README's: seed 0 of madiff, mujoco+steady, and of icbf, mujoco+adaptive, both in results/mujoco/cells/
+halfcheetah_2x3-good. Recordings are not in the repository; `ringfence eval RUN --record 1 --planner steady` makes one.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from itertools import islice
 from pathlib import Path
 
 from PIL import Image, ImageDraw
@@ -26,12 +28,16 @@ COLOURS = 48
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sides", nargs=4, metavar=("LEFT VARIANT RIGHT VARIANT", "", "", ""))
-    told = parser.parse_args().sides
+    for side in ("left", "right"):
+        parser.add_argument(side, type=Path, help="run folder with a recording")
+        parser.add_argument(f"{side}_variant", help="as results.json names it")
+    told = parser.parse_args()
     os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
-    halves = [half(Run(Path(path)), variant) for path, variant in zip(told[::2], told[1::2])]
-    films = [pair(*frames) for frames in zip(*halves)]
-    shown = round(1000 * video.DT * video.EVERY)  # ms
+    films = [
+        pair(*frames)
+        for frames in zip(half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant))
+    ]
+    shown = round(1000 * video.DT * video.stride(range(STEPS)))  # ms
     films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
     print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
 
@@ -39,12 +45,14 @@ def main() -> None:
 def half(run: Run, variant: str) -> list[Image.Image]:
     """Frames with a title: the method, and what its whole episode came to."""
     env, kept = load_job(run).task.env, recording(run, variant)
+    if kept is None:
+        raise SystemExit(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
     states, costs, rewards = kept["states"][0], kept["costs"][0], kept["rewards"][0]
     planner = variant.partition("+")[2]
     name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)
     title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
     made = []
-    for frame in islice(video.frames(env, states[:STEPS], costs), STEPS // video.EVERY):
+    for frame in video.frames(env, states[:STEPS], costs):
         whole = Image.new("RGB", (frame.width, frame.height + HEAD), "white")
         whole.paste(frame, (0, HEAD))
         ImageDraw.Draw(whole).text((10, 5), title, fill=(20, 20, 20))

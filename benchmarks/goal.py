@@ -35,7 +35,7 @@ def table(folder: Path = RESULTS) -> str:
         logged = next((r for r in references[task] if r.name == "data within the limit"), None)
         rivals = [r for r in rows if _baseline(r) and r.returns >= SHARE * ours.returns]
         rival = min(rivals, key=lambda r: (r.cost, -r.returns), default=None)
-        best = max((r for r in rows if r.safe), key=lambda r: r.returns, default=None)
+        best = next((r for r in rows if r.best), None)
         beaten = rival is None or ours.cost < rival.cost
         reached = (ours.safe, logged is None or ours.returns >= logged.returns, beaten)
         low, high = ours.cost_interval

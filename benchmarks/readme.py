@@ -105,7 +105,7 @@ def main() -> None:
     robots_searched = searched(RESULTS / "tuning" / "robots.csv", "halfcheetah_2x3-medium-quantile")
     put("docs/benchmark.md", "robots-search", robots_searched)
     put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
-    put("docs/benchmark.md", "robots-goal", goal.table(RESULTS / "mujoco"))
+    put("docs/benchmark.md", "robots-goal", goal.table())
     put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
     speed = []
     for file in sorted((RESULTS / "performance").glob("*.json")):
