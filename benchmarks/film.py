@@ -14,9 +14,9 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
+from ringfence.errors import UserError
 from ringfence.evaluate import load_job
 from ringfence.report import video
-from ringfence.report.animation import recording
 from ringfence.report.table import NAMES
 from ringfence.runs import Run
 
@@ -32,11 +32,12 @@ def main() -> None:
         parser.add_argument(side, type=Path, help="run folder with a recording")
         parser.add_argument(f"{side}_variant", help="as results.json names it")
     told = parser.parse_args()
-    os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
-    films = [
-        pair(*frames)
-        for frames in zip(half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant))
-    ]
+    try:
+        os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
+        left, right = half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant)
+    except UserError as error:
+        parser.exit(2, f"error: {error}\n")
+    films = [pair(*frames) for frames in zip(left, right)]
     shown = round(1000 * video.DT * video.stride(range(STEPS)))  # ms
     films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
     print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
@@ -44,9 +45,7 @@ def main() -> None:
 
 def half(run: Run, variant: str) -> list[Image.Image]:
     """Frames with a title: the method, and what its whole episode came to."""
-    env, kept = load_job(run).task.env, recording(run, variant)
-    if kept is None:
-        raise SystemExit(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
+    env, kept = load_job(run).task.env, video.recorded(run, variant)
     states, costs, rewards = kept["states"][0], kept["costs"][0], kept["rewards"][0]
     planner = variant.partition("+")[2]
     name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)

@@ -259,6 +259,11 @@ def test_another_limit_counts_anew_what_is_kept(tmp_path, monkeypatch):
     assert counted.card == simulated.card and path.name.startswith(names[1])
     part = counted.select(np.arange(counted.episodes) == 1)
     np.testing.assert_array_equal(part.costs, part.speed > quantile.env.limit)
+    path.write_bytes(b"no HDF5")
+    with pytest.warns(UserWarning, match="made again") as told:
+        mended, _ = make(quantile, 300)
+    assert len(told) == 1, "a damaged file is read once"
+    np.testing.assert_array_equal(mended.costs, counted.costs)
 
 
 def test_what_the_limit_allows_to_earn():

@@ -6,6 +6,7 @@ import os
 import warnings
 from dataclasses import replace
 from importlib import metadata
+from itertools import chain
 from pathlib import Path
 
 import jax
@@ -58,13 +59,15 @@ def make(
     }
     if isinstance(env, SimpleSpread):
         card |= {"integrator": env.integrator, "reward": env.reward}
-    if not fresh and not out and (kept := _usable(path, card)) is not None:
-        if kept.card["hazard"] == danger:  # or else the name has come to mean something else
-            return kept, path
-    if isinstance(env, SimpleSpread):
-        store = _spread(task, transitions, seed, card)
+    robot = isinstance(env, SafeMuJoCo)
+    kept = _usable(_kept(task.name, transitions, seed), card) if not fresh and (robot or not out) else None
+    if kept is not None and not out and kept.card["hazard"] == danger:  # or the name has come to mean something else
+        return kept, path
+    if robot:
+        store = None if fresh else _relabelled(task, kept, transitions, seed, card)
+        store = store or _robot(task, transitions, seed, card)
     else:
-        store = (None if fresh else _relabelled(task, transitions, seed, card)) or _robot(task, transitions, seed, card)
+        store = _spread(task, transitions, seed, card)
     return store, store.save(path)
 
 
@@ -120,11 +123,11 @@ def _robot(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
     )
 
 
-def _relabelled(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore | None:
-    """The kept steps of a task that differs in its speed limit alone, where there are some: the same episodes, and no
-    simulation. Speeds are kept in double precision, so every cost is the one that a simulation would count."""
-    for name in (task.name, *siblings(task.name)):
-        other = _usable(_kept(name, transitions, seed), card)
+def _relabelled(task: Task, kept: EpisodeStore | None, transitions: int, seed: int, card: dict) -> EpisodeStore | None:
+    """The kept steps of this task (`kept`) or of one that differs in its speed limit alone, where there are some: the
+    same episodes, and no simulation. Speeds are kept in double precision, so every cost is the one that a simulation
+    would count."""
+    for other in chain([kept], (_usable(_kept(name, transitions, seed), card) for name in siblings(task.name))):
         if other is not None and other.speed is not None:
             told = other.card | card | {"protocol": task.protocol}
             told |= task.env.describe(other.speed, task.cost_limit)

@@ -55,10 +55,16 @@ def film(run: Run, variant: str) -> Path:
     """Make the GIF of the first episode that an evaluation recorded, beside its recording."""
     task = load_job(run).task
     check(task)
+    kept = recorded(run, variant)
+    return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
+
+
+def recorded(run: Run, variant: str) -> dict[str, np.ndarray]:
+    """An evaluation's recording; `UserError` where it kept none."""
     kept = recording(run, variant)
     if kept is None:
         raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
-    return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
+    return kept
 
 
 def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
