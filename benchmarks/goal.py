@@ -26,12 +26,13 @@ HEAD = (
 def table(folder: Path = RESULTS) -> str:
     """One line per task; return / steps above the limit."""
     shown = board.read(folder)
-    references, reached_on, first = standings.references(shown), [], Counter()
+    references, reached_on, first, pairs = standings.references(shown), [], Counter(), []
     lines = ["| task | " + " | ".join(HEAD) + " |", "|---" * (len(HEAD) + 1) + "|"]
     for task, rows in standings.standings(shown).items():
         ours = next((r for r in rows if _is(r, "icbf", "adaptive")), None)
         if ours is None:
             continue
+        pairs += [(ours, r) for r in rows if _is(r, "madiff", "adaptive")]
         logged = next((r for r in references[task] if r.name == "data within the limit"), None)
         rivals = [r for r in rows if _baseline(r) and r.returns >= SHARE * ours.returns]
         rival = min(rivals, key=lambda r: (r.cost, -r.returns), default=None)
@@ -58,7 +59,22 @@ def table(folder: Path = RESULTS) -> str:
         + ", ".join(f"{name} on {n}" for name, n in first.most_common())
         + "."
     )
+    lines.append(f"\n{_against(pairs)}")
     return "\n".join(lines)
+
+
+def _against(pairs: list[tuple[Standing, Standing]]) -> str:
+    """What the barrier adds: ours and MADIFF under the same planner."""
+    kept, ends = sum(other.safe for _, other in pairs), max(other.cost_interval[1] for _, other in pairs)
+    costs = [ours.cost - other.cost for ours, other in pairs]
+    earned = [100 * (ours.returns / other.returns - 1) for ours, other in pairs]  # %
+    less, more = (lambda x: sum(d < 0 for d in x)), (lambda x: sum(d > 0 for d in x))
+    return (
+        f"MADIFF, which has no barrier, keeps the limit with the same planner on {kept} of {len(pairs)} (its intervals "
+        f"end at {ends:.1f} at most). Beside it `split` costs less on {less(costs)} and more on {more(costs)}, between "
+        f"{-min(costs):.1f} steps less and {max(costs):.1f} more, and earns more on {more(earned)} and less on "
+        f"{less(earned)}, between {max(earned):.0f} % more and {-min(earned):.0f} % less."
+    )
 
 
 def _is(row: Standing, algorithm: str, planner: str) -> bool:
