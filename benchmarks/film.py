@@ -38,7 +38,7 @@ def main() -> None:
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
     films = [pair(*frames) for frames in zip(left, right)]
-    shown = round(1000 * video.DT * video.stride(range(STEPS)))  # ms
+    shown = round(1000 * video.DT * video.stride(STEPS))  # ms
     films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
     print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
 
@@ -51,7 +51,7 @@ def half(run: Run, variant: str) -> list[Image.Image]:
     name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)
     title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
     made = []
-    for frame in video.frames(env, states[:STEPS], costs):
+    for frame in video.frames(env, states[: STEPS + 1], costs[:STEPS]):
         whole = Image.new("RGB", (frame.width, frame.height + HEAD), "white")
         whole.paste(frame, (0, HEAD))
         ImageDraw.Draw(whole).text((10, 5), title, fill=(20, 20, 20))

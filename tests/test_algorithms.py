@@ -196,7 +196,11 @@ def test_a_controller_acts_like_the_policy(trained, small_store):
         (np.zeros((3, 18)), np.full(18, np.nan), r"state\[0\] is nan"),
         (np.full((3, 18), np.inf), np.zeros(18), r"observations\[0, 0\] is inf"),
         ([[0.0], [0.0, 1.0]], np.zeros(18), "observations is no array of numbers"),
-        (np.zeros((3, 18)), None, "needs the global state"),
+        (
+            np.zeros((3, 18)),
+            None,
+            r"act\(\) got no state, .* view 'pruned' reads it; pass the global state \(18 entries\)",
+        ),
     ],
 )
 def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said):

@@ -3,19 +3,22 @@
 import dataclasses
 import json
 import os
+import queue
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ringfence import evaluate, files, reference, tasks, training
 from ringfence.bench import cells as grid
-from ringfence.bench import make_grid, paper, rows, run_local, suites, write_csv
+from ringfence.bench import cluster, local, make_grid, paper, rows, run_local, suites, write_csv
+from ringfence.cli import _runs, main
 from ringfence.errors import UserError
 from ringfence.hazards import Separation, to_dict
 from ringfence.policies import PLANNERS, PlanOptions
@@ -128,6 +131,49 @@ def test_entries_are_chosen_by_algorithm_or_preset(tmp_path):
         ("icbf", "mujoco-paper"),
         ("icbf", "mujoco"),
     ]
+
+
+def test_the_papers_grids_are_refused_or_made_as_a_whole(tmp_path, capsys):
+    few = dict(seeds=1, episodes=4)
+    both = paper.grids(tmp_path, **few)
+    assert [g.suite for g in both] == ["simple_spread", "mujoco"]
+    assert {c.algorithm for g in both for c in g.cells} == set(paper.METHODS)
+    for name, suite in (("icbf:split", "simple_spread"), ("icbf:mujoco", "mujoco")):
+        (only,) = paper.grids(tmp_path, only=[name], **few)
+        assert only.suite == suite
+    with pytest.raises(UserError, match="did you mean 'icbf'"):
+        paper.grids(tmp_path, only=["icfb"], **few)
+    both[1].open()
+    with pytest.raises(SystemExit):
+        main(["bench", "paper", "--out", str(tmp_path), "--seeds", "1", "--episodes", "5"])
+    assert "has episodes=4, this grid 5" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "simple_spread").exists(), "the second part was looked at before the first was begun"
+
+
+def test_a_reference_whose_worker_dies_is_told(made, capsys):
+    pool = local._Pool(made, queue.Queue(), None, 1, 2.0, -1)
+    dead, job = SimpleNamespace(pid=1, returncode=-9), {"reference": "simple_spread-random"}
+    pool._died(dead, None, [], job)
+    assert pool.jobs.get_nowait() == job and not capsys.readouterr().err, "tried again"
+    pool._died(dead, None, [], job)
+    pool.too_big.add(2)
+    pool._died(SimpleNamespace(pid=2, returncode=-9), None, [], {"reference": "other"})
+    told = capsys.readouterr().err
+    assert pool.jobs.empty()
+    assert "simple_spread-random could not be made: its worker died 2 times (exit status -9)" in told
+    assert "other could not be made: its worker grew beyond 2 GiB" in told
+
+
+def test_a_folder_that_was_moved_aside_is_found(made, tmp_path):
+    """As a kill between the two renames of a returned run leaves it."""
+    cell = dataclasses.replace(made.cells[0])
+    folder = cell.folder(tmp_path)
+    shutil.copytree(cell.folder(made.out), folder)
+    kept = cluster.begun(cell, tmp_path)
+    folder.replace(folder.with_name(f".{folder.name}.old"))
+    assert len(cluster.begun(cell, tmp_path)) == len(kept) and folder.exists()
+    shutil.copytree(folder, folder.with_name(f".{folder.name}.part"))
+    assert [r.path for r in _runs([tmp_path])] == [folder]
 
 
 def test_table(made):

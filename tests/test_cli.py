@@ -9,6 +9,7 @@ import pytest
 from ringfence import demo
 from ringfence.cli import main
 from ringfence.data import EpisodeStore
+from ringfence.errors import UserError
 
 
 def test_lists_tasks(capsys):
@@ -87,6 +88,23 @@ def test_errors_of_the_system_are_told_in_one_sentence(monkeypatch, capsys, tmp_
     with pytest.raises(SystemExit) as stop:
         main(["eval", str(tmp_path)])
     assert stop.value.code == 2 and "Permission denied; check that the path" in capsys.readouterr().err
+
+
+def test_it_is_said_which_of_several_runs_was_refused(monkeypatch, capsys, tmp_path):
+    import ringfence.evaluate
+
+    def refuse(run, **told):
+        raise UserError("this policy has diverged." if run.path.name != "b" else f"'{run.path}' is damaged.")
+
+    monkeypatch.setattr(ringfence.evaluate, "evaluate", refuse)
+    for name in "abc":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text("{}")
+    with pytest.raises(SystemExit):
+        main(["eval", str(tmp_path)])
+    told = capsys.readouterr().err
+    assert f"error: {tmp_path}/a, {tmp_path}/c: this policy has diverged." in told
+    assert f"error: '{tmp_path}/b' is damaged." in told
 
 
 def test_every_set_counts(monkeypatch):

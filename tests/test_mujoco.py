@@ -147,6 +147,8 @@ def test_actions_are_clipped_and_bad_input_is_refused(monkeypatch):
         sim.reset([0, 1])
     with pytest.raises(UserError, match="did you mean"):
         SafeMuJoCo("2x5")
+    with pytest.raises(UserError, match="episode_length=0 must be at least 1"):
+        SafeMuJoCo("2x3", episode_length=0)
     with pytest.raises(UserError, match="speed_limit=0"):
         SafeMuJoCo("2x3", speed_limit=0)
     monkeypatch.setattr(mujoco, "__version__", "4.0.0")
@@ -164,6 +166,8 @@ def test_pettingzoo_face():
     second = env.reset()[0]["agent_2"]
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(env.reset(seed=4)[0]["agent_2"], first)
+    with pytest.raises(UserError, match="seed=-1; pass one of 0 or more"):
+        env.reset(seed=-1)
     np.testing.assert_array_equal(env.reset()[0]["agent_2"], second)
     actions = dict.fromkeys(env.agents, np.zeros(2, np.float32))
     for _ in range(30):

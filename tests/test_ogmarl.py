@@ -151,8 +151,10 @@ def test_a_recording_can_be_read_under_another_limit(tmp_path):
     np.testing.assert_array_equal(slow.costs, log["speed"] > 0.5)
     task = tasks.from_store(slow)
     assert task.name == "halfcheetah_2x3-good-below-0.5" and task.env.limit == 0.5 and slow.card["protocol"] == "own"
-    with pytest.raises(UserError, match="no quantile limit for 'halfcheetah_2x3-imported'; pass --speed-limit"):
+    with pytest.raises(UserError, match="no quantile limit for 'halfcheetah_2x3-imported'; name the tier with --tier"):
         import_vault(vault.rename(tmp_path / "mine"), "halfcheetah_2x3", "quantile")
+    again = import_vault(tmp_path / "mine", "halfcheetah_2x3", "quantile", tier="Good")
+    assert again.card["task"] == store.card["task"]
 
 
 def test_falls_that_were_not_paid_keep_their_speed(tmp_path):
@@ -166,6 +168,7 @@ def test_falls_that_were_not_paid_keep_their_speed(tmp_path):
     np.testing.assert_array_equal(store.costs, first.costs)
     assert "1 falls were not paid the 1 for standing" in " ".join(store.card["warnings"])
     assert "not paid" not in " ".join(first.card["warnings"])
+    assert "multiagent_mujoco" in first.card["simulator"] and "gymnasium-robotics" in store.card["simulator"]
 
 
 def test_data_that_is_not_what_its_name_says_is_refused(tmp_path):
@@ -231,6 +234,7 @@ def test_contact_forces_are_found_where_they_were_charged(tmp_path):
     log["rewards"] += (5e-4 * np.clip(after, -1, 1) ** 2).sum(1, keepdims=True).astype(np.float32) * 9
     store = import_vault(write_vault(tmp_path / "b", log, states=states), "ant_4x2")
     assert "contact forces charged" in " ".join(store.card["warnings"])
+    assert store.card["simulator"].startswith("gymnasium-robotics"), "whose states hold 78 forces"
 
 
 def test_rewards_that_were_scaled_and_rows_out_of_order_are_refused(tmp_path):
@@ -278,6 +282,19 @@ def test_lengths_of_madiffs_paths_are_whole_numbers(tmp_path):
         import_madiff(folder, "halfcheetah_2x3")
 
 
+def test_rewards_of_one_meaning_are_read_and_no_others(tmp_path):
+    """An Ant's arrays cannot be replayed, so nothing else would tell that rewards are those of other steps."""
+    log = recorded("4x2")
+    folder = write_madiff(tmp_path / "medium", log, "4x2")
+    first, rewards = import_madiff(folder, "ant_4x2"), log["rewards"]
+    for same in (rewards[..., None], rewards[:, 0], rewards[:, :1]):
+        np.save(folder / "rewards.npy", same)
+        np.testing.assert_allclose(import_madiff(folder, "ant_4x2").rewards, first.rewards, rtol=1e-6)
+    np.save(folder / "rewards.npy", rewards.T)
+    with pytest.raises(StoreError, match=r"rewards.npy has shape \(4, 60\)"):
+        import_madiff(folder, "ant_4x2")
+
+
 def test_madiffs_ant_says_what_it_lacks(tmp_path):
     log = recorded("4x2")
     store = import_madiff(write_madiff(tmp_path / "medium", log, "4x2", reverse=False), "ant_4x2")
@@ -318,12 +335,18 @@ def test_other_robots_and_damaged_files_are_refused(tmp_path):
         blob.write_bytes(blob.read_bytes()[: blob.stat().st_size // 2])
     with pytest.raises(StoreError, match="is missing or damaged"):
         import_vault(torn, "halfcheetah_2x3")
-    (vault / "metadata.json").write_text(json.dumps({"version": 1.2}))
-    with pytest.raises(StoreError, match="metadata.json' is damaged"):
-        import_vault(vault, "halfcheetah_2x3")
+    for told in ({"version": 1.2}, [1.2]):
+        (vault / "metadata.json").write_text(json.dumps(told))
+        with pytest.raises(StoreError, match="metadata.json' is damaged"):
+            import_vault(vault, "halfcheetah_2x3")
     folder = write_madiff(tmp_path / "poor", log, "2x3")
     with pytest.raises(StoreError, match="obs.npy has shape"):
         import_madiff(folder, "ant_4x2")
+    lost = np.load(folder / "obs.npy")
+    lost[5, 0, 9] = np.nan
+    np.save(folder / "obs.npy", lost)
+    with pytest.raises(StoreError, match="obs.npy of step 5 is not finite"):
+        import_madiff(folder, "halfcheetah_2x3")
     (folder / "rewards.npy").unlink()
     with pytest.raises(StoreError, match="lacks rewards.npy"):
         import_madiff(folder, "halfcheetah_2x3")

@@ -293,7 +293,13 @@ def test_missing_checkpoint_is_said_on_the_page(tmp_path):
     assert "Not drawn:" in build_report([run], tmp_path).read_text()
 
 
-def test_damaged_recording_is_an_error_that_helps(runs, tmp_path):
-    (runs[0].path / "rollout-split.npz").write_bytes(b"PK nonsense")
+@pytest.mark.parametrize("damage", ["another file", "cut to nothing", "flipped bits"])
+def test_damaged_recording_is_an_error_that_helps(runs, tmp_path, damage):
+    file = runs[0].path / "rollout-split.npz"
+    np.savez_compressed(file, states=np.arange(1000.0))
+    data = file.read_bytes()
+    middle = bytes(255 - b for b in data[100:200])
+    wrong = {"another file": b"PK nonsense", "cut to nothing": b"", "flipped bits": data[:100] + middle + data[200:]}
+    file.write_bytes(wrong[damage])
     with pytest.raises(UserError, match="damaged"):
         build_report(runs, tmp_path)

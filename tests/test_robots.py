@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from ringfence.data.store import ARRAYS
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.policies import Constant
+from ringfence.report import video
 from ringfence.report.video import animate
 from ringfence.types import PolicyStep
 
@@ -200,6 +202,9 @@ def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
     shutil.copy(tmp_path / "one" / "0000100.npz", tmp_path / "few")
     with pytest.raises(UserError, match="1 snapshots for 'good', 4 are needed"):
         robots.pack(env, [tmp_path / "few"], tmp_path)
+    with pytest.raises(UserError, match="--transitions 100 holds no bout of learning; give 256 or more"):
+        robots._train_and_keep(env, robots.RobotsConfig(transitions=100), 0, "good", tmp_path / "short")
+    assert not (tmp_path / "short").exists()
     with pytest.raises(UserError, match="scores.jsonl' does not exist"):
         robots.pack(env, [tmp_path / "none"], tmp_path)
 
@@ -264,6 +269,11 @@ def test_another_limit_counts_anew_what_is_kept(tmp_path, monkeypatch):
         mended, _ = make(quantile, 300)
     assert len(told) == 1, "a damaged file is read once"
     np.testing.assert_array_equal(mended.costs, counted.costs)
+    path.write_bytes(b"no HDF5")
+    cached = tmp_path / "data" / path.name.replace("-quantile", "")
+    cached.unlink()
+    with pytest.warns(UserWarning, match=f"`ringfence data make {names[1]}` makes it again"):
+        make(native, 300)
 
 
 def test_what_the_limit_allows_to_earn():
@@ -288,6 +298,15 @@ def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
         assert picture.size == (320, 240) and picture.n_frames == 6
 
 
+def test_a_film_shows_every_violation_and_the_end():
+    costs = np.zeros(1001)
+    costs[[5, 1000]] = 1.0
+    shown = video.moments(costs)
+    times, over = zip(*shown)
+    assert len(shown) <= video.LONGEST + 1 and times[0] == 0 and times[-1] == 1001, "1002 states, thinned out"
+    assert [t for t, o in shown if o] == [min(t for t in times if t > 5), 1001] and sum(over) == 2
+
+
 def test_the_floor_goes_on_where_the_robot_runs_far(tmp_path):
     from PIL import Image
 
@@ -304,6 +323,15 @@ def test_the_floor_goes_on_where_the_robot_runs_far(tmp_path):
         picture.seek(picture.n_frames - 1)
         beside = np.asarray(picture.convert("L")).astype(int)[180:215, :60]
     assert beside.max() - beside.min() > 100, "light and dark tiles"
+
+
+def test_a_drawing_process_that_dies_is_no_traceback(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "backend", lambda: "egl")
+    killed = subprocess.CompletedProcess([], -9, "", "")
+    monkeypatch.setattr(video, "_run", lambda *_: killed)
+    with pytest.raises(UserError, match="x.gif' could not be drawn: .* status -9 .*free some memory"):
+        animate(SafeMuJoCo("2x3"), np.zeros((3, 17)), np.zeros(2), tmp_path / "x.gif")
+    assert not list(tmp_path.iterdir())
 
 
 def test_without_a_way_to_draw_the_reason_is_said(tmp_path, monkeypatch):

@@ -273,15 +273,18 @@ def evaluate(
             check(load_job(run).task)
         record = record or 1
     told = dict(episodes=episodes, split=split, planner=planner, record=record, step=step, quiet=False)
-    refused: dict[str, None] = {}  # what several runs are refused for is said once
+    refused: dict[str, list] = {}  # what several runs are refused for is said once
     for run in found:
         try:
             r = run_evaluation(run, **told, **given)
-            if video:
-                print(film(run, r["variant"]))
         except UserError as error:
-            refused[str(error)] = None
+            refused.setdefault(str(error), []).append(run)
             continue
+        if video:
+            try:
+                print(film(run, r["variant"]))
+            except UserError as error:
+                refused.setdefault(str(error), []).append(run)
         table.add_row(
             escape(str(run.path)),
             r["variant"],
@@ -295,8 +298,9 @@ def evaluate(
         )
     if table.row_count:
         out.print(table)
-    for message in refused:
-        _complain(message)
+    for message, those in refused.items():
+        unsaid = [str(run.path) for run in those if str(run.path) not in message]
+        _complain(", ".join(unsaid) + ": " * bool(unsaid) + message if len(found) > 1 else message)
     if refused:
         sys.exit(2)
 
@@ -424,7 +428,7 @@ def bench(
         steps: updates of every algorithm, for a quick trial.
         engine: processes on this machine, or Ray tasks.
         workers: local processes; one per `threads` cores by default.
-        threads: per worker or Ray task.
+        threads: per worker; cores that Ray sets aside per task.
         memory: GiB that a local process may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
@@ -435,24 +439,25 @@ def bench(
         raise UserError(
             f"--steps {steps} makes other rows than the suite's own; give a folder of their own with --out."
         )
-    root, parts = out_dir or Path("results"), {suite: only_tasks}
+    root, sizes = out_dir or Path("results"), dict(seeds=seeds, episodes=episodes, steps=steps)
     if suite == "paper":
-        parts, only = paper.parts(only_tasks), only or list(paper.METHODS)
-    elif out_dir is None:
-        root = root / suite
+        grids = paper.grids(root, only_tasks, only, **sizes)
+    else:
+        root = out_dir or root / suite
+        grids = [make_grid(suite, root, only_tasks=only_tasks, only=only, **sizes)]
+    for grid in grids:  # what is wrong with the last one is said before the first begins
+        grid.check()
     complete, idle = True, True
-    for part, names in parts.items():
-        folder = root / part if suite == "paper" else root
-        grid = make_grid(part, folder, seeds=seeds, episodes=episodes, only_tasks=names, only=only, steps=steps)
+    for grid in grids:
         idle = idle and not grid.groups()
         counts = _run_grid(grid, engine, workers, threads, memory, address)
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
         if counts["done"] and suite != "paper":
-            bench_results(folder)
+            bench_results(grid.out)
         if lacking := grid.references():
             _complain(f"The reference rows of {', '.join(lacking)} could not be made; see above.")
         if counts["failed"] or counts["to do"]:
-            bench_status(folder)
+            bench_status(grid.out)
         complete = complete and not (lacking or counts["failed"] or counts["to do"])
     if suite == "paper":
         bench_paper(root)
@@ -650,6 +655,7 @@ def _runs(paths: list[Path]) -> list:
         if not path.exists():
             raise UserError(f"'{path}' does not exist; give a folder that `ringfence train` made.")
         files = [path / "config.json"] if (path / "config.json").exists() else sorted(path.rglob("config.json"))
+        files = [f for f in files if not any(p.startswith(".") for p in f.relative_to(path).parts)]  # half-copied
         if not files:
             raise UserError(f"'{path}' holds no run; give a folder that `ringfence train` made.")
         found += [Run(f.parent) for f in files]

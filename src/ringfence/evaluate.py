@@ -279,6 +279,12 @@ class Controller:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."
             )
+        view = self.job.feature_map
+        if state is None and view.source == "state":
+            raise UserError(
+                f"act() got no state, but this run's view '{view.view}' reads it; pass the global state"
+                + (f" ({state_width} entries)." if state_width else ".")
+            )
         whole = None if state is None else given_as("state", state, (state_width,))
         if None in self.job.widths:
             self._reaches(seen, whole)

@@ -145,7 +145,13 @@ class Grid:
         return {t: n for t, n in sizes.items() if not reference.there(tasks.get(t), folder, self.episodes, n)}
 
     def open(self) -> None:
-        """Make the folder, or check that it holds results of this suite and protocol."""
+        """Make the folder, if it is not there."""
+        self.check()
+        if not (self.out / "bench.json").exists():
+            write_json(self.out / "bench.json", about(self.suite, self.episodes))
+
+    def check(self) -> None:
+        """Refuse a folder that holds anything but results of this suite and protocol."""
         mine = about(self.suite, self.episodes)
         file = self.out / "bench.json"
         if not file.exists():
@@ -153,7 +159,7 @@ class Grid:
                 raise UserError(f"'{self.out}' is a file; give --out an empty or a results folder.")
             if self.out.exists() and any(self.out.iterdir()):
                 raise UserError(f"'{self.out}' holds something else; give --out an empty or a results folder.")
-            write_json(file, mine)
+            return
         there = read_about(self.out)
         wrong = [k for k in mine if there.get(k) != mine[k]]
         if wrong:
@@ -191,6 +197,12 @@ def statuses(out: str | Path) -> list[dict]:
     return found
 
 
+def entry_names(suite: str) -> set[str]:
+    """What entries of a suite are chosen by."""
+    chosen = SUITES[suite]
+    return {name for task in chosen.tasks for e in chosen.entries for name in e.names(tasks.get(task))}
+
+
 def make_grid(
     suite: str,
     out: str | Path,
@@ -213,10 +225,9 @@ def make_grid(
     for name in names:
         if name not in chosen.tasks:
             raise unknown(f"task of the suite {suite}", name, chosen.tasks)
-    known = {name for task in chosen.tasks for e in chosen.entries for name in e.names(tasks.get(task))}
     for name in only:
-        if name not in known:
-            raise unknown("entry", name, known)
+        if name not in entry_names(suite):
+            raise unknown("entry", name, entry_names(suite))
     changes = () if steps is None else (("steps", steps),)
     cells = []
     for name in names:

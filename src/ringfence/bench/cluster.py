@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import shutil
 import socket
+import sys
 import tarfile
 import tempfile
 from pathlib import Path
@@ -33,8 +34,12 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
         return make(cell, episodes, begun)
 
     with owned(grid.out, grid.taken):
-        for name, transitions in {c.task: c.transitions for c in grid.cells}.items():
-            make_reference(name, grid.out, grid.episodes, transitions)
+        for name, transitions in grid.references().items():
+            try:
+                make_reference(name, grid.out, grid.episodes, transitions)
+            except Exception as error:  # cells do not need them
+                why = f"{type(error).__name__}: {error}"
+                print(f"the reference rows of {name} could not be made: {why}", file=sys.stderr, flush=True)
         cells = [c for group in grid.groups() for c in group]
         ours = set(cells)
         later = {c.twin(): c for c in cells if c.twin() in ours}  # they take what their twins will have learned
@@ -85,9 +90,21 @@ def begun(cell: Cell, out: Path) -> bytes:
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
         for known in (cell, cell.twin()):
-            if known is not None and known.folder(out).exists():
+            if known is not None and found(known.folder(out)):
                 tar.add(known.folder(out), arcname=str(known.folder(out).relative_to(out)))
     return buffer.getvalue()
+
+
+def found(folder: Path) -> bool:
+    """Whether a run folder is there; one that was moved aside when its successor was to take its place is put back."""
+    aside = _beside(folder, "old")
+    if aside.exists() and not folder.exists():
+        aside.replace(folder)
+    return folder.exists()
+
+
+def _beside(folder: Path, ending: str) -> Path:
+    return folder.with_name(f".{folder.name}.{ending}")
 
 
 def packed(cell: Cell, episodes: int, begun: bytes) -> bytes:
@@ -105,8 +122,7 @@ def packed(cell: Cell, episodes: int, begun: bytes) -> bytes:
 def unpack(packed: bytes, folder: Path) -> None:
     """Put a returned run folder in place, whole or not at all."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    part = folder.with_name(f".{folder.name}.part")
-    old = folder.with_name(f".{folder.name}.old")
+    part, old = _beside(folder, "part"), _beside(folder, "old")
     for left in (part, old):
         shutil.rmtree(left, ignore_errors=True)
     with tarfile.open(fileobj=io.BytesIO(packed)) as tar:

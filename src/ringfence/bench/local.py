@@ -151,17 +151,25 @@ class _Pool:
     def _died(self, worker, cell: Cell | None, left: list[Cell], job: dict) -> None:
         """The worker is gone before its job was done: retry the cell once, hand the others back."""
         if cell is None:
-            if "reference" in job and self._again(("reference", job["reference"])):
+            if "reference" not in job:
+                return
+            if worker.pid not in self.too_big and self._again(("reference", job["reference"])):
                 self.jobs.put(job)
+            else:
+                why = self._cause(worker)
+                print(f"the reference rows of {job['reference']} could not be made: {why}", file=sys.stderr, flush=True)
             return
-        too_big = worker.pid in self.too_big
-        if too_big or not self._again((cell.task, cell.algorithm, cell.preset, cell.seed)):
-            why = f"its worker grew beyond {self.memory:g} GiB" if too_big else f"its worker died {DEATHS} times"
-            record_failure(cell, self.grid.out, f"{why} (exit status {worker.returncode})")
+        if worker.pid in self.too_big or not self._again((cell.task, cell.algorithm, cell.preset, cell.seed)):
+            record_failure(cell, self.grid.out, self._cause(worker))
             self._count()
             left = [c for c in left if c != cell]
         if left:
             self.jobs.put({**job, "cells": [encode(c) for c in left]})
+
+    def _cause(self, worker) -> str:
+        grown = f"its worker grew beyond {self.memory or 0:g} GiB"
+        why = grown if worker.pid in self.too_big else f"its worker died {DEATHS} times"
+        return f"{why} (exit status {worker.returncode})"
 
     def _again(self, name: tuple) -> bool:
         with self.guard:

@@ -25,7 +25,7 @@ COLLECTION = 271_828  # root of the collection keys, far from those of evaluatio
 def cache_dir() -> Path:
     """Where regenerated data is kept: $RINGFENCE_HOME, else the user's cache folder."""
     home = os.environ.get("RINGFENCE_HOME")
-    return Path(home) if home else Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "ringfence"
+    return Path(home) if home else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ringfence"
 
 
 def make(
@@ -60,7 +60,8 @@ def make(
     if isinstance(env, SimpleSpread):
         card |= {"integrator": env.integrator, "reward": env.reward}
     robot = isinstance(env, SafeMuJoCo)
-    kept = _usable(_kept(task.name, transitions, seed), card) if not fresh and (robot or not out) else None
+    again = f"{task.name} is made again."
+    kept = _usable(_kept(task.name, transitions, seed), card, again) if not fresh and (robot or not out) else None
     if kept is not None and not out and kept.card["hazard"] == danger:  # or the name has come to mean something else
         return kept, path
     if robot:
@@ -127,7 +128,9 @@ def _relabelled(task: Task, kept: EpisodeStore | None, transitions: int, seed: i
     """The kept steps of this task (`kept`) or of one that differs in its speed limit alone, where there are some: the
     same episodes, and no simulation. Speeds are kept in double precision, so every cost is the one that a simulation
     would count."""
-    for other in chain([kept], (_usable(_kept(name, transitions, seed), card) for name in siblings(task.name))):
+    more = siblings(task.name)
+    later = (_usable(_kept(n, transitions, seed), card, f"`ringfence data make {n}` makes it again.") for n in more)
+    for other in chain([kept], later):
         if other is not None and other.speed is not None:
             told = other.card | card | {"protocol": task.protocol}
             told |= task.env.describe(other.speed, task.cost_limit)
@@ -136,14 +139,14 @@ def _relabelled(task: Task, kept: EpisodeStore | None, transitions: int, seed: i
     return None
 
 
-def _usable(path: Path, card: dict) -> EpisodeStore | None:
-    """A kept store, if it is of the same simulator; one that is damaged is made again."""
+def _usable(path: Path, card: dict, damaged: str) -> EpisodeStore | None:
+    """A kept store, if it is of the same simulator; of one that is damaged it is said what becomes of it."""
     if not path.exists():
         return None
     try:
         kept = EpisodeStore.load(path)
     except StoreError as error:
-        warnings.warn(f"{error} It is made again.", stacklevel=4)
+        warnings.warn(f"{error} {damaged}", stacklevel=4)
         return None
     here = kept.card | {"episode_length": kept.card.get("episode_length", card["episode_length"])}
     same = all(here.get(k) == card[k] for k in ("simulator", "episode_length", "integrator", "reward") if k in card)

@@ -41,6 +41,8 @@ AGREES = 0.05  # median over replayed steps of the largest error in the state; t
 STRAY, STRAYS = 1.0, 0.05  # a replayed step that misses by more is a stray; the share of them that is allowed
 SPEED_AGREES = 0.1  # m/s, median over replayed steps of the error of the speed that the reward tells
 Limit = float | Literal["quantile"] | None
+RECORDED_WITH = "multiagent_mujoco 1.1, MuJoCo 2.1 (OG-MARL's word; the files do not say)"
+GYMNASIUM_FORCES = 78  # contact forces in the states of gymnasium-robotics' Ant, which leaves out the world's six
 CONTACT = 5e-4  # of the squared contact forces, which some versions of the Ant charge
 
 
@@ -66,7 +68,7 @@ def import_vault(
     `tier`: a word for the data; the folder's name, where it is good, medium, poor, expert or replay.
     """
     env, vault = _robot(task), Path(vault)
-    env, called, protocol = _limited(env, f"{task}-{tier or _tier(vault)}", speed_limit)
+    env, called, protocol = _limited(env, f"{task}-{_tier(vault, tier)}", speed_limit)
     wanted = ("actions", "rewards", "terminals", "truncations", "infos.state")
     arrays = _read_vault(vault, wanted)
     where = f"Vault '{vault}'"
@@ -110,7 +112,7 @@ def import_madiff(
     """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` and
     `tier` as of `import_vault`."""
     env, directory = _robot(task), Path(directory)
-    env, called, protocol = _limited(env, f"{task}-{tier or _tier(directory)}", speed_limit)
+    env, called, protocol = _limited(env, f"{task}-{_tier(directory, tier)}", speed_limit)
     where = f"'{directory}'"
     obs, actions, rewards, lengths = (_load(directory, f) for f in ("obs", "actions", "rewards", "path_lengths"))
     n, wide = env.n_agents, OLD_OBSERVATION[env.parts]
@@ -120,8 +122,10 @@ def import_madiff(
     steps = int(lengths.sum())
     _shape(where, "obs.npy", obs, (steps, n, n + wide))
     _shape(where, "actions.npy", actions, (steps, n, env.action_dim))
-    rewards = rewards.reshape(steps, -1) if rewards.size in (steps, steps * n) else rewards
+    if rewards.shape in ((steps,), (steps, 1), (steps, n, 1)):  # of the team, or with an axis too many
+        rewards = rewards.reshape(steps, -1)
     _shape(where, "rewards.npy", rewards, (steps, rewards.shape[-1] if rewards.shape[-1:] == (1,) else n))
+    _finite(where, {"obs.npy": obs, "actions.npy": actions, "rewards.npy": rewards})
     if not (obs[:, :, :n] == np.eye(n)).all():
         raise StoreError(
             f"{where}: obs.npy does not begin with every agent's number in one-hot form; it is not MADIFF's."
@@ -140,7 +144,10 @@ def _limited(env: SafeMuJoCo, name: str, speed_limit: Limit) -> tuple[SafeMuJoCo
         return env, name, "native"
     if speed_limit == "quantile":
         if name not in QUANTILE_LIMITS:
-            raise UserError(f"There is no quantile limit for '{name}'; pass --speed-limit in m/s.")
+            raise UserError(
+                f"There is no quantile limit for '{name}'; name the tier with --tier good, medium or poor, or pass "
+                "--speed-limit in m/s."
+            )
         return replace(env, speed_limit=QUANTILE_LIMITS[name]), f"{name}-quantile", "quantile"
     return replace(env, speed_limit=float(speed_limit)), f"{name}-below-{speed_limit:g}", "own"
 
@@ -156,13 +163,7 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
 
 
 def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str, notes: list[str]) -> EpisodeStore:
-    for array in ("state", "contact", "observations", "actions", "rewards"):
-        x = getattr(log, array)
-        if x is not None and not np.isfinite(x).all():
-            row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
-            raise StoreError(
-                f"{log.where}: {array} of step {row} is not finite (some pad with -inf); cut those rows first."
-            )
+    _finite(log.where, {k: getattr(log, k) for k in ("state", "contact", "observations", "actions", "rewards")})
     if not log.last.any():
         raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
     ends = np.flatnonzero(log.last) + 1
@@ -186,7 +187,7 @@ def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str,
     speed, seen = made.pop("speed"), made.pop("seen")
     card = {
         "task": name,
-        "simulator": "multiagent_mujoco 1.1, MuJoCo 2.1",
+        "simulator": made.pop("simulator"),
         "provenance": provenance,
         "agents": [f"agent{i}" for i in range(env.n_agents)],
         "observation_names": made.pop("names"),
@@ -198,6 +199,13 @@ def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str,
         **env.describe(speed, ROBOT_COST_LIMIT),
     }
     return EpisodeStore.from_steps(**made, costs=speed > env.limit, card=card)
+
+
+def _finite(where: str, arrays: dict[str, np.ndarray | None]) -> None:
+    for name, x in arrays.items():
+        if x is not None and not np.isfinite(x).all():
+            row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
+            raise StoreError(f"{where}: {name} of step {row} is not finite (some pad with -inf); cut those rows first.")
 
 
 def _earned_by_running(env: SafeMuJoCo, rewards: np.ndarray, actions: np.ndarray) -> np.ndarray:
@@ -242,7 +250,9 @@ def _from_states(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) 
         after = np.append(state[1:, k], 0.0)
         after[at] = final[:, k]
         speed, seen = np.hypot(vx, (state[:, k] + after) / 2), ("torso.vx", "torso.vy")
+    newer = unpaid.any() or (log.contact is not None and log.contact.shape[1] == GYMNASIUM_FORCES)
     return {
+        "simulator": "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH,
         "observations": state[:, env.observed],
         "actions": actions,
         "rewards": log.rewards[:total].astype(np.float64).mean(-1),
@@ -272,6 +282,7 @@ def _from_observations(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[
         raise StoreError(f"{log.where} holds no episode of two steps or more.")
     x = log.observations[:total].astype(np.float32)
     return {
+        "simulator": RECORDED_WITH,
         "observations": x[keep],
         "actions": np.clip(log.actions[:total], -1.0, 1.0)[keep],
         "rewards": log.rewards[:total].astype(np.float64).mean(-1)[keep],
@@ -352,7 +363,9 @@ def _robot(task: str) -> SafeMuJoCo:
     return SafeMuJoCo(ROBOTS[task])
 
 
-def _tier(path: Path) -> str:
+def _tier(path: Path, told: str | None) -> str:
+    if told:
+        return told.lower() if told.lower() in TIERS else told
     name = path.resolve().name.lower()
     return name if name in TIERS else "imported"
 
@@ -394,7 +407,7 @@ def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
         raise StoreError(f"'{vault}' holds no metadata.json, so it is no Vault{hint}.")
     try:
         shapes = json.loads(file.read_text())["structure_shape"]
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise StoreError(f"'{file}' is damaged ({error}); copy the Vault again.") from error
 
     def read(name: str, cut: slice | None = None) -> np.ndarray:

@@ -389,6 +389,8 @@ def _train_and_keep(env: SafeMuJoCo, config: RobotsConfig, seed: int, level: str
     folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
     if folder.exists():
         raise UserError(f"'{folder}' exists already; delete it or give another --seed or --out.")
+    if config.transitions < (least := config.robots * config.stretch):
+        raise UserError(f"--transitions {config.transitions} holds no bout of learning; give {least} or more.")
     enough = 1.03 * LEVELS[env.parts][level]
 
     def progress(snapshot: Snapshot) -> None:

@@ -60,6 +60,8 @@ class SafeMuJoCo:
             raise unknown("division of a robot", str(self.parts), ROBOTS)
         if self.speed_limit is not None and not self.speed_limit > 0:
             raise UserError(f"speed_limit={self.speed_limit} must be positive; it is in m/s.")
+        if self.episode_length < 1:
+            raise UserError(f"episode_length={self.episode_length} must be at least 1; it is in steps.")
 
     @property
     def robot(self) -> str:

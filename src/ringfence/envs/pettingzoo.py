@@ -168,6 +168,8 @@ class SafeMuJoCoParallel(_Parallel):
 
     def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
         """Start an episode; a seed fixes this one, as in safety-gymnasium, and all later ones."""
+        if seed is not None and seed < 0:
+            raise UserError(f"reset() got seed={seed}; pass one of 0 or more, or None.")
         if seed is not None or self._seeds is None:
             self._seeds = np.random.SeedSequence(seed)
             start = self._seeds.entropy

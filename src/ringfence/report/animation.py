@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import zipfile
+import zlib
 
 import numpy as np
 
@@ -25,7 +26,7 @@ def recording(run: Run, variant: str) -> dict[str, np.ndarray] | None:
     try:
         with np.load(file) as arrays:
             return {k: arrays[k] for k in arrays.files}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error
 
 

@@ -81,7 +81,11 @@ def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | P
         np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=json.dumps(dataclasses.asdict(env)))
         made = _run([sys.executable, "-m", "ringfence.report.video", str(file), str(picture)], name)
         if made.returncode:
-            raise RuntimeError(made.stderr)
+            said = (made.stderr.strip().splitlines() or ["nothing"])[-1]
+            raise UserError(
+                f"'{out}' could not be drawn: the process that draws ended with status {made.returncode} and said: "
+                f"{said}; free some memory and try again."
+            )
         temporary.write_bytes(picture.read_bytes())
     return out
 
@@ -90,13 +94,22 @@ def _run(command: list[str], name: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": name})
 
 
-def stride(states: np.ndarray) -> int:
-    """Steps per frame; long episodes are thinned out."""
-    return max(EVERY, -(-len(states) // LONGEST))
+def stride(steps: int) -> int:
+    """Steps per picture; long episodes are thinned out."""
+    return max(EVERY, -(-(steps + 1) // LONGEST))
+
+
+def moments(costs: np.ndarray) -> list[tuple[int, bool]]:
+    """When an episode of costs (T,) is pictured, and whether a step since the picture before was above the limit; the
+    last state T is pictured, too."""
+    every = stride(len(costs))
+    times = sorted({*range(0, len(costs) + 1, every), len(costs)})
+    return [(t, bool(costs[max(0, t - every) : t].any())) for t in times]
 
 
 def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
-    """Pictures of an episode. The planar position is not in the state, so it is summed up from the velocity."""
+    """Pictures of an episode: states (T+1, S), costs (T,). The planar position is not in the state, so it is summed up
+    from the velocity."""
     import mujoco
     from PIL import Image, ImageDraw
 
@@ -111,12 +124,11 @@ def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
     speed = np.linalg.norm(states[:, moving], axis=1)
     renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
     nq = model.nq
-    for t in range(0, len(states), stride(states)):
+    for t, over in moments(costs):
         data.qpos[:] = np.concatenate([place[t], states[t, : nq - planar]])
         mujoco.mj_forward(model, data)
         renderer.update_scene(data, camera="track")
         picture = Image.fromarray(renderer.render())
-        over = t > 0 and bool(costs[t - 1])
         draw = ImageDraw.Draw(picture)
         scale = (WIDTH - 20) / (2 * env.limit)
         draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=(225, 225, 225))
@@ -135,7 +147,7 @@ def main() -> None:
         env = SafeMuJoCo(**json.loads(str(file["env"])))
         states, costs = file["states"], file["costs"]
     pictures = [p.quantize(64) for p in frames(env, states, costs)]
-    shown = round(1000 * DT * stride(states))  # ms
+    shown = round(1000 * DT * stride(len(costs)))  # ms
     pictures[0].save(sys.argv[2], save_all=True, append_images=pictures[1:], duration=shown, loop=0)
 
 
