@@ -23,7 +23,6 @@ from ringfence.runs import Run
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "rollout.gif"
 STEPS = 160  # from the start
 HEAD = 20  # pixels
-COLOURS = 48
 
 
 def main() -> None:
@@ -37,7 +36,7 @@ def main() -> None:
         left, right = half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant)
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
-    films = [pair(*frames) for frames in zip(left, right)]
+    films = video.with_one_palette([pair(*frames) for frames in zip(left, right)])
     shown = round(1000 * video.DT * video.stride(STEPS))  # ms
     films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
     print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
@@ -52,9 +51,9 @@ def half(run: Run, variant: str) -> list[Image.Image]:
     title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
     made = []
     for frame in video.frames(env, states[: STEPS + 1], costs[:STEPS]):
-        whole = Image.new("RGB", (frame.width, frame.height + HEAD), "white")
+        whole = Image.new("RGB", (frame.width, frame.height + HEAD), video.PAPER)
         whole.paste(frame, (0, HEAD))
-        ImageDraw.Draw(whole).text((10, 5), title, fill=(20, 20, 20))
+        ImageDraw.Draw(whole).text((10, 5), title, fill=video.DARK)
         made.append(whole)
     return made
 
@@ -63,7 +62,7 @@ def pair(left: Image.Image, right: Image.Image) -> Image.Image:
     both = Image.new("RGB", (left.width + right.width + 8, left.height), "white")
     both.paste(left, (0, 0))
     both.paste(right, (left.width + 8, 0))
-    return both.quantize(COLOURS)
+    return both
 
 
 if __name__ == "__main__":

@@ -26,6 +26,7 @@ from ringfence.tasks import Task
 WIDTH, HEIGHT = 320, 240  # pixels
 EVERY = 2  # steps per frame, at least
 LONGEST = 200  # frames
+DRAWN = EMPTY, RED, BLUE, DARK, PAPER = (225, 225, 225), (190, 50, 40), (70, 100, 200), (20, 20, 20), (255, 255, 255)
 # MUJOCO_GL's values that can work on a platform (others are Linux), and what to do where none does.
 BACKENDS = {"darwin": ("cgl",), "win32": ("wgl",)}
 HELP = "install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6)"
@@ -131,14 +132,31 @@ def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
         picture = Image.fromarray(renderer.render())
         draw = ImageDraw.Draw(picture)
         scale = (WIDTH - 20) / (2 * env.limit)
-        draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=(225, 225, 225))
+        draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=EMPTY)
         end = 10 + min(speed[t], 2 * env.limit) * scale
-        draw.rectangle((10, HEIGHT - 16, end, HEIGHT - 8), fill=(200, 60, 50) if over else (70, 100, 200))
-        draw.line((10 + env.limit * scale, HEIGHT - 20, 10 + env.limit * scale, HEIGHT - 4), fill=(20, 20, 20), width=2)
+        draw.rectangle((10, HEIGHT - 16, end, HEIGHT - 8), fill=RED if over else BLUE)
+        draw.line((10 + env.limit * scale, HEIGHT - 20, 10 + env.limit * scale, HEIGHT - 4), fill=DARK, width=2)
         text = f"{t * DT:4.1f} s   {speed[t]:.2f} m/s, limit {env.limit:g}" + ("   over" if over else "")
-        draw.rectangle((0, 0, WIDTH, 16), fill=(250, 250, 250))
-        draw.text((10, 3), text, fill=(160, 30, 20) if over else (20, 20, 20))
+        draw.rectangle((0, 0, WIDTH, 16), fill=PAPER)
+        draw.text((10, 3), text, fill=RED if over else DARK)
         yield picture
+
+
+def with_one_palette(pictures: list, colours: int = 64) -> list:
+    """RGB pictures in the same few colours, those of bars and words among them: nothing flickers, nothing is lost."""
+    from PIL import Image
+
+    some = pictures[:: max(1, len(pictures) // 4)]
+    width, height = some[0].size
+    wide = len(DRAWN) * height // 8
+    sample = Image.new("RGB", (width, len(some) * height + wide))
+    for k, picture in enumerate(some):
+        sample.paste(picture, (0, k * height))
+    for k, colour in enumerate(DRAWN):
+        top = len(some) * height + k * height // 8
+        sample.paste(colour, (0, top, width, top + height // 8))
+    palette = sample.quantize(colours)
+    return [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
 
 
 def main() -> None:
@@ -146,7 +164,7 @@ def main() -> None:
     with np.load(sys.argv[1]) as file:
         env = SafeMuJoCo(**json.loads(str(file["env"])))
         states, costs = file["states"], file["costs"]
-    pictures = [p.quantize(64) for p in frames(env, states, costs)]
+    pictures = with_one_palette(list(frames(env, states, costs)))
     shown = round(1000 * DT * stride(len(costs)))  # ms
     pictures[0].save(sys.argv[2], save_all=True, append_images=pictures[1:], duration=shown, loop=0)
 
