@@ -2,7 +2,9 @@
 
 import dataclasses
 import json
+import shutil
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,8 @@ import pytest
 from ringfence import algos, evaluate, tasks, training
 from ringfence.algos import icbf
 from ringfence.errors import CheckpointError, UserError
-from ringfence.runs import Run
+from ringfence.runs import Run, build_config
+from ringfence.types import PolicyStep
 from ringfence.windows import WindowData, draw
 
 TINY = {
@@ -242,7 +245,7 @@ def test_settings_that_mean_nothing_are_refused(small_store, tmp_path, changes, 
 
 def test_no_seed_and_no_store_are_refused(small_store, tmp_path):
     for seeds in ((), (-1,)):
-        with pytest.raises(UserError, match="must be one or more numbers of 0 or more"):
+        with pytest.raises(UserError, match="must be one or more whole numbers from 0"):
             training.train("bc", small_store, out=tmp_path, seeds=seeds)
     with pytest.raises(UserError, match="data of type str; pass an EpisodeStore"):
         training.train("bc", "simple_spread-random", out=tmp_path)
@@ -408,8 +411,6 @@ def test_broken_checkpoints_are_refused(trained, tmp_path):
 
 
 def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
-    import shutil
-
     from ringfence import runs
 
     run = Run(tmp_path / "copy")
@@ -465,10 +466,76 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
     run = Run(next(tmp_path.rglob("config.json")).parent)
     assert evaluate.evaluate(run, episodes=2)["step"] == 5
     assert "is at step 5 of 12; its training is unfinished" in capsys.readouterr().err
-    assert evaluate.evaluate(trained["bc"], episodes=2)["step"] == 12
+    assert evaluate.evaluate(str(trained["bc"].path), episodes=2)["step"] == 12
     assert not capsys.readouterr().err
     with pytest.raises(CheckpointError, match="no checkpoint of step 7; take one of: 5"):
         evaluate.evaluate(run, episodes=2, step=7)
+
+
+class Lost(eqx.Module):
+    """Its actions are no numbers."""
+
+    def start(self, batch):
+        return {}
+
+    def act(self, memory, observations, state, key):
+        return memory, PolicyStep(jnp.full((*observations.shape[:2], 2), jnp.nan), {})
+
+
+def test_actions_that_are_no_numbers_do_not_pass_for_safe():
+    with pytest.raises(UserError, match="Step 0 of episode 0 has a reward or state that is not finite"):
+        evaluate.evaluate_policy(Lost(), tasks.get("simple_spread-random"), episodes=2)
+
+
+def test_results_that_cannot_be_read_are_refused_before_an_episode_is_played(trained, tmp_path, monkeypatch):
+    run = Run(tmp_path / "copy")
+    shutil.copytree(trained["bc"].path, run.path)
+    (run.path / "results.json").write_text("{")
+    monkeypatch.setattr(evaluate, "evaluate_policy", lambda *_: pytest.fail("it was played"))
+    with pytest.raises(UserError, match="holds a damaged results.json; delete that file"):
+        evaluate.evaluate(run, episodes=2)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"seeds": 5}, r"seeds=5 must be several numbers; for so many seeds pass range\(5\)"),
+        ({"seeds": (0, 0)}, "each of them once"),
+        ({"seeds": (2**31,)}, "whole numbers from 0 to 2³¹ − 1"),
+        ({"seeds": ()}, "one or more whole numbers"),
+        ({"chunk": -1}, "chunk=-1 must be at least 1"),
+        ({"checkpoint_every": 0}, "checkpoint_every=0 must be at least 1"),
+        ({"changes": {"steps": None}}, "steps=None of bc must be a whole number"),
+        ({"changes": {"batch": 32.5}}, "batch=32.5 of bc must be a whole number"),
+        ({"changes": {"lr": True}}, "lr=True of bc must be a number"),
+        ({"changes": {"cost_limit": "abc"}}, "cannot be read as a number or none"),
+    ],
+)
+def test_what_training_is_told_wrongly_is_refused_before_a_folder_is_made(small_store, tmp_path, given, said):
+    with pytest.raises(UserError, match=said):
+        training.train("bc", small_store, out=tmp_path / "runs", quiet=True, **given)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_numbers_given_from_python_are_of_their_fields_type():
+    config = build_config(icbf.Config, {"steps": 1e3, "batch": np.int64(7), "lr": np.float32(0.5)}, "icbf")
+    assert [type(v) for v in (config.steps, config.batch, config.lr)] == [int, int, float]
+
+
+def test_sizes_of_the_unet_are_refused_at_once(small_store):
+    task = tasks.from_store(small_store)
+    with pytest.raises(UserError, match="depth=4 of the temporal U-Net"):
+        training.make_job("icbf", task, "madiff-unet", {"depth": 4}, small_store)
+
+
+def test_a_field_that_is_gone_is_another_config(trained, small_store, tmp_path):
+    out = trained["bc"].path.parents[2]
+    shutil.copytree(out / trained["bc"].config["task"] / "bc", tmp_path / trained["bc"].config["task"] / "bc")
+    file = tmp_path / trained["bc"].config["task"] / "bc" / "seed-0" / "config.json"
+    told = json.loads(file.read_text())
+    file.write_text(json.dumps({**told, "config": {**told["config"], "momentum": 0.9}}))
+    with pytest.raises(UserError, match="its momentum differs"):
+        training.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True)
 
 
 def test_damaged_run_folders_are_refused(tmp_path):
@@ -482,7 +549,7 @@ def test_damaged_run_folders_are_refused(tmp_path):
         (tmp_path / "config.json").write_bytes(content)
         with pytest.raises(UserError, match=said):
             evaluate.evaluate(run)
-    for content, said in ((b"[]", "is damaged.*holds a list"), (b"\xff", "is damaged.*UnicodeDecodeError")):
+    for content, said in ((b"[]", "damaged results.json; delete .*holds a list"), (b"\xff", "UnicodeDecodeError")):
         (tmp_path / "results.json").write_bytes(content)
         with pytest.raises(UserError, match=said):
             run.results  # noqa: B018 (reading is what fails)
@@ -559,7 +626,9 @@ def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, ab
         assert not training.make_job(name, task, None, {"view": "decentralized"}, store).hazard.has_formula
     assert training.make_job("madiff", task, None, {"view": "centralized"}, store).hazard.has_formula
     for name in ("icbf", "fisor"):
-        with pytest.raises(UserError, match=r"reads the feature 'other0\.dx'"):
+        with pytest.raises(
+            UserError, match="view 'decentralized' leaves out what the hazard Separation reads; set view="
+        ):
             training.make_job(name, task, None, {"view": "decentralized"}, store)
 
 

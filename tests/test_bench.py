@@ -292,6 +292,17 @@ def test_a_worker_that_outgrows_its_memory_is_stopped_and_said_so(tmp_path):
     assert "grew beyond 0.05 GiB" in g.cells[0].status(g.out)["error"]
 
 
+def test_a_file_system_without_locks_trains_all_the_same(tmp_path, monkeypatch):
+    import fcntl
+
+    def none(*_):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", none)
+    with files.owned(tmp_path, "not said"):
+        pass
+
+
 def test_a_killed_runner_loses_no_finished_cell(tmp_path):
     """Killed without warning after its first cell; the next runner keeps that cell and finishes the others."""
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)

@@ -246,6 +246,20 @@ def test_a_folder_without_finished_cells_is_refused(tmp_path):
         read(tmp_path)
 
 
+def test_a_task_without_any_result_is_shown_as_such(folder):
+    write(folder / "cells" / "simple_spread-random" / "bc" / "seed-0-a1" / "status.json", {"state": "failed"})
+    page = build_board(folder, folder / "page.html").read_text()
+    assert "simple_spread-random" in page
+    assert board_markdown_short(read(folder))
+
+
+def test_a_folder_of_validation_results_is_refused(tmp_path):
+    write(tmp_path / "bench.json", BENCH)
+    cell(tmp_path, {"default@validation": summary([1] * 4, [0] * 4, split="validation")})
+    with pytest.raises(UserError, match="results on other resets or of earlier checkpoints alone"):
+        read(tmp_path)
+
+
 def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
     twin = cell(folder, {"default": summary([1] * 4, [0] * 4)}, mark="b2")
     with pytest.raises(UserError, match="seed-0-a1' and .*seed-0-b2' are the same cell"):

@@ -119,6 +119,10 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         told = SimpleSpreadParallel.step(self, actions)
         return (told[0], dict.fromkeys(told[1], float("nan")), *told[2:])
 
+    def gone(self, actions):
+        told = SimpleSpreadParallel.step(self, actions)
+        return tuple({k: v for k, v in part.items() if k != "agent_1"} for part in told)
+
     cases = (
         (lambda: object(), "without possible_agents; give a PettingZoo ParallelEnv"),
         (lambda: SimpleSpreadParallel(n_agents=2), "has 2 agents, the run was trained with 3"),
@@ -127,10 +131,16 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         (made(step=silent), "pass cost=, a function of the agents' infos"),
         (made(step=broken), "Step 1 has a reward or cost that is not finite"),
         (made(step=lambda self, actions: (1, 2)), "returned 2 things"),
+        (made(reset=lambda self, seed: {}), "reset.. of Odd returned a dict; a ParallelEnv's returns two things"),
+        (made(step=gone), "tells no rewards of agent_1 at step 1"),
+        (made(_observations=lambda self: {}), "tells no observations of agent_0, agent_1, agent_2 at step 0"),
     )
     for make_env, said in cases:
         with pytest.raises(UserError, match=said):
             play(run, make_env, episodes=1)
+    shared = SimpleSpreadParallel()
+    with pytest.raises(UserError, match="gave the same SimpleSpreadParallel twice"):
+        play(run, lambda: shared, episodes=2)
     with pytest.raises(UserError, match="episodes=0 must be at least 1"):
         play(run, SimpleSpreadParallel, episodes=0)
     assert evaluate.load_job(run).task.cost_limit == 3

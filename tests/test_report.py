@@ -192,6 +192,33 @@ def test_headline_names_the_best_safe_method(runs, tmp_path):
     assert re.search(f'class="headline">{said}', text)
 
 
+def test_revisions_get_rows_of_their_own(runs):
+    told = json.loads((runs[1].path / "config.json").read_text())
+    (runs[1].path / "config.json").write_text(json.dumps(told | {"revision": 2}))
+    (section,) = sections(runs)
+    rows = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
+    assert rows["split [revision=1]"] == (0,) and rows["split [revision=2]"] == (1,)
+
+
+def test_one_run_and_one_path_make_a_page(runs, tmp_path):
+    for one in (runs[2], str(runs[2].path), runs[2].path):
+        assert "BC" in build_report(one, tmp_path / "one.html").read_text()
+
+
+@pytest.mark.parametrize("lost", ["cost_cvar10", "avoidable_interval", "unsafe_starts", "return_interval", "split"])
+def test_results_of_another_version_are_named(runs, tmp_path, lost):
+    told = runs[2].results
+    del told["default"][lost]
+    (runs[2].path / "results.json").write_text(json.dumps(told))
+    with pytest.raises(UserError, match=f"lacks '{lost}'|has split 'None'"):
+        build_report(runs, tmp_path)
+
+
+def test_lists_in_configs_can_be_told(tmp_path):
+    run = folder(tmp_path, "mine", "default", results={"default": result([1.0, 2.0], [0, 1])}, sizes=[64, 64])
+    assert "sizes=[64, 64]" in build_report([run], tmp_path).read_text()
+
+
 def test_configs_that_differ_get_rows_of_their_own(tmp_path):
     results = {"split": result([1.0, 2.0], [0, 1])}
     two = [folder(tmp_path / str(k), results=results, steps=k) for k in (10, 20)]

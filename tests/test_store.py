@@ -448,6 +448,31 @@ def test_places_far_from_the_origin_are_warned_of(small_store):
     assert coarse(dataclasses.replace(small_store, observations=far))[0].startswith("Observation entries 4 are so far")
 
 
+def test_entries_that_vary_for_one_agent_alone_are_no_constants(small_store):
+    """100 000 rows of all agents and more are thinned out by rows."""
+    from ringfence.data.audit import audit
+
+    def constant(store):
+        return [w for w in audit(store).warnings if "never vary" in w]
+
+    times = -(-200_000 // len(small_store.observations))
+    seen = np.tile(small_store.observations, (times, 1, 1))
+    seen[:, 0, 1] = 0.5  # of one agent
+    seen[:, :, 2] = 0.5  # of all
+    large = dataclasses.replace(
+        small_store,
+        observations=seen,
+        state=None,
+        **{k: np.tile(getattr(small_store, k), (times, 1, 1)) for k in ("actions",)},
+        **{k: np.tile(getattr(small_store, k), (times, 1)) for k in ("rewards",)},
+        **{k: np.tile(getattr(small_store, k), times) for k in ("costs", "terminated", "truncated")},
+        episode_ends=np.arange(1, times * small_store.episodes + 1) * 25,
+    )
+    silent = [w for w in constant(small_store)]
+    told = constant(large)[0]
+    assert " 2," in told and " 1," not in told and (not silent or " 1," not in silent[0])
+
+
 def test_content_tells_steps_apart(small_store):
     same = dataclasses.replace(small_store, costs=small_store.costs.copy())
     other = dataclasses.replace(small_store, costs=small_store.costs + 1)

@@ -361,11 +361,11 @@ def doctor() -> None:
 
     told = environment()
     for name in ("ringfence", "python", "system", "processor", "cores", "git"):
-        out.print(f"{name:12} {told[name]}")
+        out.print(f"{name:12} {escape(str(told[name]))}")
     for name, version in told["packages"].items():
         out.print(f"{name:12} {version}")
     out.print(f"{'devices':12} {', '.join(told['devices'])}")
-    out.print(f"{'cache':12} {cache_dir()}", soft_wrap=True)
+    out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
     from ringfence.report import video
 
     try:
@@ -505,7 +505,7 @@ def bench_results(folder: Positional[Path]) -> None:
             low, high = r.returns_interval
             table.add_row(
                 str(r.rank),
-                r.label,
+                escape(r.label),
                 str(len(r.seeds)),
                 f"{r.returns:.1f} [{low:.1f}, {high:.1f}]",
                 f"{r.returns_norm:.3f}",

@@ -86,6 +86,13 @@ def rollout(
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
     out |= {k: out[k][:episodes] for k in ("reward", "cost", "state")}
+    lost = ~(np.isfinite(out["reward"]) & np.isfinite(out["state"][:, 1:]).all(-1))
+    if lost.any():  # nothing collides with what is nowhere, so it would pass for safe
+        episode, step = np.argwhere(lost)[0]
+        raise UserError(
+            f"Step {step} of episode {episode} has a reward or state that is not finite, so the policy's actions are "
+            "no numbers; it has diverged or divides by zero."
+        )
     recorded = {k: v for k, v in out.items() if k not in ("reward", "cost", "state")}
     whole_length = {"steps": np.full(episodes, env.episode_length), "terminated": np.zeros(episodes, bool)}
     return {"rewards": out["reward"], "costs": out["cost"], "states": out["state"]} | whole_length | recorded
@@ -389,7 +396,9 @@ def evaluate(
     `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones. The result tells the
     `step` of the checkpoint that was played; where training is unfinished, a line on stderr says so.
     """
+    run = run if isinstance(run, Run) else Run(Path(run))
     job, policy, at = _loaded(run, step, planner, options)
+    _ = run.results  # damaged ones are refused before anything is played
     if step is None and at < job.config.steps:
         print(f"'{run.path}' is at step {at} of {job.config.steps}; its training is unfinished.", file=sys.stderr)
     told = run.config

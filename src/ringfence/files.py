@@ -58,10 +58,12 @@ def owned(folder: Path, taken: str) -> Iterator[int]:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
-            except OSError:
+            except BlockingIOError:
                 if attempt == 19:
                     raise UserError(taken) from None
                 time.sleep(0.25)
+            except OSError:  # a file system without locks: as above
+                break
         yield file
     finally:
         os.close(file)

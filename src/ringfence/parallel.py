@@ -48,6 +48,11 @@ def play(
             raise UserError(f"{name}={value} must be at least 1.")
     job, policy = evaluate.load(run, planner=planner, **options)
     envs = [make_env() for _ in range(min(at_once, episodes))]
+    if len({id(env) for env in envs}) < len(envs):
+        raise UserError(
+            f"make_env() gave the same {type(envs[0]).__name__} twice, but several are stepped side by side; make a "
+            "new one at every call, or pass at_once=1."
+        )
     act, key, begun = jax.jit(evaluate.act_with), jax.random.key(seed), time.perf_counter()
     label = jax.jit(lambda seen, state: job.hazard.labels(job.feature_map(seen, state))[0].any(-1))
     played: list[_Episode] = []
@@ -109,7 +114,13 @@ class _Episode:
         self.costs: list[float] = []
         self.terminated = self.unsafe_start = False
         self.running = True
-        self._look(env.reset(seed=seed)[0])
+        begun = env.reset(seed=seed)
+        if not isinstance(begun, tuple) or len(begun) != 2:
+            raise UserError(
+                f"reset() of {type(env).__name__} returned a {type(begun).__name__}; a ParallelEnv's returns two "
+                "things, observations and infos."
+            )
+        self._look(begun[0])
 
     @property
     def owes(self) -> bool:
@@ -129,6 +140,7 @@ class _Episode:
                 f"step() of {type(self.env).__name__} returned {len(told)} things; a ParallelEnv's are five."
             )
         seen, rewards, *costs, terminations, truncations, infos = told
+        self._all_in("rewards", rewards, len(self.rewards) + 1)
         ended = [bool(terminations.get(a) or truncations.get(a)) for a in self.agents]
         if any(ended) and not all(ended):
             gone = self.agents[ended.index(True)]
@@ -150,8 +162,17 @@ class _Episode:
                 "step() tells neither a cost nor the state that an episode ends in; return the last observations."
             )
 
+    def _all_in(self, what: str, told: dict, step: int) -> None:
+        lacking = [str(a) for a in self.agents if a not in told]
+        if lacking:
+            raise UserError(
+                f"{type(self.env).__name__} tells no {what} of {', '.join(lacking)} at step {step}; all "
+                "of possible_agents must take part until the episode ends."
+            )
+
     def _look(self, seen: dict) -> None:
         n, (width, state_width) = self.job.spec.n_agents, self.job.widths
+        self._all_in("observations", seen, len(self.rewards))
         there = [seen[a] for a in self.agents]
         self.seen = evaluate.given_as("observations", there, (n, width))
         self.state = evaluate.given_as("state", self.env.state(), (state_width,)) if state_width else None

@@ -50,8 +50,8 @@ class Run:
         for name, kind in _SAID.items():
             if not isinstance(told.get(name), kind):
                 raise UserError(
-                    f"'{self.path / 'config.json'}' says no {name}, so it is none of `ringfence train`; train the run "
-                    "again."
+                    f"'{self.path / 'config.json'}' says no {name}, so it is none of `ringfence train`; delete that "
+                    "folder and train the run again."
                 )
         return told
 
@@ -59,7 +59,11 @@ class Run:
     def results(self) -> dict[str, dict]:
         """Evaluations by variant; empty before the first `ringfence eval`."""
         file = self.path / "results.json"
-        return read_json(file, "is damaged; evaluate the run again") if file.exists() else {}
+        return (
+            read_json(file, "holds a damaged results.json; delete that file and evaluate the run again")
+            if file.exists()
+            else {}
+        )
 
     @property
     def metrics(self) -> list[dict]:
@@ -162,7 +166,7 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
         if name not in fields:
             raise unknown(f"config field of {of}", name, fields)
         default = fields[name].default
-        values[name] = _parse(name, value, default) if isinstance(value, str) else value
+        values[name] = _parse(name, value, default) if isinstance(value, str) else _typed(of, name, value, hints[name])
         _in_range(of, name, values[name])
         options = get_args(hints[name]) if get_origin(hints[name]) is Literal else ()
         if options and values[name] not in options:
@@ -196,6 +200,22 @@ def _in_range(of: str, name: str, value: Any) -> None:
         raise UserError(f"{name}={value} of {of} must be positive.")
 
 
+def _typed(of: str, name: str, value: Any, hint: Any) -> Any:
+    """A value given from Python, of the field's type: 1e3 is a whole number, True is none."""
+    value = value.item() if isinstance(value, np.generic) else value
+    kinds = set(get_args(hint)) or {hint}
+    if not kinds <= {bool, int, float, type(None)}:
+        return value  # literals are compared below; of another type, its algorithm knows more
+    if kinds == {int} and isinstance(value, float) and value.is_integer():
+        return int(value)
+    fits = (type(value) in kinds) or (float in kinds and type(value) is int)
+    if not fits:
+        words = {bool: "true or false", int: "a whole number", float: "a number", type(None): "None"}
+        wanted = " or ".join(words[k] for k in (bool, int, float, type(None)) if k in kinds)
+        raise UserError(f"{name}={value!r} of {of} must be {wanted}.")
+    return value
+
+
 def _parse(name: str, text: str, default: Any) -> Any:
     try:
         if isinstance(default, bool):
@@ -207,9 +227,8 @@ def _parse(name: str, text: str, default: Any) -> Any:
         if default is None:
             return None if text.lower() == "none" else float(text)
     except (ValueError, KeyError):
-        raise UserError(
-            f"{name}='{text}' cannot be read as {type(default).__name__}; its default is {default!r}."
-        ) from None
+        wanted = "a number or none" if default is None else type(default).__name__
+        raise UserError(f"{name}='{text}' cannot be read as {wanted}; its default is {default!r}.") from None
     return text
 
 

@@ -10,7 +10,7 @@ import dataclasses
 import json
 import operator
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,7 +75,7 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
     reads = a.reads(config)
-    hazard = _bound(task.hazard, spec, reads)
+    hazard = _bound(task, spec, reads, config.view, store)
     a.check(config, hazard)
     if store is not None and reads != "nothing" and not store.costs.any():
         _refuse_blank_costs(a.name, task, store, reads)
@@ -91,15 +91,27 @@ def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None
     return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]
 
 
-def _bound(hazard: hazards.Hazard, spec: Spec, reads: str) -> hazards.BoundHazard:
+def _bound(task: Task, spec: Spec, reads: str, view: str, store: EpisodeStore | None) -> hazards.BoundHazard:
     """The hazard as the algorithm's own view tells it. Where that view lacks what the formula is about (positions that
     only the global state holds), those who label no states train all the same, with the costs for danger."""
     try:
-        return hazards.bind(hazard, spec.feature_names, spec.n_agents)
+        return hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
     except UserError:
-        if reads == "labels":
-            raise
-        return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
+        if reads != "labels":
+            return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
+        if view != "pruned" and store is not None and _binds(task, "pruned", store):
+            raise UserError(
+                f"The view '{view}' leaves out what the hazard {type(task.hazard).__name__} reads; set view=pruned."
+            ) from None
+        raise
+
+
+def _binds(task: Task, view: str, store: EpisodeStore) -> bool:
+    try:
+        hazards.bind(task.hazard, task.feature_map(view, store).names, store.n_agents)
+    except UserError:
+        return False
+    return True
 
 
 def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: str) -> None:
@@ -151,10 +163,14 @@ def train(
             f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
             "ringfence.data.make.make(ringfence.tasks.get(NAME))[0]."
         )
+    seeds = _seeds(seeds)
+    for name, value in (("chunk", chunk), ("checkpoint_every", checkpoint_every)):
+        if value is not None and value < 1:
+            raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
+    if tensorboard:
+        _summary_writer()
     job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
     place = folder or (lambda seed: folder_of(out, job, seed))
-    if not seeds or min(seeds) < 0:
-        raise UserError(f"seeds={tuple(seeds)} must be one or more numbers of 0 or more.")
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
@@ -171,6 +187,17 @@ def train(
         if on_finish:
             on_finish(run)
     return runs
+
+
+def _seeds(given: Iterable[int]) -> tuple[int, ...]:
+    """The seeds as they were given, if each is a number that JAX takes and none comes twice."""
+    seeds = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else None
+    if seeds is None:
+        raise UserError(f"seeds={given!r} must be several numbers; for so many seeds pass range({given}).")
+    whole_numbers = all(isinstance(s, int | np.integer) and not isinstance(s, bool) for s in seeds)
+    if not seeds or not whole_numbers or min(seeds) < 0 or max(seeds) >= 2**31 or len(set(seeds)) < len(seeds):
+        raise UserError(f"seeds={seeds} must be one or more whole numbers from 0 to 2³¹ − 1, each of them once.")
+    return tuple(int(s) for s in seeds)
 
 
 def windows_of(data: EpisodeStore, task: Task, config, quiet: bool = True) -> WindowData:
@@ -307,7 +334,7 @@ def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Op
     state = jax.tree.map(lambda *x: jnp.stack(x), *states)
     for run in runs:
         _trim_metrics(run, step)
-    writers = [_tensorboard(run) for run in runs] if options.tensorboard else []
+    writers = [_summary_writer()(str(run.path / "tensorboard")) for run in runs] if options.tensorboard else []
     label = f"{job.algorithm.name}/{job.preset} {job.task.name} " + (
         f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
     )
@@ -378,7 +405,8 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
         if different:
             what = different[0]
             if what == "config":
-                what = next(k for k in mine["config"] if there["config"].get(k) != mine["config"][k])
+                here, then = mine["config"], there["config"]
+                what = next(k for k in {**here, **then} if (k in here, here.get(k)) != (k in then, then.get(k)))
             raise RunConflict(
                 f"'{run.path}' holds another run (its {what} differs); give another --out or delete that folder.",
                 run.path,
@@ -398,9 +426,9 @@ def _trim_metrics(run: Run, step: int) -> None:
             temporary.write_text("".join(json.dumps(r) + "\n" for r in rows))
 
 
-def _tensorboard(run: Run):
+def _summary_writer():
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise UserError("TensorBoard logs need an extra package; run pip install 'ringfence[tensorboard]'.") from None
-    return SummaryWriter(str(run.path / "tensorboard"))
+    return SummaryWriter

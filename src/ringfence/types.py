@@ -85,7 +85,7 @@ class PolicyStep(NamedTuple):
     """A joint action and what led to it."""
 
     action: Array  # (B, N, A)
-    info: dict[str, Array]  # e.g. `clearance` (B,), `plan` (B, H, N, D), `plans` (B, P, H, N, D), `chosen` (B,)
+    info: dict[str, Array]  # e.g. `clearance` (B,), `plans` (B, P, H, N, D), `chosen` (B,)
 
 
 class Policy(Protocol):
@@ -110,7 +110,7 @@ class Algorithm:
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
     # config -> what training knows danger by: the hazard's labels of states, the logged costs alone, or nothing
     reads: Callable[[Any], Literal["labels", "costs", "nothing"]] = lambda config: "labels"
-    revision: int = 1  # raised when the same settings come to train another policy; results tell theirs
+    revision: int = 1  # raised when the same settings come to train another policy; config.json tells it
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:
         """The first of the wanted presets that exists, else the algorithm's first one."""

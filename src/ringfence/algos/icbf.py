@@ -22,7 +22,7 @@ from ringfence import barrier as cbf
 from ringfence import diffusion, dynamics, features, normalise, values
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
-from ringfence.nets import MLP, build_denoiser
+from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import barrier_on, infer_action
 from ringfence.optim import Optimiser, average, fresh
@@ -230,6 +230,8 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
     if config.net == "attention" and config.width % (4 * HEADS):
         raise UserError(f"width={config.width} must be a multiple of {4 * HEADS}, for {HEADS} heads of equal width.")
+    if config.net == "unet":
+        unet.check_sizes(config.history + config.horizon, config.width, config.depth)
     if config.horizon < 2:
         raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
     for low, high in (("snr_floor", "snr_ceiling"), ("barrier_start", "barrier_full")):

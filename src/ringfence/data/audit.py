@@ -78,7 +78,8 @@ def audit(store: EpisodeStore) -> Audit:
     elif rate > 0.99:
         warnings.append(f"{100 * rate:.1f} % of steps have a cost: almost nothing in this data is safe.")
     flat = s.observations.reshape(-1, s.observations.shape[2])
-    constant = np.flatnonzero(np.ptp(flat[:: max(1, len(flat) // 100_000)], axis=0) < 1e-9)
+    some = s.observations[:: max(1, len(s.observations) // 100_000)]
+    constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
     if len(constant):
         warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
     spread, far = flat.std(0, dtype=np.float64), np.spacing(np.abs(flat).max(0).astype(np.float32))

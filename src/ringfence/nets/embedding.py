@@ -26,14 +26,12 @@ class Condition(eqx.Module):
     step: MLP
     target: MLP
     null: Array  # (width,)
-    width: int = eqx.field(static=True)
 
     def __init__(self, key: Key, width: int):
         k1, k2, k3 = jax.random.split(key, 3)
         self.step = MLP(k1, (64, width, width))
         self.target = MLP(k2, (16, width, width))
         self.null = 0.02 * jax.random.normal(k3, (width,))
-        self.width = width
 
     def __call__(self, k: Array, y: Array, keep: Array) -> Array:
         """Diffusion step k (B,), return score y (B,), keep (B,) bool: false drops the condition."""

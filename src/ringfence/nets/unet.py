@@ -32,6 +32,14 @@ HEADS = 4
 Params = dict[str, Array]
 
 
+def check_sizes(rows: int, width: int, depth: int) -> None:
+    """Refuse sizes that the network cannot have."""
+    if not 1 <= depth <= len(MULTIPLIERS):
+        raise UserError(f"depth={depth} of the temporal U-Net must be 1, 2 or 3, its number of resolutions; try 3.")
+    if width < 4 or rows < 1:
+        raise UserError(f"width={width} and horizon={rows} are too small for the temporal U-Net; use width 32 up.")
+
+
 class TemporalUNet(eqx.Module):
     """F(x_k, k, y) as `AgentAttention`; `depth` (1 to 3) counts resolutions, each half as long as the one before.
 
@@ -47,10 +55,7 @@ class TemporalUNet(eqx.Module):
     outlet: dict
 
     def __init__(self, key: Key, rows: int, features: int, width: int = 128, depth: int = 3):
-        if not 1 <= depth <= len(MULTIPLIERS):
-            raise UserError(f"depth={depth} of the temporal U-Net must be 1, 2 or 3, its number of resolutions; try 3.")
-        if width < 4 or rows < 1:
-            raise UserError(f"width={width} and horizon={rows} are too small for the temporal U-Net; use width 32 up.")
+        check_sizes(rows, width, depth)
         keys = iter(jax.random.split(key, 64))
         channels = [features] + [width * m for m in MULTIPLIERS[:depth]]
         told = 2 * width  # the embeddings of step and return, side by side

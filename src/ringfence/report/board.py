@@ -136,6 +136,11 @@ def read(folder: str | Path) -> Board:
         )
     references = _references(folder)
     entries = _entries(finished, told["split"])
+    if not entries:
+        raise UserError(
+            f"'{folder}' holds results on other resets or of earlier checkpoints alone, so there is nothing to rank; "
+            "run `ringfence bench` into it again."
+        )
     _check(entries, references, told, folder)
     names = {task for _, task, _, _ in cells} | {task for task, _ in references.values()}
     known = list(tasks.TASKS)
@@ -165,10 +170,13 @@ def read(folder: str | Path) -> Board:
     )
 
 
+RESTORE = "restore that file, e.g. from another results folder of this suite and number of episodes"
+
+
 def _declared(folder: Path) -> dict:
     if not is_board(folder):
         raise UserError(f"'{folder}' holds no {FILE}, so it is no results folder; give the one a benchmark wrote.")
-    told = read_json(folder / FILE, f"holds a damaged {FILE}; run the benchmark again")
+    told = read_json(folder / FILE, f"holds a damaged {FILE}; {RESTORE}")
     lacking = [k for k in DECLARED if k not in told]
     if told.get("format") != FORMAT:
         raise UserError(
@@ -176,7 +184,7 @@ def _declared(folder: Path) -> dict:
             "use the version of ringfence that wrote it, or run the benchmark again."
         )
     if lacking:
-        raise UserError(f"'{folder / FILE}' lacks '{lacking[0]}'; run the benchmark again.")
+        raise UserError(f"'{folder / FILE}' lacks '{lacking[0]}'; {RESTORE}.")
     return told
 
 
@@ -310,7 +318,7 @@ def _check(entries: list[Entry], references: dict[Path, tuple[str, dict[str, dic
         _complete(who, e.summary, e.task, (*NEEDED, "per_episode", "split"))
         for key in ("protocol", "split", "episodes"):
             _same(who, key, e.summary[key], told[key], folder)
-        _normalised(file, who, e.summary, leaders.setdefault(e.task, (file, e.summary)))
+        _normalised(who, e.summary, leaders.setdefault(e.task, (file, e.summary)))
     for file, (task, rows) in references.items():
         for name, summary in rows.items():
             who = f"'{file}' row '{name}'"
@@ -319,7 +327,7 @@ def _check(entries: list[Entry], references: dict[Path, tuple[str, dict[str, dic
             if summary["split"] != "data":  # logged episodes have resets of their own and any number of them
                 for key in ("split", "episodes"):
                     _same(who, key, summary[key], told[key], folder)
-            _normalised(file, who, summary, leaders.setdefault(task, (file, summary)))
+            _normalised(who, summary, leaders.setdefault(task, (file, summary)))
 
 
 def _complete(who: str, summary: dict, task: str, needed: tuple[str, ...]) -> None:
@@ -338,7 +346,7 @@ def _same(who: str, key: str, here, declared, folder: Path) -> None:
         )
 
 
-def _normalised(file: Path, who: str, summary: dict, leader: tuple[Path, dict]) -> None:
+def _normalised(who: str, summary: dict, leader: tuple[Path, dict]) -> None:
     first, of = leader
     if summary["constants"] != of["constants"]:
         raise UserError(

@@ -95,7 +95,7 @@ def _ranks(board: Board, tasks: list[str], tables: dict[str, list[Standing]]) ->
     among = {m: [] for m in complete}
     for k, task in enumerate(tasks):
         told = [cells[m][k] for m in complete]
-        limit = board.constants[task]["cost_limit"]
+        limit = board.constants.get(task, {}).get("cost_limit", 0.0)  # a task may have no result yet
         places = stats.places([r.returns for r in told], [r.cost_interval[1] for r in told], limit)
         for m, place in zip(complete, places):
             among[m].append(place)

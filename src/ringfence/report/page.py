@@ -28,11 +28,13 @@ WORDS = {  # hazard -> (what the cost counts, what a violation is)
 }
 
 
-def build_report(runs: Iterable[Run | str | Path], out: str | Path, title: str | None = None) -> Path:
+def build_report(
+    runs: Iterable[Run | str | Path] | Run | str | Path, out: str | Path, title: str | None = None
+) -> Path:
     """Write one self-contained HTML page about evaluated runs and return its path.
 
-    `runs` are run folders; `out` is the page, or a folder that gets `report.html`. Runs of several tasks get a
-    section each. `UserError` where a run has not been evaluated or numbers must not be compared.
+    `runs` are run folders, or one of them; `out` is the page, or a folder that gets `report.html`. Runs of several
+    tasks get a section each. `UserError` where a run has not been evaluated or numbers must not be compared.
     """
     found = sections(runs)
     out = Path(out)
@@ -263,12 +265,12 @@ def commands(section: Section, out: Path) -> list[str]:
             lines.append(f"ringfence data make {section.task}{size} --seed {card.get('seed', 0)} --out {data}")
     else:
         data = "DATA.h5"
-    jobs: dict[tuple, list[Run]] = {}
+    jobs: dict[tuple[str, str, str, str], list[Run]] = {}
     for run in section.runs:
         told = run.config
-        changed = _changes(told, preset=True)
+        changed = json.dumps(_changes(told, preset=True), sort_keys=True)
         root = str(run.path.parent.parent.parent)
-        jobs.setdefault((told["algorithm"], told["preset"], tuple(sorted(changed.items())), root), []).append(run)
+        jobs.setdefault((told["algorithm"], told["preset"], changed, root), []).append(run)
     for (algorithm, preset, changed, root), members in jobs.items():
         line = ["ringfence", "train", algorithm, data]
         if preset != _usual_preset(algorithm, section.task):
@@ -277,8 +279,8 @@ def commands(section: Section, out: Path) -> list[str]:
             tail = [f"--seeds {count}"] + ([f"--first-seed {first}"] if first else [])
             if root != "runs":
                 tail.append(f"--out {shlex.quote(root)}")
-            if changed:
-                tail.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in changed))
+            if given := json.loads(changed):
+                tail.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))
             lines.append(" ".join(line + tail))
     evaluations: dict[tuple, list[str]] = {}
     for row in section.rows:
@@ -325,6 +327,7 @@ def _changes(told: dict, preset: bool) -> dict:
     usual = {f.name: f.default for f in dataclasses.fields(algorithm.Config)}
     if preset:
         usual |= algorithm.presets.get(told["preset"], {})
+    usual = json.loads(json.dumps(usual))  # as config.json has it: lists for tuples
     return {k: v for k, v in told["config"].items() if k not in usual or usual[k] != v}
 
 

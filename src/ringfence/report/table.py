@@ -30,6 +30,7 @@ NAMES = {
 }
 ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
 NEEDED = ("episodes", "return_mean", "cost_mean", "avoidable_cost", "violation_rate", "constants", "protocol", "task")
+NEEDED += ("return_interval", "cost_interval", "avoidable_interval", "cost_cvar10", "unsafe_starts")
 
 
 @dataclass(kw_only=True)
@@ -73,10 +74,10 @@ class Section:
         return [r for split in SPLITS for r in self.tables.get(split, [])]
 
 
-def sections(runs: Iterable[Run]) -> list[Section]:
+def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Section]:
     """One section per task, in the order in which the runs name them."""
     tasks: dict[str, list[Run]] = {}
-    for run in _distinct(runs):
+    for run in _distinct([runs] if isinstance(runs, str | Path | Run) else runs):
         tasks.setdefault(run.config["task"], []).append(run)
     if not tasks:
         raise UserError("No run was given, so there is nothing to report; pass run folders made by `ringfence train`.")
@@ -103,8 +104,8 @@ def _section(task: str, runs: list[Run]) -> Section:
     ]
     for run, name, result in entries:
         _check(f"'{run.path}' variant '{name}'", result, task)
-        if result["split"] not in SPLITS:
-            raise UserError(f"'{run.path}' variant '{name}' has split '{result['split']}', not test or validation.")
+        if result.get("split") not in SPLITS:
+            raise UserError(f"'{run.path}' variant '{name}' has split '{result.get('split')}', not test or validation.")
         if "per_episode" not in result:
             raise UserError(f"'{run.path}' variant '{name}' lacks its episodes; run `ringfence eval {run.path}` again.")
     leader = entries[0][2]
@@ -125,7 +126,7 @@ def _section(task: str, runs: list[Run]) -> Section:
         groups: dict[tuple, list[tuple[Run, dict]]] = {}
         for run, name, result in entries:
             if result["split"] == split:
-                config = json.dumps(config_of(run.config), sort_keys=True)
+                config = json.dumps(_made_with(run.config), sort_keys=True)
                 groups.setdefault((run.config["algorithm"], name, config), []).append((run, result))
         rows = [_row(name, members, fields) for (_, name, _), members in groups.items()]
         if rows:
@@ -185,6 +186,11 @@ def config_of(told: dict) -> dict:
     return {f.name: f.default for f in dataclasses.fields(ALGORITHMS[told["algorithm"]].Config)} | told["config"]
 
 
+def _made_with(told: dict) -> dict:
+    """The config, and the algorithm's revision: with another one the same settings train another policy."""
+    return config_of(told) | {"revision": told.get("revision", 1)}
+
+
 def differing(configs: list[dict]) -> list[str]:
     """Fields in which configs differ: their runs get rows of their own."""
     fields = dict.fromkeys(k for c in configs for k in c)
@@ -195,7 +201,7 @@ def _differing(runs: list[Run]) -> dict[tuple[str, str], list[str]]:
     """Differing fields by algorithm and preset."""
     configs: dict[tuple[str, str], list[dict]] = {}
     for told in (run.config for run in runs):
-        configs.setdefault((told["algorithm"], told["preset"]), []).append(config_of(told))
+        configs.setdefault((told["algorithm"], told["preset"]), []).append(_made_with(told))
     return {key: differing(several) for key, several in configs.items()}
 
 
@@ -210,7 +216,7 @@ def _row(variant: str, members: list[tuple[Run, dict]], fields: dict) -> Row:
             )
     shown = plain_variant(variant)
     if apart := fields.get((told["algorithm"], told["preset"])):
-        config = config_of(told)
+        config = _made_with(told)
         shown += " [" + ", ".join(f"{k}={config.get(k)}" for k in apart) + "]"
     results = [result for _, result in members]
     return Row(
