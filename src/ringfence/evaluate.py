@@ -10,7 +10,6 @@ import dataclasses
 import sys
 import time
 from collections.abc import Iterable
-from pathlib import Path
 from typing import Literal
 
 import jax
@@ -247,7 +246,7 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
 
 def _loaded(run: Run | str, step: int | None, planner: str, options: dict) -> tuple[training.Job, Policy, int]:
     """`load`, and the step of the checkpoint."""
-    run = run if isinstance(run, Run) else Run(Path(run))
+    run = Run.of(run)
     if planner not in PLANNERS:
         raise unknown("planner", planner, PLANNERS)
     options = {**PLANNERS[planner], **options}
@@ -381,7 +380,7 @@ def variant_name(job: training.Job, planner: str, options: PlanOptions | None, g
 
 
 def evaluate(
-    run: Run,
+    run: Run | str,
     *,
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
@@ -396,7 +395,7 @@ def evaluate(
     `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones. The result tells the
     `step` of the checkpoint that was played; where training is unfinished, a line on stderr says so.
     """
-    run = run if isinstance(run, Run) else Run(Path(run))
+    run = Run.of(run)
     job, policy, at = _loaded(run, step, planner, options)
     _ = run.results  # damaged ones are refused before anything is played
     if step is None and at < job.config.steps:

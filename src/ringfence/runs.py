@@ -43,6 +43,11 @@ class Run:
 
     path: Path
 
+    @classmethod
+    def of(cls, run: Run | str | Path) -> Run:
+        """A run, or the one in the folder that is named."""
+        return run if isinstance(run, Run) else cls(Path(run))
+
     @property
     def config(self) -> dict:
         """Contents of config.json."""

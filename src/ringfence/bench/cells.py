@@ -12,6 +12,7 @@ import functools
 import hashlib
 import json
 import shutil
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable
@@ -225,9 +226,10 @@ def make_grid(
     for name in names:
         if name not in chosen.tasks:
             raise unknown(f"task of the suite {suite}", name, chosen.tasks)
+    known = entry_names(suite)
     for name in only:
-        if name not in entry_names(suite):
-            raise unknown("entry", name, entry_names(suite))
+        if name not in known:
+            raise unknown("entry", name, known)
     changes = () if steps is None else (("steps", steps),)
     cells = []
     for name in names:
@@ -336,6 +338,11 @@ def _record(cell: Cell, out: Path, state: str, more: dict) -> None:
 def record_failure(cell: Cell, out: Path, error: str, trace: str = "") -> None:
     """Say in the cell's folder what went wrong."""
     _record(cell, out, "failed", {"error": error, "traceback": trace})
+
+
+def tell_lost(what: str, why: str) -> None:
+    """Say on stderr that something which no cell needs could not be made."""
+    print(f"{what} could not be made: {why}", file=sys.stderr, flush=True)
 
 
 def make_reference(task: str, out: Path, episodes: int, transitions: int | None = None) -> None:

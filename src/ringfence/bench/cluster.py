@@ -9,12 +9,11 @@ from __future__ import annotations
 import io
 import shutil
 import socket
-import sys
 import tarfile
 import tempfile
 from pathlib import Path
 
-from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group
+from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
 from ringfence.errors import UserError
 from ringfence.files import owned
 from ringfence.progress import Progress
@@ -38,8 +37,7 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
             try:
                 make_reference(name, grid.out, grid.episodes, transitions)
             except Exception as error:  # cells do not need them
-                why = f"{type(error).__name__}: {error}"
-                print(f"the reference rows of {name} could not be made: {why}", file=sys.stderr, flush=True)
+                tell_lost(f"the reference rows of {name}", f"{type(error).__name__}: {error}")
         cells = [c for group in grid.groups() for c in group]
         ours = set(cells)
         later = {c.twin(): c for c in cells if c.twin() in ours}  # they take what their twins will have learned

@@ -15,7 +15,7 @@ import threading
 import time
 from pathlib import Path
 
-from ringfence.bench.cells import Cell, Grid, record_failure
+from ringfence.bench.cells import Cell, Grid, record_failure, tell_lost
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
 from ringfence.files import owned
@@ -134,7 +134,7 @@ class _Pool:
             if told["event"] in ("finished", "broken"):
                 if told["event"] == "broken":  # a cell's own failures are recorded; this is a reference's
                     what = f"the reference rows of {job['reference']}" if "reference" in job else "a group of cells"
-                    print(f"{what} could not be made: {told['error']}", file=sys.stderr, flush=True)
+                    tell_lost(what, told["error"])
                 return
             if told["event"] == "ready":
                 continue
@@ -156,8 +156,7 @@ class _Pool:
             if worker.pid not in self.too_big and self._again(("reference", job["reference"])):
                 self.jobs.put(job)
             else:
-                why = self._cause(worker)
-                print(f"the reference rows of {job['reference']} could not be made: {why}", file=sys.stderr, flush=True)
+                tell_lost(f"the reference rows of {job['reference']}", self._cause(worker))
             return
         if worker.pid in self.too_big or not self._again((cell.task, cell.algorithm, cell.preset, cell.seed)):
             record_failure(cell, self.grid.out, self._cause(worker))

@@ -15,7 +15,7 @@ import numpy as np
 from ringfence import __version__, hazards
 from ringfence.data import behaviour, robots
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import SafeMuJoCo, SimpleSpread
+from ringfence.envs import SafeMuJoCo
 from ringfence.errors import StoreError, UserError
 from ringfence.tasks import Task, siblings
 
@@ -38,14 +38,15 @@ def make(
     transitions = task.transitions if transitions is None else transitions
     if transitions < 1 or seed < 0:
         raise UserError(f"size={transitions} and seed={seed} must be a positive size and a seed of 0 or more.")
-    if isinstance(task.env, SimpleSpread):  # whose episodes all have one length
-        transitions = -(-transitions // task.env.episode_length) * task.env.episode_length
-    path = Path(out) if out else _kept(task.name, transitions, seed)
-    env, danger = task.env, hazards.to_dict(task.hazard)
-    if isinstance(env, SafeMuJoCo) and getattr(task.hazard, "limit", None) != env.limit:
+    env, danger, robot = task.env, hazards.to_dict(task.hazard), isinstance(task.env, SafeMuJoCo)
+    if not robot:  # Simple Spread, whose episodes all have one length
+        transitions = -(-transitions // env.episode_length) * env.episode_length
+    cached = _kept(task.name, transitions, seed)
+    path = Path(out) if out else cached
+    if robot and getattr(task.hazard, "limit", None) != env.limit:
         raise UserError(f"Task '{task.name}' has the danger {task.hazard}, its simulator counts above {env.limit} m/s.")
     simulator = f"ringfence {__version__} simple_spread"
-    if isinstance(env, SafeMuJoCo):
+    if robot:
         simulator = f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}"
     card = {
         "task": task.name,
@@ -57,11 +58,10 @@ def make(
         "simulator": simulator,
         "episode_length": env.episode_length,
     }
-    if isinstance(env, SimpleSpread):
+    if not robot:
         card |= {"integrator": env.integrator, "reward": env.reward}
-    robot = isinstance(env, SafeMuJoCo)
     again = f"{task.name} is made again."
-    kept = _usable(_kept(task.name, transitions, seed), card, again) if not fresh and (robot or not out) else None
+    kept = _usable(cached, card, again) if not fresh and (robot or not out) else None
     if kept is not None and not out and kept.card["hazard"] == danger:  # or the name has come to mean something else
         return kept, path
     if robot:

@@ -88,7 +88,7 @@ def _distinct(runs: Iterable[Run]) -> list[Run]:
     """Folders become runs; the same folder named twice counts once."""
     found = {}
     for run in runs:
-        run = run if isinstance(run, Run) else Run(Path(run))
+        run = Run.of(run)
         found.setdefault(run.path.resolve(), run)
     return list(found.values())
 

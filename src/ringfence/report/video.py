@@ -148,13 +148,13 @@ def with_one_palette(pictures: list, colours: int = 64) -> list:
 
     some = pictures[:: max(1, len(pictures) // 4)]
     width, height = some[0].size
-    wide = len(DRAWN) * height // 8
-    sample = Image.new("RGB", (width, len(some) * height + wide))
+    stripe = height // 8  # of each drawn colour, high enough to keep a place of its own
+    sample = Image.new("RGB", (width, len(some) * height + len(DRAWN) * stripe))
     for k, picture in enumerate(some):
         sample.paste(picture, (0, k * height))
     for k, colour in enumerate(DRAWN):
-        top = len(some) * height + k * height // 8
-        sample.paste(colour, (0, top, width, top + height // 8))
+        top = len(some) * height + k * stripe
+        sample.paste(colour, (0, top, width, top + stripe))
     palette = sample.quantize(colours)
     return [p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures]
 
