@@ -13,6 +13,9 @@ os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llv
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", tempfile.mkdtemp(prefix="ringfence-tests-"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
+# Worlds that tests fit are not the user's.
+os.environ["RINGFENCE_HOME"] = tempfile.mkdtemp(prefix="ringfence-home-")
+
 import jax
 import numpy as np
 import pytest
@@ -55,3 +58,17 @@ def small_store(played) -> EpisodeStore:
             "provenance": "made by the tests",
         },
     )
+
+
+# A World that is fitted in a second and knows little.
+QUICK_WORLD = dict(
+    members=2, dynamics_updates=20, dynamics_width=16, value_updates=20, barrier_updates=20, barrier_width=8, future_updates=20
+)
+
+
+@pytest.fixture(scope="session")
+def small_world(small_store):
+    """The World of the small store."""
+    from ringfence import worlds
+
+    return worlds.fit(small_store, **QUICK_WORLD)

@@ -9,7 +9,7 @@ import pytest
 
 from ringfence import barrier as cbf
 from ringfence import features, hazards, normalise
-from ringfence.algos import icbf
+from ringfence.algos import icbf, joint
 from ringfence.diffusion import cosine_schedule
 from ringfence.errors import UserError
 from ringfence.nets import MLP
@@ -67,7 +67,7 @@ def test_a_parked_agent_is_satisfied_from_the_fixed_point_on():
         def of(case, h):
             m, delta, scaled = case
             h = jnp.full((1, 5, 2), h)
-            got = cbf.hinges(h, ~everywhere, everywhere, everywhere, cbf.Retention(m), 0.0, delta, scaled)
+            got = joint.hinges(h, ~everywhere, everywhere, everywhere, cbf.Retention(m), 0.0, delta, scaled)
             return jnp.stack([got.retention, got.safe])
 
         return jnp.stack([jax.vmap(lambda h, c=case: of(c, h))(level) for case, level in zip(cases, levels)])
@@ -86,7 +86,7 @@ def test_a_parked_agent_is_satisfied_from_the_fixed_point_on():
 def test_hinges_are_means_over_their_sets():
     h = np.array([0.5, 0.05, -0.3, 0.2], np.float32)[None, :, None]
     safe = np.array([True, True, False, True])[None, :, None]
-    hinges = jax.jit(lambda valid: cbf.hinges(h, ~safe, safe, valid, cbf.Retention(0.5), 0.0, 0.1, False))
+    hinges = jax.jit(lambda valid: joint.hinges(h, ~safe, safe, valid, cbf.Retention(0.5), 0.0, 0.1, False))
     got = hinges(np.ones((1, 4, 1), bool))
     assert float(got.safe) == pytest.approx((0.1 - 0.05) / 3)
     assert float(got.unsafe) == 0
@@ -123,47 +123,56 @@ def scene(small_store):
     """Real windows, their normaliser and hazard, and a barrier that is positive everywhere, so that all hinges of
     unsafe states bite."""
     table = features.simple_spread("pruned", 3)
-    data = WindowData(small_store, table, 0.9)
+    data = WindowData(small_store, table)
     hazard = hazards.bind(hazards.Separation(), table.names, 3)
     batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(0, data.steps, 40), 4, 0)
     norm = normalise.fit(np.asarray(batch.features), np.asarray(batch.valid), 0, "displacement")
     net = jax.jit(lambda key: MLP(key, (18, 8, 8, 8, 1), groups=3))(jax.random.key(0))
     net.biases[-1] = net.biases[-1] + 3.0
-    bank, own = cbf.unsafe_bank(data.arrays["features"], data.arrays["costs"], hazard, 32, jax.random.key(1))
-    frozen = {"normaliser": norm, "bank": bank, "bank_own": own}
+    frozen = {"normaliser": norm}
     return data, batch, hazard, net, frozen
 
 
 def config(routing) -> icbf.Config:
-    return icbf.Config(routing=routing, horizon=4, bank=32, bank_batch=16, barrier_batch=8, delta=0.1)
+    return icbf.Config(routing=routing, horizon=4, barrier_batch=8, delta=0.1)
 
 
 @pytest.fixture(scope="module")
 def losses(scene):
-    """losses[routing](net, slow, x, valid) -> values (L_ω, L_θ), gradients of each to (net, average, x), metrics."""
+    """losses(net, x, valid) -> value of L^C, its gradients to (net, x), metrics."""
     _, batch, hazard, _, frozen = scene
 
-    def of(routing):
-        def pair(net, slow, x, valid):
-            one = jnp.ones((len(x), 1, 1))
-            made = icbf.Generated(x, valid, 0.1 * one, one)
-            omega, theta, metrics = icbf.barrier_losses(
-                net, slow, frozen, batch._replace(valid=valid), made, jax.random.key(2), config(routing), hazard
-            )
-            return jnp.stack([omega, theta]), metrics
+    @jax.jit
+    def everything(net, x, valid):
+        one = jnp.ones((len(x), 1, 1))
+        made = icbf.Generated(x, valid, 0.1 * one, one)
 
-        @jax.jit
-        def pulled(net, slow, x, valid, share):
-            value, pull, metrics = jax.vjp(lambda *a: pair(*a, valid), net, slow, x, has_aux=True)
-            return value, pull(share), metrics
+        def of(net, x):
+            told = made._replace(features=x)
+            c, norm = config("paper"), frozen["normaliser"]
+            return joint.joint_losses(net, norm, batch._replace(valid=valid), told, icbf.retention(c), c, hazard)
 
-        def everything(*args):
-            (value, omega, metrics), (_, theta, _) = (pulled(*args, jnp.eye(2)[i]) for i in range(2))
-            return value, (omega, theta), metrics
+        (value, metrics), pull = jax.value_and_grad(of, (0, 1), has_aux=True)(net, x)
+        return value, pull, metrics
 
-        return everything
+    return everything
 
-    return {routing: of(routing) for routing in ("paper", "split")}
+
+@pytest.fixture(scope="module")
+def follow(small_world):
+    """follow(x, valid) -> value of L_θ of `split`, its gradient to x, metrics."""
+
+    @jax.jit
+    def everything(x, valid):
+        one = jnp.ones((len(x), 1, 1))
+
+        def of(x):
+            return icbf.followed(small_world.barrier, icbf.Generated(x, valid, 0.1 * one, one), config("split"))
+
+        (value, metrics), pull = jax.value_and_grad(of, has_aux=True)(x)
+        return value, pull, metrics
+
+    return everything
 
 
 def moves(gradient) -> bool:
@@ -176,40 +185,26 @@ def rise(net, frozen, x, direction):
     return jax.jvp(lambda x: barrier_on(net, frozen["normaliser"], x).sum(), (x,), (direction,))[1]
 
 
-OMEGA, THETA = 0, 1
-
-
-def test_the_dangerous_term_reaches_the_generator_under_paper_and_not_under_split(scene, losses):
+def test_as_printed_the_dangerous_term_pays_the_generator_for_danger(scene, losses):
     _, batch, hazard, net, frozen = scene
     x = jax.jit(hazard.endanger)(batch.features, jax.random.key(3))
     assert hazard.labels(x)[0].all()  # only the dangerous term is left
-
-    value, gradients, _ = losses["paper"](net, net, x, batch.valid)
-    assert value[OMEGA] == 0 and value[THETA] > 0
-    to_net, to_slow, to_x = gradients[THETA]
-    assert moves(to_net) and moves(to_x) and not moves(to_slow)
-    assert rise(net, frozen, x, -to_x) < 0  # as printed, it pays the generator for going deeper into danger
-
-    value, gradients, _ = losses["split"](net, net, x, batch.valid)
-    assert value[OMEGA] > 0
-    to_net, to_slow, to_x = gradients[OMEGA]
-    assert moves(to_net) and not moves(to_x) and not moves(to_slow)  # h learns, θ does not hear of it
-    to_net, to_slow, to_x = gradients[THETA]
-    assert not moves(to_net) and not moves(to_slow)  # θ follows a frozen average
+    value, (to_net, to_x), _ = losses(net, x, batch.valid)
+    assert value > 0 and moves(to_net) and moves(to_x)
+    assert rise(net, frozen, x, -to_x) < 0  # deeper into danger
 
 
-def test_split_pulls_generated_states_towards_higher_h(scene, losses):
-    _, batch, _, net, frozen = scene
-    low = jax.tree.map(lambda leaf: leaf, net)
-    low.biases[-1] = net.biases[-1] - 3.0
-    to_x = losses["split"](net, low, batch.features, batch.valid)[1][THETA][2]
-    assert moves(to_x) and rise(low, frozen, batch.features, -to_x) > 0
-    assert not moves(to_x[:, 0])  # the present
+def test_split_pulls_generated_states_towards_higher_h(scene, follow, small_world):
+    _, batch, _, _, _ = scene
+    x = batch.features.at[..., 10:14].multiply(0.1)  # the offsets of the others: everybody is near
+    value, to_x, metrics = follow(x, batch.valid)
+    assert value > 0 and moves(to_x) and not moves(to_x[:, 0])  # the present
+    h = lambda x: small_world.barrier.of_steps(x, x).sum()  # noqa: E731
+    assert jax.jvp(h, (x,), (-to_x,))[1] > 0
 
 
-@pytest.mark.parametrize("routing", ["paper", "split"])
 @pytest.mark.parametrize("case", ["all unsafe", "all safe", "all between", "nothing valid"])
-def test_empty_sets_are_finite(scene, losses, routing, case):
+def test_empty_sets_are_finite(scene, losses, follow, case):
     _, batch, hazard, net, _ = scene
     x, valid = batch.features, batch.valid
     if case == "all unsafe":
@@ -219,8 +214,7 @@ def test_empty_sets_are_finite(scene, losses, routing, case):
     else:
         x = x.at[..., 10:14].set(1.0 if case == "all safe" else 0.24)  # the offsets of the others
         assert hazard.labels(x)[1].all() == (case == "all safe") and not hazard.labels(x)[0].any()
-    value, gradients, metrics = losses[routing](net, net, x, valid)
-    for leaf in jax.tree.leaves((value, gradients, metrics)):
+    for leaf in jax.tree.leaves((losses(net, x, valid), follow(x, valid))):
         assert np.isfinite(leaf).all()
 
 
@@ -231,7 +225,7 @@ def test_means_do_not_depend_on_the_number_of_agents():
         h = jnp.broadcast_to(jnp.linspace(-1, 1, 20).reshape(4, 5, 1), (4, 5, n))
         valid = jnp.ones((4, 5, 1), bool)
         shaped = cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, True, jnp.ones((4, 1, 1)))
-        terms = cbf.hinges(h, h < 0, h >= 0, valid, cbf.Retention(0.9), 0.0, 0.1, True)
+        terms = joint.hinges(h, h < 0, h >= 0, valid, cbf.Retention(0.9), 0.0, 0.1, True)
         return [float(x) for x in (shaped, *terms[:3], terms.metrics["share_unsafe"])]
 
     assert told(2) == pytest.approx(told(6), rel=1e-5)
@@ -248,31 +242,3 @@ def test_the_share_of_the_barrier_rises_on_schedule():
     c = icbf.Config(steps=100, barrier_weight=0.4, barrier_start=0.2, barrier_full=0.6)
     shares = [float(icbf.barrier_share(c, step)) for step in (0, 20, 30, 40, 60, 100)]
     assert shares == pytest.approx([0, 0, 0.1, 0.2, 0.4, 0.4], abs=1e-6)
-
-
-# ---------------------------------------------------------------------------------------------------------------------
-# the bank of unsafe states
-
-
-def test_the_bank_marks_who_is_unsafe(scene):
-    data, _, hazard, _, frozen = scene
-    bank, own = frozen["bank"], frozen["bank_own"]
-    assert bank.shape == (32, 3, 18) and own.shape == (32, 3)
-    np.testing.assert_array_equal(own, hazard.labels(bank)[0])
-    assert own.any(-1).all()  # every state teaches something
-    rows = np.asarray(data.arrays["features"])
-    real = [(rows == state).all((1, 2)).any() for state in np.asarray(bank)]
-    assert sum(real) == 16  # one half is data
-
-
-def test_the_bank_without_unsafe_data_or_formula(scene):
-    data, _, hazard, _, _ = scene
-    x, costs = data.arrays["features"], jnp.zeros(len(data.arrays["features"]))
-    harmless = x.at[..., 10:14].set(1.0)
-    bank, own = cbf.unsafe_bank(harmless, costs, hazard, 32, jax.random.key(0))
-    assert len(bank) == 32 and own.all()  # all made from the formula
-    logged = hazards.bind(hazards.CostColumn(), features.simple_spread("pruned", 3).names, 3)
-    bank, own = cbf.unsafe_bank(x, costs.at[4].set(1.0), logged, 32, jax.random.key(0))
-    assert own.all() and (bank == x[4]).all()
-    bank, own = cbf.unsafe_bank(x, costs, logged, 32, jax.random.key(0))
-    assert bank.shape == (32, 3, 18) and own.shape == (32, 3) and not own.any()

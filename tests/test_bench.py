@@ -20,8 +20,8 @@ from ringfence.bench import cells as grid
 from ringfence.bench import cluster, local, make_grid, paper, rows, run_local, suites, write_csv
 from ringfence.cli import _runs, main
 from ringfence.errors import UserError
+from ringfence.guards import GUARDS, GuardOptions
 from ringfence.hazards import Separation, to_dict
-from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run
 
 QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], steps=20, transitions=500)
@@ -68,13 +68,13 @@ def test_cells_are_addressed_by_what_training_depends_on(made):
 
 def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch):
     """Results that the named planner of today would not give do not count."""
-    cell = grid.Cell("simple_spread-random", "icbf", "split", 0, (), (("split+guarded", "guarded"),))
-    options = {**grid.dataclasses.asdict(PlanOptions()), **PLANNERS["guarded"]}
-    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": options}
-    Run(cell.folder(tmp_path)).add_result("split+guarded", told)
+    cell = grid.Cell("simple_spread-random", "bc", "default", 0, (), (("default+shield-learned", "shield-learned"),))
+    options = grid.dataclasses.asdict(GuardOptions(**{**GUARDS["shield"], "margin": 1.0}))
+    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}, "guard_options": options}
+    Run(cell.folder(tmp_path)).add_result("default+shield-learned", told)
     assert cell.state(tmp_path, 4) == "done"
     assert cell.state(tmp_path, 5) == "to do"
-    monkeypatch.setitem(PLANNERS, "guarded", {**PLANNERS["guarded"], "margin": 0.5})
+    monkeypatch.setitem(GUARDS, "shield", {**GUARDS["shield"], "rows": 5})
     assert cell.state(tmp_path, 4) == "to do"
 
 

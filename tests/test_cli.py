@@ -150,4 +150,5 @@ def test_the_whole_job(tmp_path, monkeypatch, capsys):
     results = [json.loads(f.read_text()) for f in (tmp_path / "demo").rglob("results.json")]
     starts = {tuple(r["per_episode"]["unsafe_start"]) for found in results for r in found.values()}
     assert len(results) == 3 and len(starts) == 1
-    assert "ICBF split, guarded" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "ICBF split, full guard, learned" in told and "of 1000 held-out steps" in told

@@ -5,9 +5,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.dynamics import blank_dynamics, fit_dynamics, foresee
+from ringfence.features import FeatureMap
+from ringfence.world.dynamics import blank_dynamics, fit_dynamics
 
 EPISODES, STEPS, AGENTS = 40, 50, 2
+
+
+def view(joint: bool) -> FeatureMap:
+    """The points as they are; of a body, each point's entries in its own order."""
+    table = np.array([[0, 1, 2, 3], [2, 3, 0, 1]]) if joint else np.tile([0, 1], (AGENTS, 1))
+    names = ("x", "v", "other.x", "other.v")[: table.shape[1]]
+    return FeatureMap("pruned", names, "state", table, np.full_like(table, -1), body=joint, joint=joint)
 
 
 def log(joint: bool):
@@ -29,19 +37,26 @@ def log(joint: bool):
 
 @pytest.mark.parametrize("joint", [False, True])
 def test_it_learns_what_actions_do(joint):
-    """To a twentieth of what a step changes; where agents share a body, by everybody's action."""
+    """To a twentieth of what a step changes; where agents share a body, by everybody's action, and all agree."""
     features, actions, row = log(joint)
-    dynamics = fit_dynamics(features, actions, row, jax.random.key(0), 1500, 16, joint)
-    foreseen = foresee(dynamics, features[row], actions, joint)
+    if joint:
+        features = jnp.concatenate([features, features[:, ::-1]], -1)
+    told = dict(members=2, updates=1500, width=16)
+    dynamics = fit_dynamics(features, actions, row, view(joint), jax.random.key(0), **told)
+    foreseen, spread = dynamics.step(features[row], actions)
     error, moved = foreseen - features[row + 1], features[row + 1] - features[row]
     assert jnp.sqrt((error**2).mean()) < 0.05 * jnp.sqrt((moved**2).mean())
+    assert spread.shape == foreseen.shape[:-1] and (spread > 0).all()
+    far, apart = dynamics.step(features[row] + 30.0, actions)
+    assert apart.mean() > 3 * spread.mean()  # where the logs have not been, the members disagree
 
 
 def test_agents_that_do_not_share_a_body_do_not_read_each_other():
-    dynamics = blank_dynamics(AGENTS, 2, 1, 8)
+    dynamics = blank_dynamics(view(False), 1, 2, 8)
     x, action = jnp.ones((3, AGENTS, 2)), jnp.ones((3, AGENTS, 1))
-    moved = foresee(dynamics, x, action.at[:, 1].set(-1.0)) - foresee(dynamics, x, action)
+    moved = dynamics.step(x, action.at[:, 1].set(-1.0))[0] - dynamics.step(x, action)[0]
     assert (moved[:, 0] == 0).all() and (moved[:, 1] != 0).all()
-    shared = blank_dynamics(AGENTS, 2, 1, 8, joint=True)
-    moved = foresee(shared, x, action.at[:, 1].set(-1.0), True) - foresee(shared, x, action, True)
+    shared = blank_dynamics(view(True), 1, 2, 8)
+    x = jnp.ones((3, AGENTS, 4))
+    moved = shared.step(x, action.at[:, 1].set(-1.0))[0] - shared.step(x, action)[0]
     assert (moved != 0).any(-1).all()

@@ -16,7 +16,7 @@ from ringfence.windows import WindowData, at
 @pytest.fixture(scope="module", params=[0, 2], ids=["present", "history"])
 def windows(request, small_store):
     """(windows (M, H, N, D), valid (M, H), row of the present)."""
-    data = WindowData(small_store, features.simple_spread("pruned", 3), 0.9)
+    data = WindowData(small_store, features.simple_spread("pruned", 3))
     batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(data.steps), 6, request.param)
     return np.asarray(batch.features), np.asarray(batch.valid), request.param
 
@@ -24,13 +24,13 @@ def windows(request, small_store):
 def test_bounds_of_actions_change_no_lesson(small_store):
     """Actions told in other units teach the same; those bounded by −1 and 1 are not touched."""
     view = features.simple_spread("pruned", 3)
-    plain = WindowData(small_store, view, 0.9).arrays["actions"]
+    plain = WindowData(small_store, view).arrays["actions"]
     np.testing.assert_array_equal(plain, small_store.actions)
     np.testing.assert_array_equal(normalise.from_unit(plain, -1.0, 1.0), plain)
     card = small_store.card | {"action_low": 2.0, "action_high": 8.0}
     told = normalise.from_unit(small_store.actions, 2.0, 8.0)
     assert 2.0 <= told.min() < 2.1 and 7.9 < told.max() <= 8.0
-    other = WindowData(replace(small_store, actions=told, card=card), view, 0.9).arrays["actions"]
+    other = WindowData(replace(small_store, actions=told, card=card), view).arrays["actions"]
     np.testing.assert_allclose(other, plain, atol=1e-6)
 
 

@@ -16,7 +16,8 @@ import ringfence.data.store as store_module
 from ringfence.data.store import ARRAYS, EpisodeStore
 from ringfence.errors import StoreError, UserError
 from ringfence.hazards import CostColumn
-from ringfence.windows import NOT_ARRIVED, WindowData, at, return_scores, returns_to_go
+from ringfence.scores import return_scores
+from ringfence.windows import NOT_ARRIVED, WindowData, at, returns_to_go
 
 
 def logs(lengths=(3, 1, 4), agents=2, seed=0, **card) -> EpisodeStore:
@@ -203,7 +204,7 @@ RULES = {
     "no last state": (lambda s: {"observations": s.observations[:-3]}, r"observations has shape \(8, 2, 5\)"),
     "agents": (lambda s: {"observations": s.observations[:, :1]}, "observations has shape"),
     "rewards": (lambda s: {"rewards": s.rewards[:, 0]}, r"rewards has shape \(8,\), expected \(8, 2\)"),
-    "costs": (lambda s: {"costs": s.rewards}, r"costs has shape \(8, 2\), expected \(8,\)"),
+    "costs": (lambda s: {"costs": s.rewards[:, :1]}, r"costs has shape \(8, 1\), expected \(8, 2\)"),
     "flags": (lambda s: {"truncated": s.truncated[:-1]}, r"truncated has shape \(7,\)"),
     "state": (lambda s: {"state": s.state[:-1]}, r"state has shape \(10, 6\), expected \(11, S\)"),
     "no episode": (lambda s: {"episode_ends": s.episode_ends[:0]}, "episode_ends is empty"),
@@ -345,7 +346,7 @@ drawn = jax.jit(at, static_argnums=(2, 3))
 @given(lengths=partitions())
 def test_windows_repeat_rows_at_the_ends_of_episodes(horizon, history, lengths):
     store = logs(tuple(lengths))
-    data = WindowData(store, lambda observations, state: observations, 0.9)
+    data = WindowData(store, lambda observations, state: observations)
     steps = np.arange(store.steps)
     batch = jax.tree.map(np.asarray, drawn(data.arrays, steps, horizon, history))
     row, step = 0, 0

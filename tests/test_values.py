@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import features, values
+from ringfence import features, scores
+from ringfence.world import values
 
 
 def test_advantages_match_their_definition():
@@ -15,7 +16,7 @@ def test_advantages_match_their_definition():
     team, value = rng.normal(size=11), rng.normal(size=14)
     row = np.arange(11) + np.repeat(np.arange(3), lengths)
     last = np.repeat(ends + np.arange(3), lengths)
-    got = values.advantages(value, team, row, last, horizon, discount)
+    got = scores.advantages(value, team, row, last, horizon, discount)
     for t in range(11):
         left = last[t] - row[t]
         n = min(horizon - 1, left)
@@ -27,7 +28,7 @@ def test_advantages_match_their_definition():
 
 def test_normal_scores_are_ordered_and_standard():
     x = np.random.default_rng(0).exponential(size=5000)
-    z = values.normal_scores(x)
+    z = scores.normal_scores(x)
     assert (np.diff(z[np.argsort(x)]) > 0).all()
     assert abs(z.mean()) < 1e-6 and abs(z.std() - 1) < 0.01
 

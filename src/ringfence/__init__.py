@@ -20,6 +20,10 @@ _WHERE = {
     "load": "ringfence.evaluate",
     "Controller": "ringfence.evaluate",
     "play": "ringfence.parallel",
+    "World": "ringfence.world",
+    "fit": "ringfence.worlds",
+    "load_world": "ringfence.worlds:load",
+    "guard": "ringfence.guards",
     "build_report": "ringfence.report",
 }
 __all__ = list(_WHERE)
@@ -27,5 +31,6 @@ __all__ = list(_WHERE)
 
 def __getattr__(name: str):
     if name in _WHERE:
-        return getattr(importlib.import_module(_WHERE[name]), name)
+        module, _, other = _WHERE[name].partition(":")
+        return getattr(importlib.import_module(module), other or name)
     raise AttributeError(f"module 'ringfence' has no attribute '{name}'")

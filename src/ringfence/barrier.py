@@ -1,4 +1,4 @@
-"""Individual control barrier functions h_i(s̃_i): the conditions, the retention schedule, who gets which gradient.
+"""What a plan is asked of a barrier h_i(s̃_i): the retention schedule, and the loss that raises h along plans.
 
     h ≥ 0 on safe states,  h < 0 on unsafe ones,  h(s̃_{t+1}) ≥ α h(s̃_t)  along transitions           (paper, eq. 7)
 
@@ -9,15 +9,14 @@ membership, 1 forbids any approach to the boundary; every value in [0, 1) keeps 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
-from ringfence.types import Array, Key, Metrics
+from ringfence.types import Array
 
 Relaxation = Literal["signal", "linear", "none"]
 
@@ -60,51 +59,6 @@ class Retention:
         return jnp.where(h >= 0, kept, (self.m + eta * (1.0 - self.m) / self.m) * h)
 
 
-class Hinges(NamedTuple):
-    """The three conditions as means over their sets; accuracies are the shares that hold with zero margin."""
-
-    safe: Array
-    unsafe: Array
-    retention: Array
-    metrics: Metrics
-
-
-def hinges(
-    h: Array,
-    unsafe: Array,
-    safe: Array,
-    valid: Array,
-    retention: Retention,
-    eta: Array,
-    delta: float,
-    scaled_margin: bool,
-    weight: Array | float = 1.0,
-) -> Hinges:
-    """The hinges of eq. 8, each a mean over its own set (sums would tie the balance to the batch and its classes).
-
-    h, unsafe, safe, valid: (B, H, N). Sets follow the labels:
-        S_0 ∪ S_s:  max(0, δ − h(s̃))              on safe states
-        S_d:        max(0, δ + h(s̃))              on unsafe states
-        S_s:        max(0, margin − h(s̃_{t+1}) + α h(s̃_t))  on transitions that start in a safe state,
-    with margin δ as printed, or (1 − α) δ when scaled. `eta` (B, 1, 1) or a number; `weight` (B, 1, 1).
-    """
-    margin = (1.0 - retention.m + eta) * delta if scaled_margin else delta
-    safe, unsafe = safe & valid, unsafe & valid
-    pair = safe[:, :-1] & valid[:, 1:]
-    slack = h[:, 1:] - retention.decay(h[:, :-1], eta)
-    return Hinges(
-        _mean(jax.nn.relu(delta - h), safe, weight),
-        _mean(jax.nn.relu(delta + h), unsafe, weight),
-        _mean(jax.nn.relu(margin - slack), pair, weight),
-        {
-            "accuracy_safe": _mean(h >= 0, safe),
-            "accuracy_unsafe": _mean(h < 0, unsafe),
-            "accuracy_retention": _mean(slack >= 0, pair),
-            "share_unsafe": _mean(unsafe.astype(jnp.float32), valid),
-        },
-    )
-
-
 def shaping(
     h: Array, valid: Array, retention: Retention, eta: Array, delta: float, scaled_margin: bool, weight: Array
 ) -> Array:
@@ -115,40 +69,14 @@ def shaping(
     h (B, H, N) = h̄ on the clean estimate, row 0 the in-painted present; `weight` (B, 1, 1), e.g. ᾱ_k. The reference
     h̄(x̂0_t) carries no gradient, or the generator would be paid for making the present worse.
     """
-    positive = _mean(jax.nn.relu(delta - h[:, 1:]), valid[:, 1:], weight)
+    positive = mean_over(jax.nn.relu(delta - h[:, 1:]), valid[:, 1:], weight)
     floor = retention.decay(jax.lax.stop_gradient(h[:, :-1]), eta)
     margin = (1.0 - retention.m + eta) * delta if scaled_margin else delta
     drop = jax.nn.relu(margin - h[:, 1:] + floor)
-    return positive + _mean(drop, valid[:, 1:], weight)
+    return positive + mean_over(drop, valid[:, 1:], weight)
 
 
-def unsafe_bank(features: Array, costs: Array, hazard: BoundHazard, size: int, key: Key) -> tuple[Array, Array]:
-    """(bank (size, N, D), own (size, N) bool): states that are unsafe for the agents marked in `own`.
-
-    One half is real unsafe states of the data (M, N, D), drawn with replacement; the rest, or all where the data has
-    none, is synthesised from the hazard's formula. Without it h goes flat as soon as the generator is safe.
-    """
-    k1, k2, k3 = jax.random.split(key, 3)
-    labels = jax.jit(hazard.labels)
-    unsafe, _ = labels(features, costs)
-    found = jnp.flatnonzero(unsafe.any(-1))
-    parts = []
-    if len(found):
-        count = size // 2 if hazard.has_formula else size
-        pick = found[jax.random.randint(k1, (count,), 0, len(found))]
-        parts.append((features[pick], unsafe[pick]))
-    if hazard.has_formula:
-        count = size - sum(len(p[0]) for p in parts)
-        base = features[jax.random.randint(k2, (count,), 0, len(features))]
-        made = jax.jit(hazard.endanger)(base, k3)
-        parts.append((made, labels(made)[0]))
-    if not parts:  # nothing is dangerous and nothing can be made so: an empty lesson of the same size, not an error
-        bank = features[jax.random.randint(k2, (size,), 0, len(features))]
-        return bank, jnp.zeros(bank.shape[:2], bool)
-    return jnp.concatenate([p[0] for p in parts]), jnp.concatenate([p[1] for p in parts])
-
-
-def _mean(x: Array, mask: Array, weight: Array | float = 1.0) -> Array:
+def mean_over(x: Array, mask: Array, weight: Array | float = 1.0) -> Array:
     """Mean of x over a mask (broadcast to x), 0 where it is empty; `weight` multiplies the terms, not the count."""
     mask = jnp.broadcast_to(mask, x.shape).astype(jnp.float32)
     return (x * mask * weight).sum() / jnp.maximum(mask.sum(), 1.0)

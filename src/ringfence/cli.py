@@ -211,28 +211,57 @@ def train(
         print(run.path)
 
 
+def fit(
+    data: Positional[str],
+    seed: int = 0,
+    sight: Literal["all", "own"] = "all",
+    set: Assignments = [],  # noqa: B006
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+) -> None:
+    """Fit the World of a task's data or of a store, and print its card: what can be foreseen, how well, where not.
+
+    Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on.
+
+    Args:
+        data: a task (its data set is regenerated if need be) or a store's file.
+        seed: of the fit, and of which episodes are held out.
+        sight: all for guards that see the team, own for agents that each guard their own action by their own view.
+        set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
+        out_file: keep the World in a file, too, for `ringfence eval --world`.
+    """
+    from ringfence import world, worlds
+
+    made = worlds.fit(_store(data), seed=seed, sight=sight, quiet=False, **_assignments(set))
+    out.print(str(made.card), soft_wrap=True, markup=False)
+    if out_file is not None:
+        print(world.save(made, out_file))
+
+
 def evaluate(
     runs: Positional[list[Path]],
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
     record: int = 4,
     step: int | None = None,
-    planner: Literal["plain", "guarded", "steady", "shielded", "adaptive"] = "plain",
+    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
+    danger: Literal["learned", "formula", "both"] | None = None,
+    sight: Literal["all", "own"] = "all",
+    world: Path | None = None,
+    planner: Literal["plain", "climbing", "steady"] = "plain",
     plans: int | None = None,
+    margin: float | None = None,
+    rows: int | None = None,
     steps: int | None = None,
     sampler: str | None = None,
     guidance: float | None = None,
     target: float | None = None,
     temperature: float | None = None,
-    select: str | None = None,
-    margin: float | None = None,
-    prefix: int | None = None,
     replan: int | None = None,
     execution: str | None = None,
     video: bool = False,
     set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
 ) -> None:
-    """Play a trained policy on the protocol's resets; all planner options are evaluation-time values.
+    """Play a trained policy on the protocol's resets, as it is or under guard; all of it are evaluation-time choices.
 
     Args:
         runs: run folders, or folders that hold some.
@@ -240,26 +269,29 @@ def evaluate(
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
         step: of the checkpoint that is played; the last one by default.
-        planner: plain follows one drawn plan; guarded steers eight and follows the best safe one; steady, shielded
-            and adaptive are for robots.
-        plans: drawn per step; the best safe one is followed.
+        guard: what is done with what the policy proposes: select among several plans, refine them up the value, shield
+            (correct them until danger keeps its distance), adapt the shield's margin to what happens; full does all.
+        danger: how the guard knows it: learned from the logs (default), by the task's formula, or the worse of both.
+        sight: all: one guard sees the team; own: every agent guards its own action by its own view.
+        world: a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed.
+        planner: how diffusion planners draw plans: plain, climbing (value steers them), steady (for robots).
+        plans: asked for by the guard.
+        margin: kept from danger, in units of its source: calibrated margins, or the hazard's safe margin.
+        rows: foreseen and judged.
         steps: of the sampler.
         sampler: ddim, ddpm or dpm++.
         guidance: ω of classifier-free guidance.
         target: return condition, as a normal score.
         temperature: scale of the first noise.
-        select: plans are judged by clearance, barrier or both.
-        margin: least safety score that is good enough.
-        prefix: rows of a plan that are judged.
         replan: steps for which a plan is followed.
         execution: centralized or decentralized.
         video: make a GIF of the first episode (robots).
-        set: any other planner option, e.g. --set ascent=10 repair=100; docs/evaluation.md lists them.
+        set: any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them.
     """
     from ringfence.evaluate import evaluate as run_evaluation
 
-    given = {k: v for k, v in locals().items() if k in PLAN_OPTIONS and v is not None}
-    given |= _planner_options(_assignments(set), given)
+    given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}
+    given |= _options(_assignments(set), given)
     names = ("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
     table = Table(*names, "ended early")
     if not runs:
@@ -272,7 +304,8 @@ def evaluate(
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
         record = record or 1
-    told = dict(episodes=episodes, split=split, planner=planner, record=record, step=step, quiet=False)
+    told = dict(episodes=episodes, split=split, planner=planner, guard=guard, sight=sight, record=record, step=step)
+    told |= {"quiet": False, "danger": danger, "world": world}
     refused: dict[str, list] = {}  # what several runs are refused for is said once
     for run in found:
         try:
@@ -305,30 +338,34 @@ def evaluate(
         sys.exit(2)
 
 
-def _planner_options(assigned: dict[str, str], given: dict) -> dict[str, str]:
-    """What --set says of the planner; refused where a flag said it already, or where it is no option of the planner."""
+def _options(assigned: dict[str, str], given: dict) -> dict[str, str]:
+    """What --set says of planner and guard; refused where a flag said it already, or where it is an option of neither."""
+    from ringfence.evaluate import asked
+    from ringfence.guards import GuardOptions
     from ringfence.policies import PlanOptions
-    from ringfence.runs import build_config
+    from ringfence.runs import parse_as
 
     for name, value in assigned.items():
-        if name in ("episodes", "split", "record", "step", "planner"):
-            raise UserError(f"--set {name}={value} is no option of the planner; write --{name} {value}.")
+        if name in ("episodes", "split", "record", "step", "planner", "guard", "danger", "sight", "world"):
+            raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
         if name in given:
             raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
-    build_config(PlanOptions, assigned, "the planner")  # an unknown name is refused before any run is played
+    how = asked(**assigned)  # an unknown name is refused before any run is played
+    for kind, values in ((PlanOptions, how.plan), (GuardOptions, how.given)):
+        parse_as(kind, values)
     return assigned
 
 
-PLAN_OPTIONS = (
+# What is handed on to planner and guard.
+FLAGS = (
     "plans",
+    "margin",
+    "rows",
     "steps",
     "sampler",
     "guidance",
     "target",
     "temperature",
-    "select",
-    "margin",
-    "prefix",
     "replan",
     "execution",
 )
@@ -356,7 +393,7 @@ def doctor() -> None:
     """Versions, devices, what is missing and how to get it."""
     import importlib.metadata as metadata
 
-    from ringfence.data.make import cache_dir
+    from ringfence.data.cache import cache_dir
     from ringfence.runs import environment
 
     told = environment()
@@ -567,6 +604,7 @@ DATA = {
 BENCH = {"status": bench_status, "results": bench_results, "paper-table": bench_paper, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,
+    "fit": fit,
     "train": train,
     "eval": evaluate,
     "bench": bench,

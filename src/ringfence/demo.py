@@ -1,4 +1,5 @@
-"""The whole job in one command: data, training without and with barrier, evaluation on the same resets, report."""
+"""The whole job in one command: data, a World, training without and with barrier, evaluation on the same resets as it is
+and under guard, told the formula of danger and not, report."""
 
 from __future__ import annotations
 
@@ -8,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Column, Table
 
-from ringfence import evaluate, reference, tasks, training
+from ringfence import evaluate, reference, tasks, training, worlds
 from ringfence.data.make import make
 from ringfence.report import build_report
 
@@ -21,18 +22,25 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     store, path = make(task, 20_000 if quick else None)
     console.print(f"data        {store.episodes:,} episodes, return {store.returns.mean():.1f}: {path}", soft_wrap=True)
     small = {"steps": 60, "batch": 32, "barrier_batch": 16, "width": 64}
-    small |= {"critic_updates": 100, "dynamics_updates": 100}
-    shared = {"out": out / "runs", "changes": small if quick else {}}
+    known = {f"{part}_updates": 100 for part in ("dynamics", "value", "barrier", "future")}
+    shared = {"out": out / "runs", "changes": small if quick else {}, "world": known if quick else {}}
     cloned = training.train("bc", store, out=out / "runs", changes={"steps": 60} if quick else {})[0]
     plain = training.train("madiff", store, **shared)[0]
     guarded = training.train("icbf", store, **shared)[0]
     rows = dict(reference.make(task, store, out / "runs", episodes))
     told = {"episodes": episodes, "record": 4, "quiet": False}
     fewer = {"steps": 2} if quick else {}
+    world = worlds.of_run(guarded)
+    console.print(str(world.card), soft_wrap=True, markup=False)
+    fewer_rounds = {"refine": 2} if quick else {}
     rows["BC"] = evaluate.evaluate(cloned, **told)
+    rows["BC, shielded, formula"] = evaluate.evaluate(cloned, guard="shield", danger="formula", world=world, **told)
+    rows["BC, shielded, learned"] = evaluate.evaluate(cloned, guard="shield", danger="learned", world=world, **told)
     rows["MADIFF"] = evaluate.evaluate(plain, **told, **fewer)
     rows["ICBF split"] = evaluate.evaluate(guarded, **told, **fewer)
-    rows["ICBF split, guarded"] = evaluate.evaluate(guarded, planner="guarded", **told, **fewer)
+    for danger in ("formula", "learned"):
+        how = dict(guard="full", danger=danger, **told, **fewer, **fewer_rounds)
+        rows[f"ICBF split, full guard, {danger}"] = evaluate.evaluate(guarded, **how)
     table = Table(Column("", no_wrap=True), "return", "norm.", "cost", "avoidable", "unsafe episodes", title=task.name)
     for name, r in rows.items():
         table.add_row(

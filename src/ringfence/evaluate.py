@@ -9,27 +9,30 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Iterable
+from pathlib import Path
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import algos, features, hazards, stats, tasks, training
-from ringfence.envs import SafeMuJoCo
+from ringfence import algos, features, hazards, stats, tasks, training, worlds
 from ringfence.errors import UserError, unknown
 from ringfence.files import whole
+from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
+from ringfence.guards.policy import build
 from ringfence.hazards import BoundHazard
 from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
 from ringfence.types import Array, Key, Policy, PyTree, Spec
+from ringfence.world import World
 
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
 CHUNK = 50  # episodes per compiled batch
+COUNTED = ("infeasible", "strange")  # of every step: a guard's condition could not be met; its World knew nothing there
 
 
 def rollout(
@@ -48,7 +51,7 @@ def rollout(
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
-    if isinstance(env, SafeMuJoCo):
+    if hasattr(env, "simulate"):
         return _rollout_native(policy, env, episodes, RESETS[split], act_root, record, label, quiet)
 
     def play(policy, index, batch, keep):
@@ -58,9 +61,11 @@ def rollout(
             memory, state = carry
             memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
+            memory = heard(policy, memory, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.cost, "state": env.global_state(after)}
+            kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
-                kept |= {k: v[:keep] for k, v in decided.info.items()}
+                kept |= {k: v[:keep] for k, v in decided.info.items() if k not in COUNTED}
             return (memory, after), kept
 
         keys = jax.random.split(jax.random.fold_in(act_root, index), env.episode_length)
@@ -84,7 +89,7 @@ def rollout(
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
-    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state")}
+    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state", *COUNTED) if k in out}
     lost = ~(np.isfinite(out["reward"]) & np.isfinite(out["state"][:, 1:]).all(-1))
     if lost.any():  # nothing collides with what is nowhere, so it would pass for safe
         episode, step = np.argwhere(lost)[0]
@@ -98,7 +103,7 @@ def rollout(
 
 
 def _rollout_native(
-    policy: Policy, env: SafeMuJoCo, episodes: int, root: int, key: Key, record: int, label: str, quiet: bool
+    policy: Policy, env, episodes: int, root: int, key: Key, record: int, label: str, quiet: bool
 ) -> dict[str, np.ndarray]:
     """`rollout` on a simulator that steps outside JAX: all episodes side by side. After an episode's end its rewards
     and costs are 0 and its state stays."""
@@ -107,7 +112,7 @@ def _rollout_native(
     act = act_with if _foreign(policy) else jax.jit(act_with)
     memory = policy.start(episodes)
     states = [sim.state().astype(np.float32)]
-    steps, info, lengths = [], [], np.zeros(episodes, int)
+    steps, info, counted, lengths = [], [], [], np.zeros(episodes, int)
     with Progress(label or "evaluating", env.episode_length, 0, quiet) as bar:
         for t in range(env.episode_length):
             if not sim.running.any():
@@ -115,12 +120,17 @@ def _rollout_native(
             seen = sim.observe(states[-1])
             memory, decided = act(policy, memory, seen, states[-1], jax.random.fold_in(key, t))
             lengths += sim.running
+            on = sim.running.copy()
             steps.append(sim.step(np.asarray(decided.action)))
             states.append(sim.state().astype(np.float32))
+            memory = heard(policy, memory, steps[-1].cost)
+            counted.append({k: np.asarray(decided.info[k]) & on for k in COUNTED if k in decided.info})
             if record:
-                info.append({k: np.asarray(v[:record]) for k, v in decided.info.items()})
+                told = {k: v for k, v in decided.info.items() if k not in COUNTED}
+                info.append({k: np.asarray(v[:record]) for k, v in told.items()})
             bar.advance(1)
     kept = {"rewards": np.stack([s.reward for s in steps], 1), "costs": np.stack([s.cost for s in steps], 1)}
+    kept |= {k: np.stack([c[k] for c in counted], 1) for k in (counted[0] if counted else ())}
     kept = {k: _padded(v, env.episode_length) for k, v in kept.items()}
     kept |= {"steps": lengths, "terminated": np.stack([s.terminated for s in steps], 1).any(1)}
     kept["states"] = np.stack(states, 1)
@@ -128,6 +138,11 @@ def _rollout_native(
         [kept["states"], np.repeat(kept["states"][:, -1:], env.episode_length + 1 - len(states), 1)], 1
     )
     return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
+
+
+def heard(policy: Policy, memory: PyTree, cost: Array) -> PyTree:
+    """The memory of a policy that wants to know what its last step cost (B,)."""
+    return policy.hear(memory, cost) if hasattr(policy, "hear") else memory
 
 
 def act_with(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
@@ -170,6 +185,7 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "violation_rate": float(violated.mean()),
         "violation_interval": stats.clopper_pearson(int(violated.sum()), n),
         "violation_upper": stats.upper_bound(int(violated.sum()), n),
+        **{k: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
         "unsafe_starts": int(hazard_at_start.sum()),
         "avoidable_cost": float(avoidable.mean()),
         "avoidable_interval": stats.bootstrap_mean(avoidable),
@@ -237,47 +253,114 @@ def evaluate_policy(
 
 
 def load(run: Run | str, step: int | None = None, planner: str = "plain", **options):
-    """(job, policy) of a finished run; `planner` is a named set of planner options (policies.PLANNERS), `options` are
-    fields of PlanOptions that change it. The policy's `act` is a pure function: compile it with jax.jit, or use a
-    `Controller`."""
-    job, policy, _ = _loaded(run, step, planner, options)
+    """(job, policy) of a finished run.
+
+    `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards (guard.GUARDS),
+    `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every agent guards its own
+    action by its own view ("own"), `world` the World it reads (default: that of the run's data and seed). Other options are
+    fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
+    `Controller`.
+    """
+    job, policy, _ = _loaded(run, step, asked(planner, **options))
     return job, policy
 
 
-def _loaded(run: Run | str, step: int | None, planner: str, options: dict) -> tuple[training.Job, Policy, int]:
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """How a run is to be played."""
+
+    planner: str
+    guard: str
+    danger: str
+    sight: str
+    world: World | str | Path | None
+    plan: dict  # options of the planner
+    given: dict  # options of the guard
+
+    @property
+    def guarded(self) -> bool:
+        return self.guard != "none" or bool(self.given)
+
+
+def asked(
+    planner: str = "plain",
+    guard: str = "none",
+    danger: str | None = None,
+    sight: str = "all",
+    world: World | str | Path | None = None,
+    **options,
+) -> Asked:
+    """Names and options sorted to whom they belong; unknown ones are refused."""
+    for kind, name, known in (
+        ("planner", planner, PLANNERS),
+        ("guard", guard, GUARDS),
+        ("sight", sight, ("all", "own")),
+    ):
+        if name not in known:
+            raise unknown(kind, str(name), known)
+    if danger is not None and danger not in DANGERS:
+        raise unknown("danger", str(danger), DANGERS)
+    fields = {f.name for f in dataclasses.fields(GuardOptions)}
+    given = {k: v for k, v in options.items() if k in fields}
+    plan = {k: v for k, v in options.items() if k not in fields}
+    for name in plan:
+        if name not in (names := {f.name for f in dataclasses.fields(PlanOptions)}):
+            raise unknown("option of planner or guard", name, names | fields)
+    found = Asked(planner, guard, danger or "learned", sight, world, plan, given)
+    if not found.guarded and (danger is not None or sight != "all" or world is not None):
+        told = next(k for k, v in (("danger", danger), ("sight", sight != "all"), ("world", world)) if v)
+        raise UserError(f"{told} is read by nothing without a guard; name one with guard=, e.g. shield.")
+    return found
+
+
+def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job, Policy, int]:
     """`load`, and the step of the checkpoint."""
     run = Run.of(run)
-    if planner not in PLANNERS:
-        raise unknown("planner", planner, PLANNERS)
-    options = {**PLANNERS[planner], **options}
     job = load_job(run)
-    template = jax.eval_shape(
-        lambda: job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
-    )
-    at, state = run.load_checkpoint(template, step)
-    return job, make_policy(job, state, options), at
+    world = worlds.of_run(run) if job.algorithm.needs is not None else None
+    told = {} if world is None else {"world": world}
+
+    def blank():
+        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **told)
+        return training.learned(state)
+
+    at, state = run.load_checkpoint(jax.eval_shape(blank), step)
+    if world is not None:
+        state |= {"world": job.algorithm.of_world(world, job.config)}
+    policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
+    if not how.guarded:
+        return job, policy, at
+    if how.world is not None or world is None or how.sight != "all" or world.map.view != "pruned":
+        world = worlds.of_run(run, how.sight, how.world, quiet=False)
+    guarded = build(policy, world, job.hazard.hazard, how.guard, how.danger, **how.given)
+    return job, guarded, at
 
 
 class Controller:
     """A trained policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
 
-    controller = Controller("runs/…/seed-0", planner="guarded")
+    controller = Controller("runs/…/seed-0", guard="shield", danger="learned")
     controller.reset()                             # at the start of every episode
     action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
+
+    `info` says of the last action what the policy knows of it, e.g. `strange`: the World knows nothing there. Not for
+    several threads at once.
     """
 
     def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
         self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(seed)
         self._act = jax.jit(act_with)
+        self.info: dict[str, np.ndarray] = {}
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._memory = self.policy.start(1)
 
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None) -> np.ndarray:
-        """(N, A) joint action within the task's bounds. Arrays of another shape than the run's are refused, and so is
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: float | None = None) -> np.ndarray:
+        """(N, A) joint action within the task's bounds; `cost` is what the last step cost, which an adapting guard
+        follows. Arrays of another shape than the run's are refused, and so is
         what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow NaN."""
         width, state_width = self.job.widths
         seen = given_as("observations", observations, (self.job.spec.n_agents, width))
@@ -296,7 +379,10 @@ class Controller:
             self._reaches(seen, whole)
         self._key, key = jax.random.split(self._key)
         whole = None if whole is None else whole[None]
+        if cost is not None:
+            self._memory = heard(self.policy, self._memory, np.full(1, cost, np.float32))
         self._memory, step = self._act(self.policy, self._memory, seen[None], whole, key)
+        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
         return np.asarray(step.action[0])
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
@@ -368,15 +454,25 @@ def make_policy(job: training.Job, state, options: dict) -> Policy:
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
 
 
-def variant_name(job: training.Job, planner: str, options: PlanOptions | None, given: Iterable[str], split: str) -> str:
-    """Preset, named planner and the values of the options given beside it, e.g. `split+guarded+steps10`. Neither their
-    order nor how their values were spelled (10, 10.0, '1e1') makes another name."""
-    name = job.preset if planner == "plain" else f"{job.preset}+{planner}"
-    for field in dataclasses.fields(PlanOptions) if options is not None else ():
-        if field.name in given:
-            value = getattr(options, field.name)
-            name += f"+{field.name}{float(value) if isinstance(field.default, float) else value}"
+def variant_name(job: training.Job, policy: Policy, how: Asked, split: str) -> str:
+    """Preset, named planner, guard with its danger and sight, and the values of the options given beside them, e.g.
+    `split+climbing+shield-learned+rows7`. Neither their order nor how their values were spelled makes another name."""
+    inner = policy.proposal if isinstance(policy, Guarded) else policy
+    name, plans = job.preset, isinstance(inner, Planner)
+    if plans and how.planner != "plain":
+        name += f"+{how.planner}"
+    if isinstance(policy, Guarded):
+        name += f"+{how.guard}-{how.danger}" + ("-own" if how.sight == "own" else "")
+    for options, given in ((inner.options if plans else None, how.plan), (_guard_of(policy), how.given)):
+        for field in dataclasses.fields(options) if options is not None else ():
+            if field.name in given:
+                value = getattr(options, field.name)
+                name += f"+{field.name}{float(value) if isinstance(field.default, float) else value}"
     return name if split == "test" else f"{name}@{split}"
+
+
+def _guard_of(policy: Policy) -> GuardOptions | None:
+    return policy.guard.options if isinstance(policy, Guarded) else None
 
 
 def evaluate(
@@ -392,17 +488,18 @@ def evaluate(
 ) -> dict:
     """Evaluate a run folder and add the result to its results.json, under the variant's name.
 
-    `planner` is a named set of planner options (policies.PLANNERS), `options` change single ones. The result tells the
-    `step` of the checkpoint that was played; where training is unfinished, a line on stderr says so.
+    `planner`, `guard`, `danger`, `sight`, `world` and other options are as in `load`. The result tells the `step` of
+    the checkpoint that was played; where training is unfinished, a line on stderr says so.
     """
-    run = Run.of(run)
-    job, policy, at = _loaded(run, step, planner, options)
+    run, how = Run.of(run), asked(planner, **options)
+    job, policy, at = _loaded(run, step, how)
     _ = run.results  # damaged ones are refused before anything is played
     if step is None and at < job.config.steps:
         print(f"'{run.path}' is at step {at} of {job.config.steps}; its training is unfinished.", file=sys.stderr)
     told = run.config
-    plans = isinstance(policy, Planner)
-    variant = variant_name(job, planner if plans else "plain", policy.options if plans else None, options, split)
+    inner = policy.proposal if isinstance(policy, Guarded) else policy
+    plans, guards = isinstance(inner, Planner), _guard_of(policy)
+    variant = variant_name(job, policy, how, split)
     variant += "" if step is None else f"@step{step}"
     seed = told["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
@@ -413,7 +510,11 @@ def evaluate(
         "step": at,
         "provenance": told["data"]["provenance"],
         "planner": planner if plans else "plain",
-        "options": dataclasses.asdict(policy.options) if plans else {},
+        "options": dataclasses.asdict(inner.options) if plans else {},
+        "guard": how.guard if guards else "none",
+        "danger": how.danger if guards else "none",
+        "sight": how.sight,
+        "guard_options": dataclasses.asdict(guards) if guards else {},
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),
     }
@@ -433,7 +534,7 @@ def _parameters(policy: Policy) -> int:
 
 def _first(env) -> tuple[Array, Array]:
     """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
-    if isinstance(env, SafeMuJoCo):
+    if hasattr(env, "simulate"):
         sim = env.simulate(1)
         sim.reset([0])
         return jnp.asarray(sim.observe(), jnp.float32), jnp.asarray(sim.state(), jnp.float32)

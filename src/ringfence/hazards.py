@@ -207,6 +207,17 @@ def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
     return BoundHazard(hazard, lambda x: hazard.limit - speed(x), endanger, margin)
 
 
+def reads(hazard: Hazard, n_agents: int, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Entries that a hazard reads from where only the global state may tell them, given what agents observe."""
+    if isinstance(hazard, All):
+        return tuple(name for h in hazard.hazards for name in reads(h, n_agents, names))
+    if isinstance(hazard, SpeedLimit):
+        return tuple(name for name in hazard.features if name not in names)
+    if isinstance(hazard, Separation) and "other0.dx" not in names:
+        return tuple(f"agent{i}.{c}" for i in range(n_agents) for c in "xy")
+    return ()
+
+
 def _missing(kind: str, name: str, names: tuple[str, ...]) -> UserError:
     near = unknown("feature", name, names)
     return UserError(f"{kind} reads the feature '{name}', which this data does not have: name it in the card. {near}")

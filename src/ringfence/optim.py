@@ -75,10 +75,13 @@ def regress(
     batch: int,
     rate: float,
     label: str = "",
+    decay: float = 0.0,
+    after: Callable[[PyTree], PyTree] = lambda net: net,
 ) -> PyTree:
     """`net` after `updates` steps of Adam on loss(net, data, picked), with `batch` of `rows` row numbers each;
-    the rate falls along a cosine to a fiftieth. Progress is shown under a `label`."""
-    adam = optax.adam(optax.cosine_decay_schedule(rate, updates, 0.02))
+    the rate falls along a cosine to a fiftieth, weights by `decay`. `after` is applied after every update, e.g. to let
+    a slow copy follow. Progress is shown under a `label`."""
+    adam = optax.adamw(optax.cosine_decay_schedule(rate, updates, 0.02), weight_decay=decay)
     keys = jax.random.split(key, updates)
 
     @jax.jit
@@ -86,8 +89,8 @@ def regress(
         def step(i, carry):
             net, moments = carry
             picked = jax.random.randint(keys[i], (batch,), 0, rows)
-            moves, moments = adam.update(jax.grad(loss)(net, data, picked), moments)
-            return optax.apply_updates(net, moves), moments
+            moves, moments = adam.update(jax.grad(loss)(net, data, picked), moments, net)
+            return after(optax.apply_updates(net, moves)), moments
 
         return jax.lax.fori_loop(start, stop, step, carry)
 

@@ -24,6 +24,7 @@ def play(
     *,
     episodes: int = 20,
     planner: str = "plain",
+    split: str = "test",
     seed: int = 0,
     cost: Cost | None = None,
     at_once: int = 16,
@@ -34,8 +35,9 @@ def play(
 
     `make_env()` makes a PettingZoo `ParallelEnv` whose agents, in the order of `possible_agents`, are those of the
     run's data, and who begin and end together. `at_once` of them are stepped side by side, so that one compiled call
-    acts in all. Episode k is reset with the seed 7 000 001 + k; `seed` moves the policy's noise. `planner` and
-    `options` are as in `evaluate.load`.
+    acts in all. Episode k is reset with the seed 7 000 001 + k, on the split "validation", for choosing settings,
+    with 9 000 001 + k; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are as in
+    `evaluate.load`.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); where there
@@ -46,6 +48,8 @@ def play(
     for name, value in (("episodes", episodes), ("at_once", at_once)):
         if value < 1:
             raise UserError(f"{name}={value} must be at least 1.")
+    if split not in evaluate.RESETS:
+        raise UserError(f"split='{split}' does not exist; use test or validation.")
     job, policy = evaluate.load(run, planner=planner, **options)
     envs = [make_env() for _ in range(min(at_once, episodes))]
     if len({id(env) for env in envs}) < len(envs):
@@ -60,7 +64,7 @@ def play(
     with Progress(f"{job.algorithm.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
         for first in range(0, episodes, len(envs)):
             seeds = range(first, min(first + len(envs), episodes))
-            table = [_Episode(env, job, evaluate.RESETS["test"] + k) for env, k in zip(envs, seeds)]
+            table = [_Episode(env, job, evaluate.RESETS[split] + k) for env, k in zip(envs, seeds)]
             if formula:
                 for episode, unsafe in zip(table, np.asarray(label(*_seen(table)))):
                     episode.unsafe_start = bool(unsafe)
@@ -79,6 +83,7 @@ def play(
                         )
                     for episode, unsafe in zip(table, np.asarray(label(*_seen(table)))):
                         episode.charge(float(unsafe))
+                memory = evaluate.heard(policy, memory, np.array([e.costs[-1] for e in table], np.float32))
             played += table
             bar.advance(len(table))
     result = evaluate.summarise(_together(played), job.task, np.array([e.unsafe_start for e in played]))

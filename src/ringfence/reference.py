@@ -39,7 +39,7 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     length = int(store.lengths.max())
     pad = np.arange(length) < store.lengths[:, None]
     rewards, costs = np.zeros(pad.shape), np.zeros(pad.shape)
-    rewards[pad], costs[pad] = store.rewards.mean(1), store.costs
+    rewards[pad], costs[pad] = store.rewards.mean(1), store.team_costs
     if store.state is not None and task.env is not None:
         first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
         starts = unsafe_starts(task, store.state[first])

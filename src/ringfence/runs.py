@@ -22,11 +22,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 import jax
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import save_file
 
 from ringfence import __version__
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.files import whole
+from ringfence.trees import load_named, named_arrays
 from ringfence.types import PyTree
 
 KEEP = 2  # checkpoints
@@ -96,7 +97,7 @@ class Run:
     def save_checkpoint(self, step: int, state: PyTree) -> Path:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
         final = self.path / "ckpt" / f"step-{step:08d}.safetensors"
-        arrays = {name: np.array(leaf, order="C") for name, leaf in named_leaves(state)}
+        arrays = named_arrays(state)
         with whole(final) as temporary:
             try:
                 save_file(arrays, temporary, {"step": str(step)})
@@ -118,33 +119,14 @@ class Run:
                 raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
         at, file = found[-1]
         try:
-            arrays = load_file(file)
+            return at, load_named(file, template)
         except (SafetensorError, OSError) as error:
             raise CheckpointError(
                 f"'{file}' is truncated or damaged ({error}); delete it to use the one before."
             ) from (error)
-        leaves = []
-        for name, leaf in named_leaves(template):
-            if name not in arrays:
-                raise CheckpointError(f"'{file}' lacks the array '{name}'; it was made by another model: train again.")
-            if arrays[name].shape != leaf.shape:
-                raise CheckpointError(
-                    f"'{file}': '{name}' has shape {arrays[name].shape}, this run's config gives {leaf.shape}; the "
-                    "checkpoint belongs to another task or config."
-                )
-            leaves.append(jax.numpy.asarray(arrays[name], leaf.dtype))
-        return at, jax.tree.unflatten(jax.tree.structure(template), leaves)
 
     def add_result(self, variant: str, result: dict) -> None:
         write_json(self.path / "results.json", {**self.results, variant: result})
-
-
-def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
-    """Leaves with their paths, e.g. ('params/denoiser/blocks/0/qkv', array)."""
-    return [
-        ("/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), leaf)
-        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
-    ]
 
 
 def read_json(path: Path, problem: str) -> dict:
@@ -164,6 +146,12 @@ def write_json(path: Path, data: Any) -> None:
         temporary.write_text(json.dumps(data, indent=1))
 
 
+def parse_as(kind: type, changes: dict[str, str]) -> dict[str, Any]:
+    """Words read as the types of a config's fields."""
+    fields = {f.name: f for f in dataclasses.fields(kind)}
+    return {name: _parse(name, text, fields[name].default) for name, text in changes.items()}
+
+
 def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
     """A config dataclass from named changes; strings are read as the field's type, unknown names are refused."""
     fields, hints, values = {f.name: f for f in dataclasses.fields(kind)}, get_type_hints(kind), {}
@@ -181,8 +169,9 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 
 # Least and largest value that a field of this name may have, in whatever config it is.
 RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps", "inverse_width"), (1, None))
-RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "bank", "bank_batch", "gradient_batch"), (1, None))
-RANGES |= dict.fromkeys(("critic_updates", "dynamics_updates", "dynamics_width"), (1, None))
+RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "gradient_batch", "barrier_updates"), (1, None))
+RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates", "dynamics_width"), (1, None))
+RANGES |= {"members": (1, 20), "future_discount": (0, 0.999), "expectile": (0.5, 1)}
 RANGES |= dict.fromkeys(("search_iterations", "search_samples", "cql_samples"), (1, None))
 RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
 RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
@@ -230,7 +219,8 @@ def _parse(name: str, text: str, default: Any) -> Any:
         if isinstance(default, float):
             return float(text)
         if default is None:
-            return None if text.lower() == "none" else float(text)
+            words = {"none": None, "true": True, "false": False}
+            return words[text.lower()] if text.lower() in words else float(text)
     except (ValueError, KeyError):
         wanted = "a number or none" if default is None else type(default).__name__
         raise UserError(f"{name}='{text}' cannot be read as {wanted}; its default is {default!r}.") from None

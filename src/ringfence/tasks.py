@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from ringfence import features, hazards
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, SimpleSpread
@@ -32,6 +34,11 @@ class Task:
     action_low: float = -1.0
     action_high: float = 1.0
 
+    @property
+    def world(self) -> dict:
+        """What settings of a World its simulator asks for."""
+        return dict(getattr(self.env, "world", {}))
+
     def normalised_return(self, r):
         return (r - self.return_min) / (self.return_max - self.return_min)
 
@@ -50,7 +57,9 @@ class Task:
         width = 0 if store.state is None else store.state.shape[1]
         names = store.card["observation_names"] or [f"obs{d}" for d in range(store.observations.shape[2])]
         state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
-        return features.from_data(view, store.observations, store.state, tuple(names), tuple(state_names))
+        firsts = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+        keep = hazards.reads(self.hazard, store.n_agents, tuple(names))
+        return features.from_data(view, store.observations, store.state, tuple(names), tuple(state_names), firsts, keep)
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
         env = self.env

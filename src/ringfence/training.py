@@ -20,11 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import algos, features, hazards, tasks
+from ringfence import algos, features, hazards, tasks, worlds
 from ringfence.data.audit import APART, disagreement
 from ringfence.data.origin import other_data, regenerated
 from ringfence.data.store import EpisodeStore
-from ringfence.dynamics import fit_dynamics
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.files import owned, whole
 from ringfence.progress import Progress
@@ -32,6 +31,8 @@ from ringfence.runs import Run, build_config, environment, write_json
 from ringfence.tasks import Task
 from ringfence.types import Algorithm, PyTree, Spec
 from ringfence.windows import WindowData, draw
+from ringfence.world import World
+from ringfence.world import save as save_world
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,7 @@ class Job:
     feature_map: Any
     hazard: hazards.BoundHazard
     widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
+    world: dict | None = None  # settings of the World that training reads, if it reads one
 
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
@@ -59,14 +61,22 @@ class Job:
             "hazard": hazards.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "widths": None if self.task.env is not None else list(self.widths),
+            "world": self.world,
             "seed": seed,
             "data": card,
         }
 
 
-def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, store: EpisodeStore | None = None) -> Job:
+def make_job(
+    algorithm: str,
+    task: Task,
+    preset: str | None,
+    changes: dict,
+    store: EpisodeStore | None = None,
+    world: dict | None = None,
+) -> Job:
     """Resolve names to values; every bad name or value is refused here, before work starts. Without a preset, that of
-    the task's data tier is taken where there is one."""
+    the task's data tier is taken where there is one. `world`: changes to the settings of the World."""
     a = algos.get(algorithm)
     preset = preset or a.preset_for(task.presets)
     if preset not in a.presets:
@@ -79,7 +89,12 @@ def make_job(algorithm: str, task: Task, preset: str | None, changes: dict, stor
     a.check(config, hazard)
     if store is not None and reads != "nothing" and not store.costs.any():
         _refuse_blank_costs(a.name, task, store, reads)
-    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store))
+    told = None
+    if a.needs is not None and store is not None:
+        told = dataclasses.asdict(worlds.settings_for(store, task, **{**a.needs(config), **(world or {})}))
+    elif world:
+        raise UserError(f"{a.name} reads no World in training; leave world= out.")
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), told)
 
 
 def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:
@@ -97,7 +112,7 @@ def _bound(task: Task, spec: Spec, reads: str, view: str, store: EpisodeStore | 
     try:
         return hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
     except UserError:
-        if reads != "labels":
+        if reads not in ("labels", "world"):
             return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
         if view != "pruned" and store is not None and _binds(task, "pruned", store):
             raise UserError(
@@ -122,7 +137,7 @@ def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: 
             f"{algorithm} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard "
             "with a formula; give EpisodeStore one of them, or train an algorithm that reads none."
         )
-    if reads == "labels":
+    if reads in ("labels", "world"):  # a World's barrier learns from the formula then
         return
     unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
     if unsafe > (APART if "mujoco" in task.presets else 0.0):
@@ -141,6 +156,7 @@ def train(
     seeds: tuple[int, ...] = (0,),
     out: str | Path = "runs",
     changes: dict | None = None,
+    world: dict | None = None,
     together: bool = False,
     chunk: int | None = None,
     checkpoint_every: int | None = None,
@@ -155,6 +171,7 @@ def train(
     A folder that exists is resumed from its last checkpoint if it holds the same job, and refused otherwise.
     `together` trains all seeds in one program (same results up to rounding; faster only where the networks are too
     small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default;
+    `world` changes settings of the World that training reads (world/fitting.py `Settings`), if it reads one.
     `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
@@ -169,21 +186,20 @@ def train(
             raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
     if tensorboard:
         _summary_writer()
-    job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data)
+    job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data, world)
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
-    # A finished run needs nothing fitted to its data again.
-    windows = windows_of(data, job.task, job.config, quiet) if left else None
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
+    lessons = _Lessons(job, data, quiet)
     if together and left:
-        _loop(job, windows, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
+        _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
     for run, seed in zip(runs, seeds):
         if run in left and not together:
-            program = _loop(job, windows, [run], [seed], options, program)
+            program = _loop(job, lessons, [run], [seed], options, program)
         if on_finish:
             on_finish(run)
     return runs
@@ -200,55 +216,31 @@ def _seeds(given: Iterable[int]) -> tuple[int, ...]:
     return tuple(int(s) for s in seeds)
 
 
-def windows_of(data: EpisodeStore, task: Task, config, quiet: bool = True) -> WindowData:
-    """Device data of a job, with the critic and the dynamics that its config asks for.
+@dataclass
+class _Lessons:
+    """What a seed learns from: the World, if training reads one, and windows. Those of the last seed are kept, which is
+    all seeds' where no World is read."""
 
-    The last ones are kept: tables train several algorithms on one store, and fitting takes longer than all the rest.
-    """
-    limit, condition = getattr(config, "cost_limit", None), getattr(config, "condition", None)
-    discount, updates = getattr(config, "discount", 1.0), getattr(config, "critic_updates", 0)
-    fitted, width = getattr(config, "dynamics_updates", 0), getattr(config, "dynamics_width", 0)
-    rows = (data, task, config.view, limit)
-    valued, acted = (*rows, discount, updates), (*rows, fitted, width)
-    seen = task.feature_map(config.view, data)
+    job: Job
+    store: EpisodeStore
+    quiet: bool
+    last: tuple[int, World | None, WindowData] | None = None
 
-    def fit() -> WindowData:
-        used = data if limit is None else data.select(within(data.episode_costs, limit))
-        known = _kept("critic", valued)
-        return WindowData(used, seen, discount, condition, config.horizon, updates, known, seen.critic_weight, quiet)
-
-    windows = _kept("windows", (*valued, acted, condition, config.horizon), fit)
-    if windows.critic is not None:
-        _kept("critic", valued, lambda: windows.critic)
-    if fitted:
-        x, actions, row = (windows.arrays[k] for k in ("features", "actions", "row"))
-        windows.dynamics = _kept(
-            "dynamics",
-            acted,
-            lambda: fit_dynamics(x, actions, row, jax.random.key(0), fitted, width, seen.joint, quiet),
-        )
-    return windows
+    def of(self, seed: int) -> tuple[World | None, WindowData]:
+        if self.last is None or (self.last[0] != seed and self.job.world is not None):
+            self.last = None  # there may be no room for two
+            world = None
+            if self.job.world is not None:
+                world = worlds.fit(self.store, seed=seed, quiet=self.quiet, **self.job.world)
+            self.last = (seed, world, windows_of(self.job, self.store, world))
+        return self.last[1:]
 
 
-_last: dict[str, tuple[tuple, Any]] = {}  # what was fitted last: what it is -> (about what, itself)
-
-
-def _kept(what: str, about: tuple, make: Callable[[], Any] | None = None) -> Any:
-    """The last of its kind if it is about the same; else a new one that `make` makes, or None."""
-    known, made = _last.get(what, (None, None))
-    if known == about:
-        return made
-    if make is None:
-        return None
-    _last.pop(what, None)  # there may be no room for two
-    _last[what] = about, make()
-    return _last[what][1]
-
-
-def within(costs: np.ndarray, limit: float, least: float = 0.01) -> np.ndarray:
-    """(E,) bool: the episodes whose cost is within the limit; if they are too few to learn from, the `least` share of
-    all with the lowest cost."""
-    return costs <= max(limit, np.quantile(costs, least, method="higher"))
+def windows_of(job: Job, store: EpisodeStore, world: World | None = None) -> WindowData:
+    """What a job draws its batches from."""
+    if job.algorithm.prepare is None:
+        return WindowData(store, job.feature_map)
+    return job.algorithm.prepare(store, job.config, job.feature_map, world)
 
 
 @dataclass(frozen=True)
@@ -263,68 +255,73 @@ class _Options:
 def make_program(job: Job):
     """(advance, diagnose): compiled functions over a leading axis of seeds.
 
-    advance(state, keys, arrays, count) makes `count` updates, a traced number, so that one compilation serves every
+    advance(state, keys, arrays, scores, count) makes `count` updates, a traced number, so that one compilation serves every
     chunk length; it returns the new state and the chunk's mean metrics.
     """
     config = job.config
     update = job.algorithm.make_update(config, job.spec, job.feature_map, job.hazard)
     look = job.algorithm.make_diagnose(config, job.spec, job.feature_map, job.hazard)
 
-    def one(state: PyTree, root, arrays):
+    def one(state: PyTree, root, arrays, scores):
+        arrays = arrays | {"scores": scores}
         key = jax.random.fold_in(root, state["step"])
         kd, ku = jax.random.split(key)
         return update(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
 
-    def advance(state, roots, arrays, count):
+    def advance(state, roots, arrays, scores, count):
         # No vmap of one seed: its matrix products would be batched ones, which are slower; and no axis of one within
         # the loop, for which the compiler would copy the whole state at every update.
         alone = roots.shape[0] == 1
-        several, known = (one, roots[0]) if alone else (jax.vmap(one, in_axes=(0, 0, None)), roots)
+        several, known = (one, roots[0]) if alone else (jax.vmap(one, in_axes=(0, 0, None, 0)), roots)
+        scores = scores[0] if alone else scores
         state = jax.tree.map(lambda x: x[0], state) if alone else state
-        shapes = jax.eval_shape(several, state, known, arrays)[1]
+        shapes = jax.eval_shape(several, state, known, arrays, scores)[1]
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, jnp.float32), shapes)
 
         def body(_, carry):
             state, total = carry
-            state, metrics = several(state, known, arrays)
+            state, metrics = several(state, known, arrays, scores)
             return state, jax.tree.map(jnp.add, total, metrics)
 
         state, total = jax.lax.fori_loop(0, count, body, (state, zeros))
         means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), total)
         return jax.tree.map(lambda x: x[None], (state, means)) if alone else (state, means)
 
-    def diagnose(state, roots, arrays):
-        def of(state, root):
+    def diagnose(state, roots, arrays, scores):
+        def of(state, root, scores):
             kd, ku = jax.random.split(jax.random.fold_in(root, state["step"]))
-            return look(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
+            return look(state, draw(arrays | {"scores": scores}, kd, config.batch, config.horizon, config.history), ku)
 
-        return jax.vmap(of)(state, roots)
+        return jax.vmap(of)(state, roots, scores)
 
     return jax.jit(advance, donate_argnums=0), jax.jit(diagnose)
 
 
-def _loop(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program=None):
+def _loop(job: Job, lessons: _Lessons, runs: list[Run], seeds, options: _Options, program=None):
     """Train runs that nobody else trains at this time, in one program."""
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(owned(run.path, f"Another process trains '{run.path}'; wait for it or stop it."))
-        return _advance(job, windows, runs, seeds, options, program)
+        return _advance(job, lessons, runs, seeds, options, program)
 
 
-def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Options, program):
+def _advance(job: Job, lessons: _Lessons, runs: list[Run], seeds, options: _Options, program):
     program = program or make_program(job)
     advance, diagnose = program
     roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-    fresh = [
-        job.algorithm.init(jax.random.fold_in(r, 2**31 - 1), job.spec, job.config, windows, job.feature_map, job.hazard)
-        for r in roots
-    ]
-    starts, states = [], []
-    for run, state in zip(runs, fresh):
+    starts, states, conditions = [], [], []
+    for run, seed, root in zip(runs, seeds, roots):
+        world, windows = lessons.of(seed)
+        told = {} if world is None else {"world": world}
+        key = jax.random.fold_in(root, 2**31 - 1)
+        state = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **told)
+        if world is not None and not (run.path / worlds.WORLD).exists():
+            save_world(world, run.path / worlds.WORLD)
         if run.checkpoints():
-            step, state = run.load_checkpoint(state)
+            state = state | run.load_checkpoint(learned(state))[1]
         starts.append(int(state["step"]))
         states.append(state)
+        conditions.append(windows.arrays["scores"])
     if len(set(starts)) > 1:
         raise CheckpointError(
             f"The runs stand at different steps ({sorted(set(starts))}), so they cannot go on in one program; "
@@ -332,6 +329,9 @@ def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Op
         )
     step, steps = starts[0], job.config.steps
     state = jax.tree.map(lambda *x: jnp.stack(x), *states)
+    # Conditions differ between seeds, whose Worlds do; all else of the data is theirs together.
+    arrays = {k: v for k, v in windows.arrays.items() if k != "scores"}
+    conditions = jnp.stack(conditions)
     for run in runs:
         _trim_metrics(run, step)
     writers = [_summary_writer()(str(run.path / "tensorboard")) for run in runs] if options.tensorboard else []
@@ -344,9 +344,9 @@ def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Op
             while step < steps:
                 count = min(options.chunk - step % options.chunk, steps - step)
                 begun = time.perf_counter()
-                state, metrics = advance(state, roots, windows.arrays, count)
+                state, metrics = advance(state, roots, arrays, conditions, count)
                 step += count
-                metrics = {**metrics, **diagnose(state, roots, windows.arrays)}
+                metrics = {**metrics, **diagnose(state, roots, arrays, conditions)}
                 metrics = {k: np.asarray(v) for k, v in metrics.items()}
                 seconds = time.perf_counter() - begun
                 for i, run in enumerate(runs):
@@ -378,13 +378,18 @@ def _advance(job: Job, windows: WindowData, runs: list[Run], seeds, options: _Op
     return program
 
 
+def learned(state: PyTree) -> PyTree:
+    """What a checkpoint holds: all but what is read of the World, which stands beside it."""
+    return {k: v for k, v in state.items() if k != "world"}
+
+
 def _deleted(state: PyTree) -> bool:
     """An interruption inside a compiled call leaves donated buffers behind; there is nothing to save then."""
     return any(x.is_deleted() for x in jax.tree.leaves(state))
 
 
 def _save(runs: list[Run], step: int, state: PyTree) -> None:
-    host = jax.device_get(state)
+    host = jax.device_get(learned(state))
     for i, run in enumerate(runs):
         run.save_checkpoint(step, jax.tree.map(operator.itemgetter(i), host))
 
@@ -399,7 +404,7 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     card = data.card if regenerated(data.card) else data.card | {"content": data.content}
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
-        there = {"revision": 1, "widths": mine["widths"]} | run.config  # older runs tell neither
+        there = {"revision": 1, "widths": mine["widths"], "world": None} | run.config  # older runs tell none of these
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

@@ -85,11 +85,16 @@ class PolicyStep(NamedTuple):
     """A joint action and what led to it."""
 
     action: Array  # (B, N, A)
-    info: dict[str, Array]  # e.g. `clearance` (B,), `plans` (B, P, H, N, D), `chosen` (B,)
+    info: dict[str, Array]  # e.g. `clearance`, `infeasible` (B,), `plans` (B, P, H, N, D), `chosen` (B,)
 
 
 class Policy(Protocol):
-    """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history)."""
+    """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
+
+    A policy may have `hear(memory, cost) -> memory`: it is then told the cost (B,) of every step. One that knows several
+    steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions (B, P, K, N, A) in
+    [−1, 1], info), which guards choose from.
+    """
 
     def start(self, batch: int) -> PyTree: ...
 
@@ -103,13 +108,21 @@ class Algorithm:
     name: str
     Config: type  # frozen dataclass; the command line is generated from it
     check: Callable[..., None]  # (config, hazard): refuses settings that cannot work
-    init: Callable[..., PyTree]  # (key, spec, config, data, feature_map, hazard) -> state, a pytree
+    # (key, spec, config, data, feature_map, hazard, and the world where one is needed) -> state, a pytree; what stands
+    # in state["world"] is kept in the run's World, not in its checkpoints
+    init: Callable[..., PyTree]
     make_update: Callable[..., Callable]  # (config, spec, feature_map, hazard) -> update(state, batch, key)
     make_diagnose: Callable[..., Callable]  # same -> diagnose(state, batch, key) -> metrics, once per chunk
     make_policy: Callable[..., Policy]  # (state, config, spec, feature_map, hazard, options) -> Policy
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
-    # config -> what training knows danger by: the hazard's labels of states, the logged costs alone, or nothing
-    reads: Callable[[Any], Literal["labels", "costs", "nothing"]] = lambda config: "labels"
+    # config -> what training knows danger by: the hazard's labels of states, the World's barrier, the logged costs
+    # alone, or nothing
+    reads: Callable[[Any], Literal["labels", "world", "costs", "nothing"]] = lambda config: "labels"
+    prepare: Callable[..., Any] | None = (
+        None  # (store, config, feature_map, world) -> WindowData, if not all of the store
+    )
+    needs: Callable[[Any], dict[str, Any]] | None = None  # config -> settings of the World that training reads, if any
+    of_world: Callable[[Any, Any], dict[str, PyTree]] | None = None  # (world, config) -> state["world"]
     revision: int = 1  # raised when the same settings come to train another policy; config.json tells it
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:

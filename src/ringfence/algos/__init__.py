@@ -5,12 +5,13 @@ from __future__ import annotations
 from ringfence.algos.bc import BC, BC_SAFE
 from ringfence.algos.fisor import FISOR
 from ringfence.algos.icbf import ICBF, MADIFF
+from ringfence.algos.mpc import MPC
 from ringfence.algos.omar import MA_CQL, OMAR
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
 from ringfence.errors import unknown
 from ringfence.types import Algorithm
 
-ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, BC, BC_SAFE, MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)}
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, BC, BC_SAFE, MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)}
 
 
 def get(name: str) -> Algorithm:

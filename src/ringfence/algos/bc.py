@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import jax
+import numpy as np
 
 from ringfence import features
 from ringfence.algos import actor_critic as ac
+from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
@@ -66,6 +68,14 @@ def reads(config: Config) -> Literal["costs", "nothing"]:
     return "nothing" if config.cost_limit is None else "costs"
 
 
+def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: None) -> WindowData:
+    """All episodes, or those within the limit; if they are too few to learn from, the cheapest hundredth."""
+    if config.cost_limit is not None:
+        costs = store.episode_costs
+        store = store.select(costs <= max(config.cost_limit, np.quantile(costs, 0.01, method="higher")))
+    return WindowData(store, feature_map)
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     opt = _optimiser(config)
 
@@ -101,6 +111,7 @@ BC = Algorithm(
     make_policy,
     {"default": {}, "mujoco": {"steps": 8_000}},
     reads=reads,
+    prepare=prepare,
 )
 BC_SAFE = replace(
     BC,

@@ -2,11 +2,11 @@
 
 Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 6)
-    L^C  barrier hinges, as printed (`paper`) or routed (`split`)                             (paper, eq. 8)
+    L^C  the generator follows the World's barrier (`split`), or both learn as printed (`paper`, algos/joint.py; eq. 8)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
-the barrier is learned and diagnosed, but the planner is MADIFF's to the bit.
+the planner is MADIFF's to the bit.
 """
 
 from __future__ import annotations
@@ -19,16 +19,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import barrier as cbf
-from ringfence import diffusion, dynamics, features, normalise, values
+from ringfence import diffusion, features, normalise, scores
+from ringfence.algos.joint import joint_losses
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
-from ringfence.nets.heads import barrier_on, infer_action
+from ringfence.nets.heads import infer_action
 from ringfence.optim import Optimiser, average, fresh
 from ringfence.policies import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData, at
+from ringfence.world import World
+from ringfence.world.barrier import Barrier
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,7 @@ class Config:
     history: int = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    condition: values.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
+    condition: scores.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
     discount: float = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
@@ -57,13 +60,12 @@ class Config:
     condition_dropout: float = 0.25  # p, share of plans that do not see the return
 
     # --- barrier ---
-    barrier: bool = True  # build h at all
+    barrier: bool = True  # L^C at all
     barrier_weight: float = 3.0  # λ of the generator's share of L^C
     barrier_start: float = 0.3  # share of training at which λ starts to rise from 0
     barrier_full: float = 0.5  # share of training at which λ is reached
     routing: Literal["split", "paper"] = "split"  # who gets which gradient
-    scope: Literal["individual", "shared"] = "individual"  # one h per agent, or one for all
-    delta: float = 0.1  # δ, margin of the hinges
+    delta: float = 1.0  # δ, margin of the hinges; of the World's barrier in calibrated margins
     retention: float = 0.9  # m, largest share of h that must be kept from step to step
     relaxation: cbf.Relaxation = "signal"  # how retention is relaxed at noisy levels
     two_sided: bool = True  # relax the unsafe side towards "do not get worse"
@@ -71,15 +73,11 @@ class Config:
     weigh_by_signal: bool = True  # weight ᾱ_k on the generator's hinges
     gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
     gradient_batch: int = 32  # windows per update for ddim:n and chain:n
-    barrier_width: int = 128  # units of each of h's 3 hidden layers
-    barrier_batch: int = 64  # windows per update that barriers work on, data and generated, each
-    bank: int = 4096  # unsafe states kept for h
-    bank_batch: int = 128  # of them per update
+    barrier_batch: int = 64  # windows per update that L^C works on
+    scope: Literal["individual", "shared"] = "individual"  # joint training: one h per agent, or one for all
+    barrier_width: int = 128  # joint training: units of each of h's 3 hidden layers
 
-    # --- other networks ---
-    critic_updates: int = 8000  # of the critic, fitted once per data set before training
-    dynamics_updates: int = 40_000  # of forward dynamics, fitted likewise
-    dynamics_width: int = 128  # units of each of its 2 hidden layers
+    # --- inverse dynamics ---
     inverse_width: int = 128  # units of each of 2 hidden layers
     inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
@@ -115,8 +113,6 @@ _MUJOCO = {
     "condition": "return",
     "barrier_weight": 0.3,
     "barrier_batch": 32,
-    "bank_batch": 64,
-    "dynamics_width": 256,
 }
 PRESETS: dict[str, dict] = {
     "split": {},
@@ -158,9 +154,10 @@ def init(
     data: WindowData | None,
     feature_map: features.FeatureMap,
     hazard: BoundHazard,
+    world: World,
 ) -> PyTree:
-    """Parameters, their averages, optimiser state and the frozen statistics of the data; without data, zeros stand
-    for the statistics, which is all that a checkpoint's template needs."""
+    """Parameters, their averages, optimiser state, the normaliser, and what is read of the World, which no checkpoint
+    holds; without data, zeros stand for statistics, which is all that a checkpoint's template needs."""
     kd, kb, ki, _, ks = jax.random.split(key, 5)  # the fourth was forward dynamics': others start as they always did
     n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
@@ -172,41 +169,22 @@ def init(
             ),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True),
         }
-        if config.barrier:
+        if config.barrier and config.routing == "paper":
             groups = n if config.scope == "individual" else 1
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
         return fresh(optimiser(config), params, "ema")
 
     if data is None:
-        frozen = blank_statistics(spec, config, feature_map.joint)
+        one, moved = jnp.zeros(d), jnp.zeros((config.horizon - 1, d))
+        norm = normalise.Normaliser(one, one, moved, moved, config.history, config.coordinates)
     else:
-        frozen = statistics(ks, config, data, hazard)
-    return jax.jit(networks)() | {"frozen": frozen}
+        norm = fit_normaliser(config, data, jax.random.split(ks)[0])
+    return jax.jit(networks)() | {"frozen": {"normaliser": norm}, "world": of_world(world, config)}
 
 
-def statistics(key: Key, config: Config, data: WindowData, hazard: BoundHazard) -> PyTree:
-    """What is learned of the data once: the normaliser, critic, forward dynamics, the bank of unsafe states."""
-    kw, ku = jax.random.split(key)
-    frozen = {"normaliser": fit_normaliser(config, data, kw), "critic": data.critic, "dynamics": data.dynamics}
-    if config.barrier:
-        some = jax.random.randint(kw, (min(100_000, 4 * data.steps),), 0, data.arrays["features"].shape[0])
-        rows = data.arrays["features"][some], data.arrays["costs"][some]
-        frozen["bank"], frozen["bank_own"] = cbf.unsafe_bank(*rows, hazard, config.bank, ku)
-    return frozen
-
-
-def blank_statistics(spec: Spec, config: Config, joint: bool) -> PyTree:
-    """Zeros in the shapes of `statistics`."""
-    d, n, h = spec.feature_dim, spec.n_agents, config.horizon
-    one = jnp.zeros(d)
-    norm = normalise.Normaliser(
-        one, one, jnp.zeros((h - 1, d)), jnp.zeros((h - 1, d)), config.history, config.coordinates
-    )
-    acts = dynamics.blank_dynamics(n, d, spec.action_dim, config.dynamics_width, joint)
-    frozen = {"normaliser": norm, "critic": values.blank_critic(d), "dynamics": acts}
-    if config.barrier:
-        frozen |= {"bank": jnp.zeros((config.bank, n, d)), "bank_own": jnp.zeros((config.bank, n), bool)}
-    return frozen
+def of_world(world: World, config: Config) -> dict[str, PyTree]:
+    """What states are worth and, where the generator follows it, the barrier."""
+    return {"critic": world.values.critic} | ({"barrier": world.barrier} if follows(config) else {})
 
 
 def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 8192) -> normalise.Normaliser:
@@ -217,6 +195,11 @@ def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 81
 
 def optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+
+
+def follows(config: Config) -> bool:
+    """Whether the generator follows the World's barrier."""
+    return config.barrier and config.routing == "split"
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -239,16 +222,28 @@ def check(config: Config, hazard: BoundHazard) -> None:
             raise UserError(
                 f"{low}={getattr(config, low)} is above {high}={getattr(config, high)}; lower it or raise {high}."
             )
-    if config.routing == "split" and not config.scaled_margin and config.delta / (1 - config.retention) > 2.0:
-        raise UserError(
-            f"delta={config.delta} with retention={config.retention} asks a parked agent for h >= "
-            f"{config.delta / (1 - config.retention):.3g}; lower one of them or set scaled_margin=True."
-        )
 
 
-def reads(config: Config) -> Literal["labels", "nothing"]:
-    """A barrier learns from labelled states; without one, danger matters at run time only."""
-    return "labels" if config.barrier else "nothing"
+def reads(config: Config) -> Literal["labels", "world", "nothing"]:
+    """Joint training labels generated states; `split` follows the World's barrier; without one, danger matters at run
+    time only."""
+    if not config.barrier:
+        return "nothing"
+    return "labels" if config.routing == "paper" else "world"
+
+
+def prepare(store, config: Config, feature_map: features.FeatureMap, world: World) -> WindowData:
+    """Windows with the condition that plans are drawn for."""
+    seen = feature_map(store.observations, store.state) if config.condition == "advantage" else None
+    if seen is not None:
+        seen = jnp.asarray(seen, jnp.float32)
+    found = scores.scores_of(store, config.condition, config.horizon, config.discount, world.values, seen)
+    return WindowData(store, feature_map, found)
+
+
+def needs(config: Config) -> dict:
+    """The World that training reads: in the planner's own view, with its discount."""
+    return {"view": config.view, "discount": config.discount}
 
 
 def gradient_depth(text: str) -> tuple[str, int]:
@@ -381,64 +376,16 @@ def generated(
     return Generated(norm.invert(x), valid, etas[top - n] * one, weight)
 
 
-def barrier_losses(
-    net: MLP,
-    average: MLP,
-    frozen: PyTree,
-    batch: Batch,
-    made: Generated,
-    key: Key,
-    config: Config,
-    hazard: BoundHazard,
-) -> tuple[Array, Array, Metrics]:
-    """(L_ω, L_θ, metrics): what h learns from, and what the generator learns from h.
-
-    split: h learns from labels on data, on stop-gradient generated states and on the unsafe bank; the generator
-    follows h̄, an average of h. paper: one loss, the printed hinges on generated states, gradients to both.
-    """
-    norm, ret = frozen["normaliser"], retention(config)
-    now, eta, weight = config.history, made.eta, made.weight
-    x, valid = made.features[:, now:], made.valid[:, now:]
-    argued = (ret, 0.0, config.delta, config.scaled_margin)
-    unsafe_made = safe_made = None
-    if hazard.has_formula:
-        unsafe_made, safe_made = hazard.labels(jax.lax.stop_gradient(x))
-    rows = valid[..., None]
-    if config.routing == "paper":
-        made_h = barrier_on(net, norm, x)
-        on_made = cbf.hinges(made_h, unsafe_made, safe_made, rows, ret, eta, config.delta, config.scaled_margin, weight)
-        loss_theta = on_made.safe + on_made.unsafe + on_made.retention
-        loss_omega = jnp.zeros(())
-    else:
-        slow = jax.lax.stop_gradient(average)
-        loss_theta = cbf.shaping(barrier_on(slow, norm, x), rows, ret, eta, config.delta, config.scaled_margin, weight)
-    m = config.barrier_batch
-    data_x, data_rows = batch.features[:m, now:], batch.valid[:m, now:, None]
-    unsafe, safe = hazard.labels(data_x, batch.costs[:m, now:])
-    data_h = barrier_on(net if config.routing == "split" else jax.lax.stop_gradient(net), norm, data_x)
-    on_data = cbf.hinges(data_h, unsafe, safe, data_rows, *argued)
-    metrics = {f"barrier/data_{k}": v for k, v in on_data.metrics.items()}
-    if config.routing == "split":
-        pick = jax.random.randint(key, (config.bank_batch,), 0, config.bank)
-        bank, own = frozen["bank"][pick], frozen["bank_own"][pick]
-        bank_h = barrier_on(net, norm, bank)
-        bank_loss = (jax.nn.relu(config.delta + bank_h) * own).sum() / jnp.maximum(own.sum(), 1)
-        loss_omega = on_data.safe + on_data.unsafe + on_data.retention + bank_loss
-        if unsafe_made is not None:
-            made_h = barrier_on(net, norm, jax.lax.stop_gradient(x))
-            # Unlabelled noise levels teach nothing: only estimates from mostly-signal plans count, by their weight.
-            on_made = cbf.hinges(
-                made_h,
-                unsafe_made,
-                safe_made,
-                rows,
-                *argued,
-                weight=jax.lax.stop_gradient(weight),
-            )
-            loss_omega = loss_omega + 0.5 * (on_made.safe + on_made.unsafe + on_made.retention)
-    if unsafe_made is not None:
-        metrics |= {f"barrier/made_{k}": v for k, v in on_made.metrics.items()}
-    return loss_omega, loss_theta, metrics | {"loss/barrier": loss_omega, "loss/shaping": loss_theta}
+def followed(barrier: Barrier, made: Generated, config: Config) -> tuple[Array, Metrics]:
+    """(L_θ, metrics): the generator raises the World's barrier, in calibrated margins, along the plan; the barrier is
+    fixed and hears of nothing."""
+    x = made.features[:, config.history :]
+    before = jnp.concatenate([x[:, :1], x[:, :-1]], 1)
+    h = barrier.of_steps(before, x) / barrier.unit
+    rows = made.valid[:, config.history :, None]
+    loss = cbf.shaping(h, rows, retention(config), made.eta, config.delta, config.scaled_margin, made.weight)
+    kept = cbf.mean_over((h[:, 1:] >= 0).astype(jnp.float32), rows[:, 1:])
+    return loss, {"barrier/made_safe": kept, "loss/shaping": loss}
 
 
 def barrier_share(config: Config, step: Array) -> Array:
@@ -450,11 +397,11 @@ def barrier_share(config: Config, step: Array) -> Array:
 
 
 def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
-    """loss(params, ema, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
+    """loss(params, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
     alpha_bar, carried = schedule(config), carried_entries(config, feature_map)
 
-    def loss(params, ema, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
-        kd, kp, kc, kg = jax.random.split(key, 4)
+    def loss(params, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
+        kd, kp, _, kg = jax.random.split(key, 4)
         norm = frozen["normaliser"]
         denoise, (clean, noised, mask) = denoising(
             params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried
@@ -469,14 +416,13 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
                 made = made._replace(features=feature_map.agreed(made.features, config.history))
             if config.barrier_weight == 0:  # h is learned, θ must not hear of it
                 made = jax.lax.stop_gradient(made)
-            omega, theta, more = barrier_losses(
-                params["barrier"], ema["barrier"], frozen, batch, made, kc, config, hazard
-            )
             share = barrier_share(config, step)
-            if config.routing == "paper" and config.barrier_weight == 0:
-                total = total + theta
+            if config.routing == "paper":
+                theta, more = joint_losses(params["barrier"], norm, batch, made, retention(config), config, hazard)
+                total = total + (theta if config.barrier_weight == 0 else parts[1] * share * theta)
             else:
-                total = total + omega + parts[1] * share * theta
+                theta, more = followed(frozen["barrier"], made, config)
+                total = total + parts[1] * share * theta
             metrics |= more | {"barrier/weight": share}
         return total, metrics
 
@@ -489,7 +435,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         (_, metrics), grads = jax.value_and_grad(loss, has_aux=True)(
-            state["params"], state["ema"], state["frozen"], batch, state["step"], key
+            state["params"], state["frozen"] | state["world"], batch, state["step"], key
         )
         params, moments, norms = opt.update(grads, state["opt"], state["params"])
         ema = average(state["ema"], params, config.ema, state["step"])
@@ -513,8 +459,7 @@ def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, 
             def of(denoiser):
                 return loss(
                     {**fixed, "denoiser": denoiser},
-                    state["ema"],
-                    state["frozen"],
+                    state["frozen"] | state["world"],
                     batch,
                     state["step"],
                     key,
@@ -539,8 +484,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     return Planner(
         networks=state["ema"],
         normaliser=state["frozen"]["normaliser"],
-        critic=state["frozen"]["critic"],
-        dynamics=state["frozen"]["dynamics"],
+        critic=state["world"]["critic"],
         alpha_bar=tuple(schedule(config).tolist()),
         horizon=config.horizon,
         history=config.history,
@@ -551,16 +495,28 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
         carries_own=carries_own(config, feature_map),
         spec=spec,
         feature_map=feature_map,
-        hazard=hazard,
         options=options,
     )
 
 
 # 1: the scale of the critic that ranks plans missed some agents' views of states, or some moments. 2: forward dynamics
-# was trained with the planner, on fewer rows.
-REVISION = 3
+# was trained with the planner, on fewer rows. 3: critic and forward dynamics were fitted with one seed for all, `split`
+# trained a barrier of its own.
+REVISION = 4
 ICBF = Algorithm(
-    "icbf", Config, check, init, make_update, make_diagnose, make_policy, PRESETS, reads=reads, revision=REVISION
+    "icbf",
+    Config,
+    check,
+    init,
+    make_update,
+    make_diagnose,
+    make_policy,
+    PRESETS,
+    reads=reads,
+    prepare=prepare,
+    needs=needs,
+    of_world=of_world,
+    revision=REVISION,
 )
 MADIFF = Algorithm(
     "madiff",
@@ -576,5 +532,8 @@ MADIFF = Algorithm(
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
     reads=reads,
+    prepare=prepare,
+    needs=needs,
+    of_world=of_world,
     revision=REVISION,
 )

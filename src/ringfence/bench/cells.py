@@ -27,6 +27,7 @@ from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import RunConflict, UserError, unknown
 from ringfence.files import whole
+from ringfence.guards import GUARDS, GuardOptions, margin_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run, build_config, read_json, write_json
 
@@ -90,7 +91,7 @@ class Cell:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
             same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
-            return same and (not r["options"] or same_options(r["options"], EVALUATIONS[name]))
+            return same and same_options(r, EVALUATIONS[name])
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -106,11 +107,17 @@ class Cell:
 
 
 def same_options(stored: dict, evaluation: dict) -> bool:
-    """Whether a result was played with the planner options that an evaluation's name stands for today."""
-    told = {k: v for k, v in evaluation.items() if k != "planner"}
-    wanted = PlanOptions(**{**PLANNERS[evaluation.get("planner", "plain")], **told})
-    plain = dataclasses.asdict(PlanOptions())  # an option that is newer than the result had its default then
-    return {**plain, **stored} == dataclasses.asdict(wanted)
+    """Whether a result was played with the options of planner and guard that an evaluation's name stands for today."""
+    how = evaluate.asked(**evaluation)
+    plan = dataclasses.asdict(PlanOptions(**{**PLANNERS[how.planner], **how.plan}))
+    if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
+        return False
+    guard = stored.get("guard_options") or {}
+    if not how.guarded:
+        return not guard
+    wanted = dataclasses.asdict(GuardOptions(**{**GUARDS[how.guard], **margin_of(how.danger), **how.given}))
+    told = {**dataclasses.asdict(GuardOptions()), **guard}  # an option newer than the result had its default then
+    return bool(guard) and told == wanted
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,17 @@ from ringfence.tasks import TASKS, Task
 # Named sets of evaluation-time choices; keyword arguments of evaluate.evaluate.
 EVALUATIONS: dict[str, dict] = {
     "plain": {},
-    "plans8": {"plans": 8},
-    "guarded": {"planner": "guarded"},
     "steady": {"planner": "steady"},
-    "shielded": {"planner": "shielded"},
-    "adaptive": {"planner": "adaptive"},
+    **{
+        f"{guard}-{danger}": {"guard": guard, "danger": danger}
+        for guard in ("shield", "adapt", "full")
+        for danger in ("learned", "formula")
+    },
+    **{
+        f"steady+adapt-{danger}": {"planner": "steady", "guard": "adapt", "danger": danger}
+        for danger in ("learned", "formula")
+    },
+    **{f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"} for guard in ("adapt", "full")},
 }
 
 
@@ -68,10 +74,10 @@ SUITES = {
             Entry("fisor"),
             Entry("omar"),
             Entry("ma-cql"),
-            Entry("madiff", "default", ("plain", "guarded")),
+            Entry("madiff", "default"),
             Entry("icbf", "paper"),
-            Entry("icbf", "split", ("plain", "plans8", "guarded")),
-            Entry("icbf", "long", ("plain", "guarded"), ("expert", "medium")),
+            Entry("icbf", "split"),
+            Entry("icbf", "long", tiers=("expert", "medium")),
         ),
     ),
     "mujoco": Suite(
@@ -85,9 +91,29 @@ SUITES = {
             Entry("fisor"),
             Entry("omar"),
             Entry("ma-cql"),
-            Entry("madiff", evaluations=("plain", "steady", "shielded", "adaptive")),
+            Entry("madiff", evaluations=("plain", "steady")),
             Entry("icbf", "mujoco-paper"),
-            Entry("icbf", evaluations=("plain", "steady", "shielded", "adaptive")),
+            Entry("icbf", evaluations=("plain", "steady")),
+        ),
+        episodes=20,
+    ),
+    # Proposal x guard x danger's source, under Worlds that are fitted for every seed.
+    "guards": Suite(
+        tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random")),
+        (
+            Entry(
+                "bc",
+                evaluations=("plain", "shield-learned", "shield-formula", "full-learned", "full-formula", "full-learned-own"),
+            ),
+            Entry("mpc", evaluations=("full-learned", "full-formula", "full-learned-own")),
+            Entry("icbf", "split", ("plain", "shield-learned", "full-learned", "full-formula")),
+        ),
+    ),
+    "guards-mujoco": Suite(
+        tuple(name for name, t in TASKS.items() if t.protocol),
+        (
+            Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "adapt-learned-own")),
+            Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
         ),
         episodes=20,
     ),

@@ -16,9 +16,9 @@ from ringfence.files import whole
 from ringfence.runs import Run, read_json
 
 COLUMNS = (
-    "task, algorithm, variant, seed, episodes, return_mean, return_std, return_norm, cost_mean, cost_norm, "
+    "task, algorithm, variant, guard, danger, sight, seed, episodes, return_mean, return_std, return_norm, cost_mean, cost_norm, "
     "avoidable_cost, violation_rate, violation_upper, unsafe_starts, cost_cvar10, cost_rate, steps_mean, "
-    "termination_rate, train_seconds, eval_seconds, "
+    "termination_rate, infeasible, strange, train_seconds, eval_seconds, "
     "plan_ms_p50, plan_ms_p99, parameters, run"
 ).split(", ")
 
@@ -30,7 +30,16 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
     found, constants, seen = [], {}, {}
     for file in sorted((out / "reference").glob("*/reference.json")):
         for name, r in read_json(file, "is damaged; delete it").items():
-            found.append({**r, "algorithm": name, "variant": "reference", "seed": 0, "run": str(file.relative_to(out))})
+            found.append(
+                {
+                    **guard_of({}),
+                    **r,
+                    "algorithm": name,
+                    "variant": "reference",
+                    "seed": 0,
+                    "run": str(file.relative_to(out)),
+                }
+            )
     for file in sorted((out / "cells").glob("*/*/[!.]*/results.json")):
         run = Run(file.parent)
         for r in run.results.values():
@@ -56,10 +65,22 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
                     f"'{file.parent}' and '{other}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, with other "
                     "settings; delete the one that is not meant."
                 )
-            found.append({**r, "run": str(file.parent.relative_to(out))})
+            found.append({**guard_of(r), **r, "run": str(file.parent.relative_to(out))})
     if not may_be_empty and not any(r["variant"] != "reference" for r in found):
         raise UserError(f"'{out}' holds no finished cell yet; run `ringfence bench`.")
     return found
+
+
+# What planners that checked their own actions by the formula did, before guards were apart from them.
+_OLD = {"guarded": "shield", "shielded": "shield", "adaptive": "adapt"}
+
+
+def guard_of(result: dict) -> dict[str, str]:
+    """Guard, danger and sight of a result that is older than guards."""
+    options, guard = result.get("options") or {}, _OLD.get(result.get("planner", ""), "none")
+    if guard == "none" and options.get("plans", 1) > 1:
+        guard = "select"
+    return {"guard": guard, "danger": "none" if guard == "none" else "formula", "sight": "all"}
 
 
 def write_csv(out: str | Path) -> Path:

@@ -24,7 +24,7 @@ def audit(store: EpisodeStore) -> Audit:
     """Sizes, returns, cost, share of episodes that start unsafe, and warnings in plain words."""
     s, card = store, store.card
     returns, costs, lengths = s.returns, s.episode_costs, s.lengths
-    rate = float((s.costs > 0).mean())
+    rate = float((s.team_costs > 0).mean())
     facts = {
         "task": str(card["task"]),
         "provenance": str(card["provenance"]),
@@ -113,4 +113,4 @@ def disagreement(store: EpisodeStore, task: tasks.Task) -> float | None:
     steps = np.unique(np.linspace(0, store.steps - 1, 100_000).astype(int))
     episode = np.searchsorted(store.episode_ends, steps, side="right")
     labels = _labels(store, task, steps + episode + 1)
-    return None if labels is None else float((labels != (store.costs[steps] > 0)).mean())
+    return None if labels is None else float((labels != (store.team_costs[steps] > 0)).mean())

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from dataclasses import replace
 from importlib import metadata
@@ -14,18 +13,13 @@ import numpy as np
 
 from ringfence import __version__, hazards
 from ringfence.data import behaviour, robots
+from ringfence.data.cache import cache_dir
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import StoreError, UserError
 from ringfence.tasks import Task, siblings
 
 COLLECTION = 271_828  # root of the collection keys, far from those of evaluation
-
-
-def cache_dir() -> Path:
-    """Where regenerated data is kept: $RINGFENCE_HOME, else the user's cache folder."""
-    home = os.environ.get("RINGFENCE_HOME")
-    return Path(home) if home else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ringfence"
 
 
 def make(

@@ -4,7 +4,7 @@ Time runs along the first axis, episodes one after another. T is the number of s
 
     observations (T+E, N, O)   one more row than steps in every episode: the last state is kept
     state        (T+E, S)      global state, when known
-    actions      (T, N, A)     rewards (T, N)     costs (T,)
+    actions      (T, N, A)     rewards (T, N)     costs (T,) of the team, or (T, N) of each agent
     speed        (T,)          m/s, of robots whose simulator told it: what another speed limit would count
     terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
     episode_ends (E,)          cumulative number of steps
@@ -87,8 +87,13 @@ class EpisodeStore:
 
     @property
     def episode_costs(self) -> np.ndarray:
-        """(E,) undiscounted episode cost."""
-        return self._per_episode(self.costs)
+        """(E,) undiscounted episode cost of the team."""
+        return self._per_episode(self.team_costs)
+
+    @property
+    def team_costs(self) -> np.ndarray:
+        """(T,) cost of every step: of agents with costs of their own, the largest one."""
+        return self.costs if self.costs.ndim == 1 else self.costs.max(1)
 
     def _per_episode(self, x: np.ndarray) -> np.ndarray:
         return np.add.reduceat(x.astype(np.float64), np.concatenate([[0], self.episode_ends[:-1]]))
@@ -133,7 +138,7 @@ class EpisodeStore:
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
-        costs (E, L) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (none, if
+        costs (E, L), (E, L, N) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (none, if
         it is not given)."""
         observations, actions = _numbers("observations", observations), _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
@@ -144,7 +149,10 @@ class EpisodeStore:
         e, length, n = actions.shape[:3]
         rewards = _numbers("rewards", rewards)
         costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
-        one = {"observations": (observations, (e, length + 1, n)), "costs": (costs, (e, length))}
+        one = {
+            "observations": (observations, (e, length + 1, n)),
+            "costs": (costs, (e, length, n)[: max(2, costs.ndim)]),
+        }
         one["rewards"] = (rewards, (e, length, n)[: max(2, rewards.ndim)])
         if state is not None:
             state = _numbers("state", state)
@@ -192,8 +200,8 @@ class EpisodeStore:
         speed=None,
         card=None,
     ):
-        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,), state (T, S);
-        `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
+        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), state
+        (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
         episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
         ends = _numbers("episode_ends", episode_ends, 1)
         if (ends % 1 != 0).any():
@@ -433,7 +441,7 @@ def validate(store: EpisodeStore) -> None:
     shapes = {
         "observations": (t + e, n),
         "rewards": (t, n),
-        "costs": (t,),
+        "costs": (t, n) if np.ndim(s.costs) == 2 else (t,),
         "terminated": (t,),
         "truncated": (t,),
     }
@@ -450,6 +458,12 @@ def validate(store: EpisodeStore) -> None:
             s.state.ndim == 2 and len(s.state) == t + e,
             f"state has shape {s.state.shape}, expected ({t + e}, S); keep the state each episode ended in.",
         )
+    known = np.isfinite(s.costs).mean()
+    demand(
+        known > 0.5 or known == 1,
+        f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop episodes "
+        "of which nobody knows.",
+    )
     if s.speed is not None:
         demand(s.speed.shape == (t,), f"speed has shape {s.speed.shape}, expected ({t},); give one of every step.")
     for name in ("observations", "actions", "rewards", "costs", *OPTIONAL):

@@ -21,7 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -54,6 +54,9 @@ class SafeMuJoCo:
     parts: Parts = "2x3"
     speed_limit: float | None = None  # m/s; None: safety-gymnasium's
     episode_length: int = 1000
+    # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of 1000
+    # above it are allowed.
+    world: ClassVar[dict] = {"dynamics_width": 256, "barrier_updates": 20_000, "missed": 0.02}
 
     def __post_init__(self):
         if self.parts not in ROBOTS:

@@ -267,7 +267,7 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
     import jax
     import jax.numpy as jnp
 
-    from ringfence import evaluate
+    from ringfence import evaluate, worlds
     from ringfence.nets.heads import barrier_on
 
     if not run.checkpoints():
@@ -275,7 +275,8 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
     job, policy = evaluate.load(run)
     networks, names = getattr(policy, "networks", {}), job.spec.feature_names
     n, radius = job.spec.n_agents, getattr(job.hazard.hazard, "radius", None)
-    if "barrier" not in networks or radius is None or job.task.env is None or n < 2:
+    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.algorithm.needs else None
+    if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
         return None
     agent, other = 0, 1
     env = job.task.env
@@ -304,7 +305,8 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
                 if has_velocity:
                     v = velocity[agent, c] + approach * towards.ravel()
                     x[:, :, names.index(f"agent{other}.v{axis}")] = v[:, None]
-        h = barrier_on(networks["barrier"], policy.normaliser, jnp.asarray(x))
+        x = jnp.asarray(x)
+        h = barrier_on(networks["barrier"], policy.normaliser, x) if learned is None else learned.of_steps(x, x)
         return np.asarray(h)[:, agent].reshape(dx.shape)
 
     cases = [("at rest relative to the agent", 0.0)]

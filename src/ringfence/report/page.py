@@ -16,6 +16,7 @@ from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
+from ringfence.guards import GUARDS, GuardOptions, margin_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.table import NAMES, Row, Section, sections
@@ -285,12 +286,7 @@ def commands(section: Section, out: Path) -> list[str]:
     evaluations: dict[tuple, list[str]] = {}
     for row in section.rows:
         for run, result in row.members:
-            planner = result.get("planner", "plain")
-            usual = {f.name: f.default for f in dataclasses.fields(PlanOptions)} | PLANNERS.get(planner, {})
-            options = result.get("options") or {}
-            given = " ".join(shlex.quote(f"{k}={v}") for k, v in options.items() if v != usual.get(k))
-            given = f"--set {given}" if given else ""
-            given = given if planner == "plain" else f"--planner {planner} {given}".strip()
+            given = _how(result)
             split = " --split validation" if row.split == "validation" else ""
             step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
             how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
@@ -305,6 +301,22 @@ def _usual_preset(algorithm: str, task: str) -> str:
     """The preset that training takes without being told one; no name where that is not known."""
     known = algos.ALGORITHMS.get(algorithm)
     return known.preset_for(tasks.TASKS[task].presets if task in tasks.TASKS else ()) if known else ""
+
+
+def _how(result: dict) -> str:
+    """The options of `ringfence eval` that gave a result."""
+    planner, name = result.get("planner", "plain"), result.get("guard", "none")
+    words = [f"--planner {planner}"] if planner != "plain" else []
+    told, usual = dict(result.get("options") or {}), dataclasses.asdict(PlanOptions()) | PLANNERS.get(planner, {})
+    given = {k: v for k, v in told.items() if v != usual.get(k)}
+    if result.get("guard_options"):
+        words += [f"--guard {name} --danger {result['danger']}"]
+        words += [f"--sight {result['sight']}"] if result["sight"] != "all" else []
+        usual = dataclasses.asdict(GuardOptions()) | GUARDS[name] | margin_of(result["danger"])
+        given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
+    if given:
+        words.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))
+    return " ".join(words)
 
 
 def _stretches(seeds: list[int]) -> list[tuple[int, int]]:

@@ -1,0 +1,71 @@
+"""How a guard knows danger: one signed score per agent, whoever tells it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from ringfence.errors import UserError
+from ringfence.hazards import BoundHazard, least
+from ringfence.types import Array
+from ringfence.world import World
+
+Source = Literal["formula", "learned", "both"]
+DANGERS = ("formula", "learned", "both")
+
+
+class Danger(eqx.Module):
+    """Scores in units of a margin that is right for each source: the hazard's own safe margin for a formula, the
+    calibrated one for what is learned. So a margin means the same to both, and the smaller of both can be taken.
+
+    What is learned is lowered where the World does not know (the ensemble is apart by more than held-out episodes
+    were): by one margin for every time that it is.
+    """
+
+    world: World
+    source: Source = eqx.field(static=True)
+    hazard: BoundHazard | None = eqx.field(static=True)  # bound to the World's view
+    future: bool = eqx.field(static=True)  # judge the last row by what will be dangerous, too
+
+    def __check_init__(self):
+        if self.source not in DANGERS:
+            raise UserError(f"danger='{self.source}' is unknown; choose formula, learned or both.")
+        if self.source != "learned" and (self.hazard is None or not self.hazard.has_formula):
+            raise UserError(
+                f"danger='{self.source}' needs a formula that the World's view can read, and there is none; use "
+                "danger='learned'."
+            )
+        if self.source != "formula" and self.world.barrier is None:
+            raise UserError(
+                f"danger='{self.source}' needs a barrier, but this World was fitted without labels of danger; use "
+                "danger='formula', or fit a World on logs with costs."
+            )
+        if self.source != "learned" and not self.hazard.safe_margin > 0:
+            raise UserError(
+                f"danger='{self.source}' measures its margin in safe margins, but the hazard's is 0; give it one above 0."
+            )
+
+    def along(self, rows: Array, spread: Array) -> Array:
+        """(..., K, N) scores of foreseen rows (..., K+1, N, D), the present first; spread (..., K, N)."""
+        scores = []
+        if self.source != "learned":
+            scores.append(self.hazard.clearance(rows[..., 1:, :, :]) / self.hazard.safe_margin)
+        if self.source != "formula":
+            barrier = self.world.barrier
+            told = barrier.of_steps(rows[..., :-1, :, :], rows[..., 1:, :, :])
+            if self.future:
+                last = jnp.minimum(told[..., -1:, :], barrier.ahead(rows[..., -1:, :, :]))
+                told = jnp.concatenate([told[..., :-1, :], last], -2)
+            scores.append(told / barrier.unit - jnp.maximum(spread / self.world.strange - 1.0, 0.0))
+        return least(scores)
+
+    def now(self, before: Array, present: Array) -> Array:
+        """(..., N) scores of the step that led from one state (..., N, D) to the present."""
+        scores = []
+        if self.source != "learned":
+            scores.append(self.hazard.clearance(present) / self.hazard.safe_margin)
+        if self.source != "formula":
+            scores.append(self.world.barrier.of_steps(before, present) / self.world.barrier.unit)
+        return least(scores)

@@ -1,0 +1,239 @@
+"""What a guard does with proposals, each on its own switch and in this order: refine, select, shield; and adapt.
+
+    refine   climb the value of every proposal's actions through the World's dynamics, away from danger
+    select   the best of the safe ones, or the safest
+    shield   correct the actions until danger keeps its distance along the foreseen rows
+    adapt    move the margin by what happens: up after a cost, down while there is none
+
+The shield asks the paper's condition (3) of foreseen rows, h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k), or a margin; its correction is
+the supremum over actions. Where no action meets it, the least bad one found is taken, and counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ringfence.errors import UserError
+from ringfence.guards.danger import Danger
+from ringfence.types import Array, Key
+from ringfence.world import World
+
+MAX_MARGIN = 3.0  # of an adapting margin
+RATE = 0.1  # Adam's, of refined actions
+CONDITIONS = ("margin", "retain")
+
+
+@dataclass(frozen=True)
+class GuardOptions:
+    """Every choice of a guard. Margins are in the unit of the danger's source (danger.py)."""
+
+    plans: int = 1  # proposals that are asked for
+    select: bool = False  # among them; else the first is followed
+    refine: int = 0  # Adam steps that climb the value; 0: none
+    starts: int = 1  # refined: the proposals, the last plan moved on, and noisy copies, so many in all
+    noise: float = 0.5  # deviation of noisy copies
+    care: float = 10.0  # weight of danger in what is climbed, in deviations of value per margin
+    shield: int = 0  # rounds of correction; 0: none
+    rows: int = 3  # foreseen rows that are judged
+    condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
+    alpha: float = 0.5  # share of what is left of the distance that one step may use up
+    margin: float = 0.6  # distance that is kept
+    future: bool = False  # judge the last row by the value of danger, where it is learned
+    adapt: float = 0.0  # step of the margin after a cost; 0: it stays
+    rate: float = 0.00625  # share of steps with a cost at which an adapting margin settles
+
+    def __post_init__(self):
+        for name, bound in (("plans", 1), ("starts", 1), ("rows", 1), ("refine", 0), ("shield", 0)):
+            if getattr(self, name) < bound:
+                raise UserError(f"{name}={getattr(self, name)} must be at least {bound}.")
+        for name in ("noise", "care", "adapt"):
+            if getattr(self, name) < 0:
+                raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if not 0 < self.rate < 1:
+            raise UserError(f"rate={self.rate} must be a share of steps between 0 and 1.")
+        if not 0 < self.alpha <= 1:
+            raise UserError(f"alpha={self.alpha} must lie in (0, 1]: at 0 a barrier could never fall.")
+        if self.condition not in CONDITIONS:
+            raise UserError(f"condition='{self.condition}' is unknown; choose margin or retain.")
+        if self.plans > 1 and not self.select and not self.refine:
+            raise UserError(f"plans={self.plans} are drawn, but none is selected; set select=true, or plans=1.")
+        if self.starts > 1 and not self.refine:
+            raise UserError(f"starts={self.starts} is read by nothing without refine; set refine=30, or starts=1.")
+
+    @property
+    def judges(self) -> bool:
+        """Whether it does anything at all."""
+        return self.select or self.refine > 0 or self.shield > 0
+
+
+_SHIELD = {"shield": 10}
+# Named sets of choices; "none" follows the proposal.
+GUARDS: dict[str, dict] = {
+    "none": {},
+    "select": {"plans": 8, "select": True},
+    "shield": _SHIELD,
+    "adapt": _SHIELD | {"adapt": 0.1},
+    "refine": {"refine": 20, "starts": 8, "select": True, "rows": 7},
+    "full": _SHIELD | {"plans": 4, "refine": 20, "starts": 8, "select": True, "rows": 7, "adapt": 0.1},
+}
+
+
+class Decision(NamedTuple):
+    """What a guard made of proposals."""
+
+    plan: Array  # (B, K, N, A) actions
+    chosen: Array  # (B,) index of the proposal, or (B, N) of agents that are alone
+    rows: Array  # (B, P, K+1, N, D) where the proposals lead
+    safety: Array  # (B, N) least score along the plan
+    short: Array  # (B, N) bool: the condition is not met along it
+    strange: Array  # (B, N) bool: the World does not know where the first action leads
+
+
+class Guard(eqx.Module):
+    """The four operations on proposals (B, P, K, N, A), actions in [−1, 1]. Where the World is `alone`, every agent
+    judges and corrects its own actions by its own view of things, and hears of nobody."""
+
+    world: World
+    danger: Danger
+    options: GuardOptions = eqx.field(static=True)
+
+    def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
+        """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins (B,) or (B, N) to a plan."""
+        o = self.options
+        if o.refine:
+            proposals = self.refined(present, self.started(proposals, last, key), margin)
+        rows, spread = self.foreseen(present, proposals)
+        score = self.danger.along(rows, spread)
+        chosen = self.selected(rows, proposals, score, margin)
+        if self.world.alone:
+            plan = jnp.take_along_axis(proposals, chosen[:, None, None, :, None], 1)[:, 0]
+        else:
+            plan = jnp.take_along_axis(proposals, chosen[:, None, None, None, None], 1)[:, 0]
+        if o.shield:
+            plan = self.shielded(present, plan, margin)
+        ahead, spread = self.foreseen(present, plan[:, None])
+        score = self.danger.along(ahead, spread)[:, 0]
+        short = (self.missing(present, score, margin) < -1e-3).any(1)
+        unknown = spread[:, 0, 0] > self.world.strange
+        return Decision(plan, chosen, rows, score.min(1), short, unknown)
+
+    def foreseen(self, present: Array, actions: Array) -> tuple[Array, Array]:
+        """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A)."""
+        x = jnp.broadcast_to(present[:, None], (*actions.shape[:2], *present.shape[1:]))
+
+        def step(x: Array, action: Array):
+            after, spread = self.world.dynamics.step(x, action)
+            return after, (after, spread)
+
+        _, (rows, spread) = jax.lax.scan(step, x, jnp.moveaxis(actions, 2, 0), unroll=True)
+        rows = jnp.concatenate([x[:, :, None], jnp.moveaxis(rows, 0, 2)], 2)
+        return rows, jnp.moveaxis(spread, 0, 2)
+
+    def missing(self, present: Array, score: Array, margin: Array) -> Array:
+        """(B, K, N) how much scores (B, K, N) of foreseen rows fall short of the condition, 0 or negative."""
+        o, kept = self.options, self._wide(margin, 1)
+        if o.condition == "margin":
+            return jnp.minimum(score - kept, 0.0)
+        now = self.danger.now(present, present)[:, None]
+        before = jnp.concatenate([now, score[:, :-1]], 1)
+        return jnp.minimum((score - kept) - (1.0 - o.alpha) * (before - kept), 0.0)
+
+    def _wide(self, margin: Array, axes: int) -> Array:
+        """Margins (B,) or (B, N) with that many axes after the first, and the agents' last."""
+        if margin.ndim == 1:
+            return margin.reshape(-1, *[1] * axes, 1)
+        return margin.reshape(margin.shape[0], *[1] * axes, margin.shape[1])
+
+    def started(self, proposals: Array, last: Array, key: Key) -> Array:
+        """(B, S, K, N, A): the proposals, the last plan moved on by a step, and noisy copies of these."""
+        count = max(self.options.starts, proposals.shape[1])
+        moved = jnp.concatenate([last[:, 1:], last[:, -1:]], 1)[:, None]
+        known = jnp.concatenate([proposals, moved], 1)[:, :count]
+        more = count - known.shape[1]
+        if more <= 0:
+            return known
+        copies = jnp.tile(known, (1, -(-more // known.shape[1]), 1, 1, 1))[:, :more]
+        copies = copies + self.options.noise * jax.random.normal(key, copies.shape)
+        return jnp.concatenate([known, jnp.clip(copies, -1.0, 1.0)], 1)
+
+    def refined(self, present: Array, actions: Array, margin: Array) -> Array:
+        """Actions (B, S, K, N, A) after Adam's ascent of value, in deviations of the logs', less `care` for every
+        margin that is missing and for places where the World knows nothing."""
+
+        def worth(actions: Array) -> Array:
+            rows, spread = self.foreseen(present, actions)
+            value = self.world.values.of_plan(rows, actions) / self.world.values.usual
+            score = self.danger.along(rows, spread)
+            short = jnp.minimum(score - self._wide(margin, 2), 0.0).sum((2, 3))
+            lost = jnp.maximum(spread / self.world.strange - 1.0, 0.0).sum((2, 3))
+            return value.sum() + self.options.care * (short - lost).sum()
+
+        def climb(carry, t):
+            a, m, s = carry
+            g = jax.grad(worth)(a)
+            m, s = 0.9 * m + 0.1 * g, 0.99 * s + 0.01 * g * g
+            move = (m / (1 - 0.9 ** (t + 1))) / (jnp.sqrt(s / (1 - 0.99 ** (t + 1))) + 1e-6)
+            return (jnp.clip(a + RATE * move, -1.0, 1.0), m, s), None
+
+        zero = jnp.zeros_like(actions)
+        rounds = jnp.arange(self.options.refine, dtype=jnp.float32)
+        return jax.lax.scan(climb, (actions, zero, zero), rounds)[0][0]
+
+    def selected(self, rows: Array, actions: Array, score: Array, margin: Array) -> Array:
+        """(B,) which proposal: the one of most value among those that keep the margin; where there is none, the safest.
+        (B, N) where every agent chooses for itself."""
+        if actions.shape[1] == 1 or not (self.options.select or self.options.refine):
+            shape = actions.shape[:1] + ((actions.shape[3],) if self.world.alone else ())
+            return jnp.zeros(shape, jnp.int32)
+        value, safety = self.world.values.of_plan(rows, actions), score.min(2)
+        if not self.world.alone:
+            safety = safety.min(-1)
+        return pick(safety, value, self._wide(margin, 1) if self.world.alone else margin[:, None])
+
+    def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
+        """Plans (B, K, N, A) corrected until the condition holds along the foreseen rows, and the best found otherwise.
+
+        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within the
+        action bounds. Where nothing is missing the plan is kept as it is.
+        """
+        alone = self.world.alone
+
+        def shortfall(plan: Array) -> Array:
+            rows, spread = self.foreseen(present, plan[:, None])
+            short = self.missing(present, self.danger.along(rows, spread)[:, 0], margin)
+            return short.sum(1) if alone else short.sum((1, 2))[:, None]  # (B, N) or (B, 1)
+
+        def correct(carry, _):
+            plan, best, least = carry
+            f, back = jax.vjp(shortfall, plan)
+            slope = back(jnp.ones_like(f))[0]
+            better = (f > least)[:, None, :, None]
+            best, least = jnp.where(better, plan, best), jnp.maximum(f, least)
+            size = (slope**2).sum((1, 3)) if alone else (slope**2).sum((1, 2, 3))[:, None]
+            moved = plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
+            return (jnp.clip(moved, -1.0, 1.0), best, least), None
+
+        nothing = jnp.full((plan.shape[0], plan.shape[2] if alone else 1), -jnp.inf)
+        (plan, best, least), _ = jax.lax.scan(correct, (plan, plan, nothing), length=self.options.shield)
+        return jnp.where((shortfall(plan) >= least)[:, None, :, None], plan, best)
+
+    def adapted(self, margin: Array, unsafe: Array) -> Array:
+        """Margins (B,) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN.
+
+        Adaptive conformal inference (Gibbs and Candès 2021) on the guard's own foresight: whatever its errors, the
+        share of unsafe steps tends to `rate` as long as a margin within the bounds can prevent them.
+        """
+        o = self.options
+        return jnp.clip(margin + o.adapt * (unsafe - o.rate), 0.0, max(MAX_MARGIN, o.margin))
+
+
+def pick(safety: Array, value: Array, margin: Array | float) -> Array:
+    """argmax of value among plans (axis 1) with safety ≥ margin; where there is none, argmax of safety."""
+    fine = safety >= margin
+    best = jnp.where(fine, value, -jnp.inf).argmax(1)
+    return jnp.where(fine.any(1), best, safety.argmax(1))

@@ -1,0 +1,241 @@
+"""A policy under guard: whatever proposes, a World and its guard decide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import hazards, normalise
+from ringfence.errors import UserError, unknown
+from ringfence.features import translation
+from ringfence.guards.danger import Danger
+from ringfence.guards.guard import GUARDS, Guard, GuardOptions
+from ringfence.hazards import BoundHazard
+from ringfence.types import Array, Key, PolicyStep, PyTree
+from ringfence.world import World
+
+
+class Guarded(eqx.Module):
+    """A proposal under guard; itself a policy (types.Policy).
+
+    What proposes several steps has a method `propose`; of what gives one action at a time the next ones are asked along
+    foreseen rows, where its view can be read from the World's, and the last action is held where it cannot.
+    """
+
+    proposal: Any
+    guard: Guard
+
+    def start(self, batch: int) -> PyTree:
+        o, spec = self.guard.options, self.guard.world.spec
+        shape = (batch, spec.n_agents) if self.guard.world.alone else (batch,)
+        return {
+            "inner": self.proposal.start(batch),
+            "margin": jnp.full(shape, o.margin),
+            "last": jnp.zeros((batch, o.rows, spec.n_agents, spec.action_dim)),
+            "before": jnp.zeros((batch, spec.n_agents, spec.feature_dim)),
+            "cost": jnp.full(batch, jnp.nan),
+            "age": jnp.zeros((), jnp.int32),
+        }
+
+    def hear(self, memory: PyTree, cost: Array) -> PyTree:
+        """The memory with the cost (B,) that the last step had: what an adapting margin follows. Where none is told, it
+        follows its own judgement of the step."""
+        return {**memory, "cost": jnp.asarray(cost, jnp.float32)}
+
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        kp, kd = jax.random.split(key)
+        inner, actions, info = self.proposed(memory["inner"], observations, state, kp)
+        present = self.guard.world.map(observations, state)
+        memory, step = self.decided({**memory, "inner": inner}, present, actions, kd)
+        return memory, step._replace(info=info | step.info)
+
+    def decided(self, memory: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        """What becomes of proposals (B, P, K, N, A) in the present (B, N, D)."""
+        g = self.guard
+        margin = jnp.full_like(memory["margin"], g.options.margin)  # known to the compiler unless it moves
+        if g.options.adapt:
+            judged = g.danger.now(memory["before"], present) < 0
+            judged = judged if g.world.alone else judged.any(-1)
+            cost = memory["cost"].reshape(-1, *[1] * (judged.ndim - 1))
+            unsafe = jnp.where(jnp.isnan(cost), judged, cost > 0)
+            margin = jnp.where(memory["age"] == 0, margin, g.adapted(memory["margin"], unsafe))
+        found = g.decide(present, actions, memory["last"], margin, key)
+        info = {
+            "plans": found.rows,
+            "chosen": found.chosen,
+            "clearance": found.safety.min(-1),
+            "infeasible": found.short.any(-1),
+            "strange": found.strange.any(-1),
+        }
+        spec = g.world.spec
+        action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
+        memory = {
+            **memory,
+            "margin": margin,
+            "last": found.plan,
+            "before": present,
+            "cost": jnp.full_like(memory["cost"], jnp.nan),
+            "age": memory["age"] + 1,
+        }
+        return memory, PolicyStep(action, info)
+
+    def proposed(self, inner: PyTree, observations: Array, state: Array | None, key: Key):
+        """(memory, actions (B, P, K, N, A) in [−1, 1], info) of the proposal."""
+        g = self.guard
+        if hasattr(self.proposal, "propose"):
+            return self.proposal.propose(inner, observations, state, key, g.options.plans, g.options.rows, g.world)
+        spec = g.world.spec
+        memory, step = self.proposal.act(inner, observations, state, key)
+        action = normalise.to_unit(step.action, spec.action_low, spec.action_high)
+        return memory, held(action, g.options.rows), {}
+
+
+def held(action: Array, rows: int) -> Array:
+    """(B, 1, K, N, A): one action (B, N, A), held."""
+    return jnp.broadcast_to(action[:, None, None], (action.shape[0], 1, rows, *action.shape[1:]))
+
+
+def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, present: Array, rows: int) -> Array:
+    """(B, 1, K, N, A): what a policy `act`, of features in its own view `own`, does now (`seen`) and along the rows
+    that the World foresees from `present`; the first action held where the views cannot be translated."""
+    index = translation(own, world.map)
+    first = act(seen)
+    if index is None or rows == 1:
+        return held(first, rows)
+    x, action, actions = present, first, [first]
+    for _ in range(rows - 1):
+        x, _ = world.dynamics.step(x, action)
+        action = act(jnp.take_along_axis(x, jnp.broadcast_to(index, (*x.shape[:-1], index.shape[1])), -1))
+        actions.append(action)
+    return jnp.stack(actions, 1)[:, None]
+
+
+class Callback:
+    """Anybody's function (observations, state) -> actions under guard, outside JAX: NumPy in, NumPy out.
+
+    `act` takes one environment, (N, O) and (S,) or None, and calls the function with the same; `reset` begins an episode.
+    As a policy of the library (`start`, `act` of four arguments) it is played in simulators that step outside JAX.
+    """
+
+    def __init__(self, function: Callable, guarded: Guarded, seed: int = 0):
+        self.function, self.guarded = function, guarded
+        self._key = jax.random.key(seed)
+        self._decide = jax.jit(lambda g, memory, present, action, key: g.decided(memory, present, action, key))
+        self.reset()
+
+    def reset(self) -> None:
+        self._memory = self.start(1)
+
+    def start(self, batch: int) -> PyTree:
+        return self.guarded.start(batch)
+
+    def hear(self, memory: PyTree, cost) -> PyTree:
+        return self.guarded.hear(memory, cost)
+
+    def act(self, *given, cost: float | None = None):
+        """(observations, state=None) -> (action (N, A), info), or a policy's (memory, observations, state, key)."""
+        if len(given) == 4:
+            memory, observations, state, key = given
+            wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
+            return self._decided(memory, observations, state, wanted, key)
+        observations, state = given if len(given) == 2 else (given[0], None)
+        wanted = self.function(observations, state)
+        self._key, key = jax.random.split(self._key)
+        if cost is not None:
+            self._memory = self.hear(self._memory, np.full(1, cost))
+        shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
+        self._memory, step = self._decided(self._memory, *shown, np.asarray(wanted)[None], key)
+        return np.asarray(step.action[0]), {k: np.asarray(v[0]) for k, v in step.info.items()}
+
+    def _decided(self, memory, observations, state, wanted, key):
+        world = self.guarded.guard.world
+        spec, batch = world.spec, len(observations)
+        try:
+            wanted = np.asarray(wanted, np.float32)
+        except (TypeError, ValueError):
+            raise UserError("The policy under guard returned no array of numbers; return actions (N, A).") from None
+        expected = (batch, spec.n_agents, spec.action_dim)
+        if wanted.shape != expected:
+            raise UserError(
+                f"The policy under guard returned actions of shape {wanted.shape[1:]}; this World takes {expected[1:]}."
+            )
+        if not np.isfinite(wanted).all():
+            raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
+        action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
+        present = world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
+        plan = held(action, self.guarded.guard.options.rows)
+        return self._decide(self.guarded, memory, present, plan, key)
+
+
+class Nothing(eqx.Module):
+    """Stands where a callback's proposals come from outside."""
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+
+def margin_of(danger: str) -> dict[str, float]:
+    """The margin that is kept unless another is asked for: a calibrated one of what is learned; of a formula less than
+    its safe margin, which is what examples of safety have."""
+    return {"margin": 1.0} if danger == "learned" else {}
+
+
+def build(
+    proposal: Any, world: World, hazard: hazards.Hazard | BoundHazard | None, name: str, danger: str, **changes
+) -> Guarded:
+    """A policy under the named guard with changed options; without a named margin, that of the danger's source."""
+    from ringfence.runs import build_config
+
+    if name not in GUARDS:
+        raise unknown("guard", name, GUARDS)
+    told = {**GUARDS[name], **margin_of(danger), **changes}
+    options = build_config(GuardOptions, told, "the guard")
+    if not options.judges:
+        raise UserError(
+            f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
+        )
+    bound = hazard
+    if hazard is not None and not isinstance(hazard, BoundHazard):
+        bound = bound_or_none(hazard, world)
+    return Guarded(proposal, Guard(world, Danger(world, danger, bound, options.future), options))
+
+
+def bound_or_none(hazard: hazards.Hazard, world: World) -> BoundHazard | None:
+    """The hazard in the World's view; None where that view cannot read its formula."""
+    try:
+        return hazards.bind(hazard, world.spec.feature_names, world.spec.n_agents)
+    except UserError:
+        return None
+
+
+def guard(
+    policy: Any,
+    world: World,
+    *,
+    guard: str = "shield",
+    danger: str = "learned",
+    hazard: hazards.Hazard | None = None,
+    seed: int = 0,
+    **options,
+):
+    """Any policy under guard.
+
+    policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
+    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller, which
+    gives a `Callback`. `guard` is a name in GUARDS, `danger` formula, learned or both, `options` fields of
+    GuardOptions; `hazard` is the formula's definition, where one is to be used.
+    """
+    if not isinstance(world, World):
+        raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
+    if hasattr(policy, "start") and hasattr(policy, "act"):
+        return build(policy, world, hazard, guard, danger, **options)
+    if not callable(policy):
+        raise UserError(
+            f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
+        )
+    return Callback(policy, build(Nothing(), world, hazard, guard, danger, **options), seed)

@@ -1,0 +1,41 @@
+"""Pytrees as named arrays, the form in which they are kept on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from safetensors.numpy import load_file
+
+from ringfence.errors import CheckpointError
+from ringfence.types import PyTree
+
+
+def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
+    """Leaves with their paths, e.g. ('params/denoiser/blocks/0/qkv', array)."""
+    return [
+        ("/".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), leaf)
+        for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]
+    ]
+
+
+def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
+    """Leaves on the host, by path."""
+    return {name: np.array(leaf, order="C") for name, leaf in named_leaves(tree)}
+
+
+def load_named(file: str | Path, template: PyTree) -> PyTree:
+    """The tree in a file of named arrays, which must be the template's in name and shape."""
+    arrays, leaves = load_file(file), []
+    for name, leaf in named_leaves(template):
+        if name not in arrays:
+            raise CheckpointError(f"'{file}' lacks the array '{name}'; it was made by another model: make it again.")
+        if arrays[name].shape != leaf.shape:
+            raise CheckpointError(
+                f"'{file}': '{name}' has shape {arrays[name].shape}, its config gives {leaf.shape}; it belongs to "
+                "another task or config."
+            )
+        leaves.append(jax.numpy.asarray(arrays[name], leaf.dtype))
+    return jax.tree.unflatten(jax.tree.structure(template), leaves)

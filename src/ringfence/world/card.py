@@ -1,0 +1,230 @@
+"""How good a World is, on episodes that no part of it has seen; in numbers, and in words."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.types import Array
+from ringfence.world.barrier import team_score
+from ringfence.world.world import World
+
+AHEAD = 8  # steps that foresight is judged over
+WINDOWS = 3000  # of each kind that it is judged on
+STEPS = 60_000  # held-out steps that scores are judged on
+FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
+LEAST = 1.0  # a margin, in log-odds
+JUDGED = 3  # steps ahead that the margin is calibrated for
+
+
+def judge(world: World, told, level: float, missed: float) -> tuple[dict[str, Any], float, float]:
+    """(facts, the ensemble's threshold, the margin that calibration asks for)."""
+    rng = np.random.default_rng(0)
+    facts: dict[str, Any] = {"held_out": {"episodes": int(told.held.sum()), "steps": int(len(told.kept))}}
+    facts["foresight"] = _foresight(world, told, rng)
+    facts["values"] = _values(world, told, rng)
+    strange = _strange(world, told, level)
+    facts["strange"] = {"threshold": strange, "level": level}
+    unit = LEAST
+    if world.barrier is not None:
+        facts["barrier"], unit = _barrier(world, told, rng, missed)
+    return facts, strange, unit
+
+
+def _foresight(world: World, told, rng) -> dict[str, Any]:
+    """Root mean square errors of held-out windows, rolled out along the logged actions."""
+    left = np.asarray(told.arrays["last_row"] - told.arrays["row"])[told.kept]
+    ahead = int(min(AHEAD, left.max()))
+    starts = told.kept[left >= ahead]
+    starts = rng.choice(starts, min(WINDOWS, len(starts)), replace=False)
+    foreseen, _ = _rolled(world, told, starts, ahead)
+    row = np.asarray(told.arrays["row"])[starts]
+    x = told.arrays["features"]
+    came = np.stack([np.asarray(x[row + k]) for k in range(ahead + 1)], 1)
+    error = np.asarray(foreseen) - came[:, 1:]
+    scale = np.maximum(np.asarray(world.dynamics.scale), 1e-9)
+    rms = np.sqrt((error**2).mean((0, 2)))  # (ahead, D)
+    still = np.sqrt(((came[:, 1:] - came[:, :1]) ** 2).mean((0, 2)))
+    entries = world.dynamics.foreseen
+    share = np.sqrt(((rms / scale)[:, entries] ** 2).mean(1)) / np.maximum(
+        np.sqrt(((still / scale)[:, entries] ** 2).mean(1)), 1e-9
+    )
+    return {
+        "steps_ahead": list(range(1, ahead + 1)),
+        "error_of_change": [round(float(v), 4) for v in share],
+        "by_entry": {
+            name: [float(f"{rms[k, d]:.3g}") for k in sorted({0, min(2, ahead - 1), ahead - 1})]
+            for d, name in enumerate(world.map.names)
+        },
+    }
+
+
+def _rolled(world: World, told, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
+    """Rows (W, K, N, D) and disagreement (W, K, N) from the states before steps, along the logged actions."""
+    row = told.arrays["row"][starts]
+    actions = jnp.stack([told.arrays["actions"][np.minimum(starts + k, told.store.steps - 1)] for k in range(ahead)])
+
+    @jax.jit
+    def roll(world: World, x: Array, actions: Array):
+        def step(x, action):
+            after, spread = world.dynamics.step(x, action)
+            return after, (after, spread)
+
+        return jax.lax.scan(step, x, actions)[1]
+
+    rows, spread = roll(world, told.arrays["features"][row], actions)
+    return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
+
+
+def _values(world: World, told, rng) -> dict[str, float]:
+    steps = rng.choice(told.kept, min(STEPS, len(told.kept)), replace=False)
+    row = told.arrays["row"][steps]
+    x = told.arrays["features"]
+    team = np.asarray(told.arrays["rewards"])[steps].mean(1)
+    togo = np.asarray(told.togo(world.values.discount))[steps]
+
+    @jax.jit
+    def tell(world: World, before, action, after):
+        reward, value = world.values.of_steps(before, action, after), world.values.ahead(before)
+        return (reward.mean(-1), value.mean(-1)) if world.alone else (reward, value)
+
+    reward, value = tell(world, x[row], told.arrays["actions"][steps], x[row + 1])
+    return {"reward_r2": _r2(team, np.asarray(reward)), "value_r2": _r2(togo, np.asarray(value))}
+
+
+def _r2(truth: np.ndarray, told: np.ndarray) -> float:
+    return float(1 - ((truth - told) ** 2).mean() / max(truth.var(), 1e-12))
+
+
+def _strange(world: World, told, level: float) -> float:
+    """The conformal quantile, over held-out episodes, of how far apart the ensemble was at worst."""
+    steps = told.kept[:STEPS]
+    _, spread = _rolled(world, told, steps, 1)
+    worst = np.asarray(spread)[:, 0].max(-1)
+    episode = told.store.episode_of_step[steps]
+    most = np.array([worst[episode == e].max() for e in np.unique(episode)])
+    return conformal(most, level)
+
+
+def conformal(values: np.ndarray, level: float) -> float:
+    """The value that a new one stays below with that probability, whatever their distribution: the ⌈(n+1) level⌉-th
+    smallest of n, the largest where there are too few."""
+    n = len(values)
+    return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
+
+
+def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], float]:
+    barrier, x, row = world.barrier, told.arrays["features"], np.asarray(told.arrays["row"])
+    unsafe = told.label if told.label.ndim == 1 else told.label.any(1)
+    bad, fine = (told.kept[unsafe[told.kept] == v] for v in (True, False))
+    if not len(bad) or not len(fine):
+        said = "unsafe" if not len(bad) else "safe"
+        return {"warning": f"no held-out step is {said}, so nothing is known of how well danger is told"}, 5.0
+    steps = rng.choice(told.kept, min(STEPS, len(told.kept)), replace=False)
+    steps = np.unique(np.concatenate([steps, rng.choice(bad, min(WINDOWS, len(bad)), replace=False)]))
+
+    @jax.jit
+    def score(barrier, before, after):
+        return team_score(barrier.of_steps(before, after), barrier.shape)
+
+    def of(steps: np.ndarray) -> np.ndarray:
+        parts = [steps[i : i + 20_000] for i in range(0, len(steps), 20_000)]
+        return np.concatenate([np.asarray(score(barrier, x[row[p]], x[row[p] + 1])) for p in parts])
+
+    h, truth = of(steps), unsafe[steps]
+    share = unsafe[told.kept].mean()
+    line = np.quantile(h[~truth], FALSE_ALARMS)
+    # The margin: foreseen scores of steps that came to be unsafe, from up to three steps before.
+    first = np.asarray(told.arrays["first_row"])
+    seen, ends = [], rng.choice(bad, min(WINDOWS, len(bad)), replace=False)
+    for back in range(JUDGED):
+        start = ends - back
+        start = start[(start >= 0) & (row[ends] - back >= first[ends])]
+        if len(start):
+            rows, _ = _rolled(world, told, start, back + 1)
+            before = x[row[start]] if back == 0 else rows[:, -2]
+            seen.append(np.asarray(score(barrier, before, rows[:, -1])))
+    foreseen = np.concatenate(seen)
+    unit = max(LEAST, conformal(foreseen, 1 - missed))
+    table = [_of_margin(m, h, truth, foreseen, share) for m in sorted({0.0, 1.0, 2.0, 4.0, 8.0, round(unit, 2)})]
+    facts = {
+        "unsafe_share": float(share),
+        "auroc": _auroc(h, truth),
+        "recall": float((h[truth] < line).mean()),
+        "false_alarms": FALSE_ALARMS,
+        "false_safe": float((h[truth] >= 0).mean()),
+        "false_unsafe": float((h[~truth] < 0).mean()),
+        "foreseen_false_safe": float((foreseen >= 0).mean()),
+        "margin": float(unit),
+        "missed": missed,
+        "calibration": table,
+    }
+    return facts, unit
+
+
+def _of_margin(margin: float, h, truth, foreseen, share: float) -> dict[str, float]:
+    """Of held-out steps with that margin: how many of 1000 are unsafe, weighed by how frequent the classes are."""
+    passed, missed = float((h[~truth] >= margin).mean()), float((h[truth] >= margin).mean())
+    both = share * missed + (1 - share) * passed
+    return {
+        "margin": float(margin),
+        "unsafe_in_1000": float(1000 * share * missed / both) if both else 0.0,
+        "unsafe_foreseen_above": float((foreseen >= margin).mean()),
+        "safe_kept": passed,
+    }
+
+
+def _auroc(h: np.ndarray, unsafe: np.ndarray) -> float:
+    order = np.argsort(np.argsort(h, kind="stable"), kind="stable") + 1.0
+    n, m = int((~unsafe).sum()), int(unsafe.sum())
+    return float((order[~unsafe].sum() - n * (n + 1) / 2) / (n * m))
+
+
+def words(told: dict[str, Any]) -> list[str]:
+    """The card as a person reads it."""
+    if not told:
+        return ["an empty card"]
+    held, see, worth = told["held_out"], told["foresight"], told["values"]
+    lines = [
+        f"World of '{told['data']['task']}', seed {told['seed']}, sight {told['settings']['sight']}: "
+        f"{told['data']['episodes']} episodes, judged on {held['episodes']} that nothing was fitted to "
+        f"({held['steps']} steps)."
+    ]
+    errors = see["error_of_change"]
+    far = ", ".join(
+        f"{100 * errors[k]:.2g} % at {k + 1}" for k in sorted({0, min(2, len(errors) - 1), len(errors) - 1})
+    )
+    lines.append(f"Foresight errs by this share of what changes, steps ahead: {far}.")
+    lines.append(
+        f"Rewards of steps are explained to {100 * worth['reward_r2']:.3g} %, returns-to-go to "
+        f"{100 * worth['value_r2']:.3g} % of their variance."
+    )
+    lines.append(
+        f"It calls a place strange where its forward models are more than {told['strange']['threshold']:.2g} usual steps "
+        f"apart: {100 * told['strange']['level']:g} % of held-out episodes never are."
+    )
+    danger = told.get("barrier")
+    if danger is None:
+        return [*lines, "No barrier: guards need a formula of danger."]
+    if "warning" in danger:
+        return [*lines, f"Barrier ({told['shape']}): {danger['warning']}."]
+    lines.append(f"Barrier: {told['shape']}. {100 * danger['unsafe_share']:.3g} % of held-out steps are unsafe.")
+    lines.append(
+        f"With 1 false alarm in 100 safe steps it finds {100 * danger['recall']:.1f} % of the unsafe ones (AUROC "
+        f"{danger['auroc']:.4f}); at 0 it calls {100 * danger['false_safe']:.2g} % of unsafe steps safe and "
+        f"{100 * danger['false_unsafe']:.2g} % of safe ones unsafe."
+    )
+    for row in danger["calibration"]:
+        lines.append(
+            f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are unsafe; "
+            f"{100 * row['safe_kept']:.3g} % of the safe steps have it"
+        )
+    lines.append(
+        f"Default margin {danger['margin']:.2g}: of 1000 unsafe steps, foreseen from up to {JUDGED} steps before, "
+        f"{1000 * danger['missed']:g} looked as safe as that."
+    )
+    return lines

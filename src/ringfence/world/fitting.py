@@ -1,0 +1,360 @@
+"""Fitting a World: per data set, settings and seed; parts are cached by content, so that data sets which differ in
+their costs alone share what does not depend on them, and an interrupted fit goes on with the part that it was at."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from ringfence import features, hazards
+from ringfence.data.cache import cache_dir
+from ringfence.data.store import EpisodeStore
+from ringfence.errors import UserError
+from ringfence.files import whole
+from ringfence.normalise import varying
+from ringfence.trees import load_named, named_arrays
+from ringfence.types import PyTree, Spec
+from ringfence.windows import WindowData, returns_to_go
+from ringfence.world import barrier as cbf
+from ringfence.world import card as cards
+from ringfence.world import dynamics, values
+from ringfence.world.world import Card, World
+
+FORMAT = 1
+HELD_OUT = 0.1  # of the episodes, whole ones
+FEWEST = 5  # episodes that can be divided
+STRANGE = 0.95  # of held-out episodes stay below the ensemble's threshold throughout
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Every choice of a World."""
+
+    view: features.View = "pruned"  # what s̃_i is
+    sight: Literal["all", "own"] = "all"  # own: of agents that hear of nobody, each in its own view
+    labels: Literal["costs", "formula"] = "costs"  # where labels of danger come from
+    discount: float = 0.9  # of values
+    members: int = 3  # of the ensemble of forward models
+    dynamics_updates: int = 40_000
+    dynamics_width: int = 128  # units of each of 2 hidden layers
+    value_updates: int = 8000  # of the critic, and again of rewards
+    barrier: bool = True
+    loss: cbf.Loss = "cross-entropy"  # of labels
+    both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
+    barrier_width: int = 128  # units of each of 3 hidden layers
+    barrier_updates: int = 6000  # of the labels
+    future_updates: int = 6000  # of the value of danger
+    future_discount: float = 0.95  # how far ahead danger is seen: 1 / (1 − it) steps
+    expectile: float = 0.9  # of what the logs did, how near to the best
+    missed: float = 0.001  # share of unsafe steps that may be foreseen at the default margin or above
+
+
+PARTS = {
+    "dynamics": ("members", "dynamics_updates", "dynamics_width"),
+    "values": ("discount", "value_updates"),
+    "label": ("labels", "loss", "both_ends", "barrier_width", "barrier_updates"),
+    "future": ("future_updates", "future_discount", "expectile"),
+}
+
+
+def fit_view(
+    store: EpisodeStore,
+    map: features.FeatureMap,
+    spec: Spec,
+    settings: Settings = Settings(),
+    *,
+    hazard: hazards.BoundHazard | None = None,
+    seed: int = 0,
+    cached: bool = True,
+    quiet: bool = True,
+) -> World:
+    """The World of a store in the view `map` of `spec`; from the cache where it has been fitted before.
+
+    `hazard`, bound to the view, labels states where `settings.labels` is "formula". A tenth of the episodes is held
+    out of every part; the card tells what they say.
+    """
+    if settings.sight == "own":
+        map = features.alone(map)
+    held = held_out(store, seed)
+    label = labels_of(store, map, settings, hazard) if settings.barrier else None
+    told = _Told(store, map, held, label)
+    begun, seconds, blank = time.perf_counter(), {}, _blank(map, spec, settings)
+
+    def part(name: str, upon: tuple[str, ...], content: str, template: PyTree, make: Callable[[jax.Array], PyTree]):
+        """A part from the cache, or made and kept there."""
+        fields = {f: getattr(settings, f) for p in (*upon, name) for f in PARTS[p]}
+        about = [FORMAT, name, content, settings.view, settings.sight, fields, seed]
+        if name in ("label", "future") and hazard is not None and settings.labels == "formula":
+            about.append(hazards.to_dict(hazard.hazard))
+        code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+        file = cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+        if cached and (kept := _read(file, template)) is not None:
+            return kept
+        started = time.perf_counter()
+        made = make(jax.random.fold_in(jax.random.key(seed), list(PARTS).index(name)))
+        seconds[name] = time.perf_counter() - started
+        if cached:
+            _write(file, made)
+        return made
+
+    moved = digest(store, ("observations", "state", "actions", "episode_ends", "terminated"))
+    paid = digest(store, ("rewards",)) + moved
+    bad = moved + ("" if label is None else hashlib.blake2b(label.tobytes(), digest_size=8).hexdigest())
+    s, fitted = settings, told.fitted
+    acts = part(
+        "dynamics",
+        (),
+        moved,
+        blank.dynamics,
+        lambda key: dynamics.fit_dynamics(
+            told.arrays["features"],
+            told.arrays["actions"][fitted],
+            told.arrays["row"][fitted],
+            map,
+            key,
+            members=s.members,
+            updates=s.dynamics_updates,
+            width=s.dynamics_width,
+            label="" if quiet else "forward dynamics, what actions do",
+        ),
+    )
+    worth = part(
+        "values",
+        (),
+        paid,
+        blank.values,
+        lambda key: values.fit_values(
+            told.arrays | {"togo": told.togo(s.discount)},
+            jnp.asarray(fitted),
+            map,
+            key,
+            discount=s.discount,
+            updates=s.value_updates,
+            period=told.longest,
+            alone=s.sight == "own",
+            quiet=quiet,
+        ),
+    )
+    danger = None
+    if settings.barrier:
+        danger = part("label", (), bad, blank.barrier, lambda key: _label(told, blank.barrier, settings, key, quiet))
+        ahead = part(
+            "future",
+            ("label",),
+            bad,
+            blank.barrier,
+            lambda key: cbf.fit_future(
+                danger,
+                told.arrays,
+                fitted,
+                key,
+                discount=s.future_discount,
+                expectile=s.expectile,
+                updates=s.future_updates,
+                quiet=quiet,
+            ),
+        )
+        danger = ahead
+    world = World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
+    facts, strange, unit = cards.judge(world, told, STRANGE, settings.missed)
+    if danger is not None:
+        world = eqx.tree_at(lambda w: w.barrier.unit, world, jnp.asarray(unit, jnp.float32))
+    facts = {
+        "format": FORMAT,
+        "data": {
+            "task": store.card["task"],
+            "content": store.content,
+            "episodes": store.episodes,
+            "hazard": store.card["hazard"],
+        },
+        "settings": dataclasses.asdict(settings),
+        "seed": seed,
+        "shape": _shape_in_words(danger),
+        "seconds": {k: round(v, 1) for k, v in seconds.items()} | {"in all": round(time.perf_counter() - begun, 1)},
+        **facts,
+    }
+    return World(acts, worth, world.barrier, jnp.asarray(strange, jnp.float32), map, spec, world.alone, Card(facts))
+
+
+@dataclass(eq=False)
+class _Told:
+    """A data set as fits and judges read it."""
+
+    store: EpisodeStore
+    map: features.FeatureMap
+    held: np.ndarray  # (E,) bool
+    label: np.ndarray | None  # (T,) or (T, N) bool: unsafe
+
+    def __post_init__(self):
+        self.arrays = WindowData(self.store, self.map).arrays
+        out = self.held[self.store.episode_of_step]
+        self.fitted, self.kept = np.flatnonzero(~out), np.flatnonzero(out)
+        self.longest = int(self.store.lengths.max()) + 1
+
+    def togo(self, discount: float):
+        return jnp.asarray(returns_to_go(self.store.rewards.mean(1), self.store.lengths, discount), jnp.float32)
+
+
+def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
+    """(E,) bool: the episodes that no part of a World of this seed learns from."""
+    if store.episodes < FEWEST:
+        raise UserError(
+            f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} or "
+            "more: cut long recordings into episodes."
+        )
+    out = np.zeros(store.episodes, bool)
+    count = max(1, round(HELD_OUT * store.episodes))
+    out[np.random.default_rng([seed, 77]).choice(store.episodes, count, replace=False)] = True
+    return out
+
+
+def labels_of(
+    store: EpisodeStore, map: features.FeatureMap, settings: Settings, hazard: hazards.BoundHazard | None
+) -> np.ndarray:
+    """(T,) or (T, N) bool: the steps that are unsafe, by costs or by the formula of the states that they lead to."""
+    name = store.card["task"]
+    if settings.labels == "formula":
+        if hazard is None or not hazard.has_formula:
+            raise UserError(
+                f"labels='formula' needs a formula of danger, which '{name}' has not; take labels='costs', or give its "
+                "card a hazard."
+            )
+        row = np.arange(store.steps) + store.episode_of_step + 1
+        x = map(store.observations, store.state)
+        judge = jax.jit(lambda x: hazard.labels(x)[0])
+        unsafe = np.concatenate([np.asarray(judge(x[row[i : i + 100_000]])) for i in range(0, len(row), 100_000)])
+    else:
+        unsafe = store.costs > 0
+    share = unsafe.mean()
+    where = "the formula's labels" if settings.labels == "formula" else "the costs"
+    for empty, kind, none in ((0.0, "0", "unsafe"), (1.0, "above 0", "safe")):
+        if share == empty:
+            raise UserError(
+                f"No step of '{name}' is {none}: {where} are {kind} everywhere, so nothing tells a barrier what danger is; "
+                "give costs that are 0 on safe steps and above 0 on unsafe ones, or fit with barrier=False."
+            )
+    return unsafe
+
+
+def _label(told: _Told, blank: cbf.Barrier, settings: Settings, key: jax.Array, quiet: bool) -> cbf.Barrier:
+    """ℓ of a data set, with the statistics that it reads by."""
+    kd, kf = jax.random.split(key)
+    row = told.arrays["row"][told.fitted]
+    some = row[jax.random.randint(kd, (min(20_000, 4 * len(row)),), 0, len(row))]
+    n, d = told.arrays["features"].shape[1:]
+    before, after = (np.asarray(told.arrays["features"][k], np.float64) for k in (some, some + 1))
+    moved, flat = (after - before).reshape(-1, d), after.reshape(-1, d)
+    mean, scale = flat.mean(0), varying(flat.std(0), flat.mean(0))
+    mean, scale = cbf.isotropic(blank.shape, mean, scale)
+    step_scale = varying(moved.std(0), np.abs(mean) + scale)
+    stats = [jnp.asarray(v, jnp.float32) for v in (mean, scale, moved.mean(0), step_scale)]
+    start = eqx.tree_at(lambda b: (b.mean, b.scale, b.step_mean, b.step_scale), blank, stats)
+    any_unsafe = told.label if told.label.ndim == 1 else told.label.any(1)
+    bad, fine = (told.fitted[any_unsafe[told.fitted] == x] for x in (True, False))
+    if not len(bad) or not len(fine):
+        raise UserError(
+            f"All unsafe steps of '{told.store.card['task']}' lie in the episodes that are held out; log more of them, "
+            "or take another seed."
+        )
+    data = told.arrays["features"], told.arrays["row"], jnp.asarray(told.label)
+    sizes = dict(loss=settings.loss, updates=settings.barrier_updates, width=settings.barrier_width)
+    return cbf.fit_label(start, data, bad, fine, kf, **sizes, quiet=quiet)
+
+
+def _blank(map: features.FeatureMap, spec: Spec, s: Settings) -> World:
+    """Zeros in the shapes of a World."""
+    acts = dynamics.blank_dynamics(map, spec.action_dim, s.members, s.dynamics_width)
+    worth = values.blank_values(map, spec.action_dim, s.discount, s.sight == "own")
+    danger = cbf.blank_barrier(map, s.barrier_width, s.both_ends) if s.barrier else None
+    return World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
+
+
+def _shape_in_words(barrier: cbf.Barrier | None) -> str:
+    if barrier is None:
+        return "no barrier"
+    shape = barrier.shape
+    if shape.pairs:
+        kinds = ", ".join(f"{len(entries)} x {kind}" for kind, entries in shape.pairs)
+        return f"one network for all pairs ({kinds}), the worst one counts"
+    if shape.joint or shape.blame == "all":
+        return "one body: everybody answers for its danger"
+    return (
+        "one network per agent on all it sees; no names like other0.dx tell which entries belong to which other, so "
+        "pairs could not be told apart"
+    )
+
+
+def digest(store: EpisodeStore, names: tuple[str, ...]) -> str:
+    """Of some of a store's arrays."""
+    found = hashlib.blake2b(digest_size=8)
+    for name in names:
+        array = getattr(store, name)
+        if array is not None:
+            found.update(f"{name} {array.shape} {array.dtype}".encode())
+            found.update(np.ascontiguousarray(array).data)
+    return found.hexdigest()
+
+
+# --- files ---
+
+
+def _write(file: Path, tree: PyTree) -> None:
+    with whole(file) as temporary:
+        save_file(named_arrays(tree), temporary)
+
+
+def _read(file: Path, template: PyTree) -> PyTree | None:
+    """A cached part; None where there is none, or a damaged one."""
+    if not file.exists():
+        return None
+    try:
+        return load_named(file, template)
+    except (SafetensorError, OSError, UserError):
+        return None
+
+
+def save(world: World, path: str | Path) -> Path:
+    """Write one file, whole or not at all: arrays, and the card as its metadata."""
+    path = Path(path)
+    about = {"map": features.to_dict(world.map), "spec": dataclasses.asdict(world.spec), "card": world.card.told}
+    with whole(path) as temporary:
+        save_file(named_arrays(world), temporary, {"ringfence_world": json.dumps(about)})
+    return path
+
+
+def load(
+    path: str | Path, map_of: Callable[[str, str, dict], features.FeatureMap | None] = lambda task, view, hazard: None
+) -> World:
+    """The World in a file. `map_of` gives the view of a simulated task (tasks.py); of own data the file tells all."""
+    path = Path(path)
+    try:
+        with safe_open(path, "numpy") as f:
+            about: dict[str, Any] = json.loads((f.metadata() or {})["ringfence_world"])
+        told = about["card"]
+        settings = Settings(**told["settings"])
+        spec = Spec(**{**about["spec"], "feature_names": tuple(about["spec"]["feature_names"])})
+        map = map_of(spec.task, settings.view, told["data"]["hazard"]) or features.from_dict(about["map"])
+        map = features.alone(map) if settings.sight == "own" else map
+        if map.names != spec.feature_names:
+            raise UserError(f"'{path}' is a World of another view; fit it again.")
+        world = load_named(path, _blank(map, spec, settings))
+    except UserError:
+        raise
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"'{path}' is no World that can be read ({type(error).__name__}); fit it again with `ringfence fit`."
+        ) from error
+    return dataclasses.replace(world, card=Card(told))

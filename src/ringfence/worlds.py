@@ -1,0 +1,105 @@
+"""Worlds of data sets and of runs: which settings, from where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ringfence import features, hazards, tasks
+from ringfence.data.origin import regenerated
+from ringfence.data.store import EpisodeStore
+from ringfence.errors import UserError
+from ringfence.runs import Run, build_config
+from ringfence.tasks import Task
+from ringfence.world import Settings, World
+from ringfence.world import load as load_world
+from ringfence.world.fitting import fit_view
+
+WORLD = "world.safetensors"  # in a run folder: the World that training read
+
+
+def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Settings:
+    """The settings of a World of this data: the task's own where it has some, and labels from its costs if they tell
+    safe steps from unsafe ones, else from its formula; without either, no barrier."""
+    task = task or tasks.from_store(store)
+    told = {"view": "decentralized" if changes.get("sight") == "own" else "pruned", **task.world}
+    costs = store.costs > 0
+    if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
+        formula = not isinstance(task.hazard, hazards.CostColumn)
+        told |= {"labels": "formula"} if formula else {"barrier": False}
+    return build_config(Settings, {**told, **changes}, "the World")
+
+
+def fit(store: EpisodeStore, *, seed: int = 0, cached: bool = True, quiet: bool = True, **changes) -> World:
+    """The World of a store (T + E rows, N agents); `changes` are fields of Settings. Cached by content: the same data,
+    settings and seed are fitted once.
+
+    world = ringfence.fit(store); print(world.card)
+    """
+    if not isinstance(store, EpisodeStore):
+        raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise UserError(f"seed={seed!r} must be a whole number, 0 or more.")
+    task = tasks.from_store(store)
+    settings = settings_for(store, task, **changes)
+    map = task.feature_map(settings.view, store)
+    spec = task.spec(map, store)
+    try:
+        hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
+    except UserError:
+        if settings.labels == "formula" and settings.barrier:
+            raise
+        hazard = None
+    return fit_view(store, map, spec, settings, hazard=hazard, seed=int(seed), cached=cached, quiet=quiet)
+
+
+def of_run(run: Run, sight: str = "all", world: World | str | Path | None = None, quiet: bool = True) -> World:
+    """The World of a run's data and seed: the one that is given, that of its folder, or one that is fitted to the data
+    that this package regenerates; of anybody's own data it has to be given."""
+    told = run.config
+    if world is not None:
+        world = world if isinstance(world, World) else load(world)
+        _of_same(run, world, sight)
+        return world
+    kept = run.path / WORLD
+    if sight == "all" and kept.exists():
+        return load(kept)
+    card = told["data"]
+    if not regenerated(card) or told["task"] not in tasks.TASKS:
+        raise UserError(
+            f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
+            f"STORE --out FILE{' --sight own' if sight == 'own' else ''}` and name it with world=FILE."
+        )
+    from ringfence.data.make import make
+
+    size = card.get("size", card.get("transitions"))
+    store, _ = make(tasks.get(told["task"]), size, card.get("seed", 0))
+    return fit(store, seed=told["seed"], sight=sight, quiet=quiet)
+
+
+def _of_same(run: Run, world: World, sight: str) -> None:
+    """Refuse a World of other data, or of another sight."""
+    told = run.config
+    here, there = told["data"].get("content"), world.card["data"]
+    apart = told["task"] != there["task"] or (here is not None and here != there["content"])
+    if apart:
+        raise UserError(
+            f"The World is of '{there['task']}', the run '{run.path}' of other data ('{told['task']}'); fit one to the "
+            "data that the run was trained on."
+        )
+    if world.alone != (sight == "own"):
+        raise UserError(
+            f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; fit "
+            f"one with `ringfence fit STORE --sight {sight}`."
+        )
+
+
+def load(path: str | Path) -> World:
+    """The World in a file that `save` or `ringfence fit --out` wrote, or in a run folder."""
+
+    def map_of(task: str, view: features.View, hazard: dict) -> features.FeatureMap | None:
+        known = tasks.simulated(task, hazards.from_dict(hazard))
+        return None if known is None else known.feature_map(view)
+
+    return load_world(path, map_of)
