@@ -62,7 +62,13 @@ def small_store(played) -> EpisodeStore:
 
 # A World that is fitted in a second and knows little.
 QUICK_WORLD = dict(
-    members=2, dynamics_updates=20, dynamics_width=16, value_updates=20, barrier_updates=20, barrier_width=8, future_updates=20
+    members=2,
+    dynamics_updates=20,
+    dynamics_width=16,
+    value_updates=20,
+    barrier_updates=20,
+    barrier_width=8,
+    future_updates=20,
 )
 
 

@@ -43,10 +43,7 @@ def job_of(name):
 def trained(small_store, tmp_path_factory):
     """One tiny finished run of every algorithm."""
     out = tmp_path_factory.mktemp("runs")
-    return {
-        name: training.train(name, small_store, out=out, chunk=5, **job_of(name))[0]
-        for name in algos.ALGORITHMS
-    }
+    return {name: training.train(name, small_store, out=out, chunk=5, **job_of(name))[0] for name in algos.ALGORITHMS}
 
 
 @pytest.mark.parametrize("name", algos.ALGORITHMS)

@@ -18,6 +18,7 @@ WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
 FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
 LEAST = 1.0  # a margin, in log-odds
+ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 JUDGED = 3  # steps ahead that the margin is calibrated for
 
 
@@ -138,9 +139,12 @@ def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], fl
     h, truth = of(steps), unsafe[steps]
     share = unsafe[told.kept].mean()
     line = np.quantile(h[~truth], FALSE_ALARMS)
-    # The margin: foreseen scores of steps that came to be unsafe, from up to three steps before.
+    # The margin: foreseen scores, from up to three steps before, of steps that entered danger. Those that were in it
+    # already say little of where it begins: where a log is nearly all unsafe, most of them lie far beyond.
     first = np.asarray(told.arrays["first_row"])
-    seen, ends = [], rng.choice(bad, min(WINDOWS, len(bad)), replace=False)
+    entered = bad[(row[bad] > first[bad]) & ~unsafe[np.maximum(bad - 1, 0)]]
+    entered = entered if len(entered) >= ENTRIES else bad
+    seen, ends = [], rng.choice(entered, min(WINDOWS, len(entered)), replace=False)
     for back in range(JUDGED):
         start = ends - back
         start = start[(start >= 0) & (row[ends] - back >= first[ends])]
@@ -224,7 +228,7 @@ def words(told: dict[str, Any]) -> list[str]:
             f"{100 * row['safe_kept']:.3g} % of the safe steps have it"
         )
     lines.append(
-        f"Default margin {danger['margin']:.2g}: of 1000 unsafe steps, foreseen from up to {JUDGED} steps before, "
-        f"{1000 * danger['missed']:g} looked as safe as that."
+        f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "
+        f"before, {1000 * danger['missed']:g} looked as safe as that."
     )
     return lines

@@ -56,7 +56,7 @@ class Settings:
     both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
     barrier_width: int = 128  # units of each of 3 hidden layers
     barrier_updates: int = 6000  # of the labels
-    future_updates: int = 6000  # of the value of danger
+    future_updates: int = 3000  # of the value of danger
     future_discount: float = 0.95  # how far ahead danger is seen: 1 / (1 − it) steps
     expectile: float = 0.9  # of what the logs did, how near to the best
     missed: float = 0.001  # share of unsafe steps that may be foreseen at the default margin or above

@@ -1,0 +1,182 @@
+"""The guard: what it does with proposals, whoever makes them."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ringfence
+from ringfence import evaluate, hazards, tasks, worlds
+from ringfence.errors import UserError
+from ringfence.guards import Danger, Guard, GuardOptions
+from ringfence.guards.guard import pick
+from tests.conftest import QUICK_WORLD
+
+
+@pytest.fixture(scope="module")
+def bound(small_world):
+    return hazards.bind(hazards.Separation(), small_world.spec.feature_names, 3)
+
+
+def make(world, bound, source="formula", **options) -> Guard:
+    return Guard(world, Danger(world, source, bound, False), GuardOptions(**options))
+
+
+@pytest.fixture(scope="module")
+def present(small_store, small_world):
+    return jnp.asarray(small_world.map(small_store.observations, small_store.state)[:64])
+
+
+def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, bound, present):
+    """Actions are left alone where the plan keeps its margin, and otherwise lead to more clearance, within bounds."""
+    plan = jnp.zeros((64, 3, 3, 2))
+    last = jnp.zeros_like(plan)
+    found = {}
+    for name, margin in (("easy", -90.0), ("hard", 4.0)):
+        guard = make(small_world, bound, shield=8)
+        found[name] = eqx.filter_jit(guard.decide)(present, plan[:, None], last, jnp.full(64, margin), jax.random.key(0))
+    np.testing.assert_array_equal(found["easy"].plan, plan)
+    assert not found["easy"].short.any()
+    assert np.abs(found["hard"].plan).max() <= 1.0
+    short = np.asarray(found["easy"].safety.min(-1)) < 4.0
+    assert 5 < short.sum()
+    assert (found["hard"].safety.min(-1) - found["easy"].safety.min(-1))[short].mean() > 0
+    assert found["hard"].short.any()  # what cannot be met is said
+
+
+def test_the_shield_never_makes_it_worse(small_world, bound, present):
+    guard = make(small_world, bound, shield=3)
+    plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-1, maxval=1)
+    margin = jnp.full(64, 3.0)
+
+    def missing(plan):
+        rows, spread = guard.foreseen(present, plan[:, None])
+        return guard.missing(present, guard.danger.along(rows, spread)[:, 0], margin).sum((1, 2))
+
+    assert (missing(guard.shielded(present, plan, margin)) >= missing(plan) - 1e-5).all()
+
+
+def test_refining_climbs_value(small_world, bound, present):
+    guard = make(small_world, bound, refine=10, starts=4, care=0.0)
+    plan = jnp.zeros((64, 1, 3, 3, 2))
+    worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
+    better = guard.refined(present, plan, jnp.zeros(64))
+    assert (worth(better) > worth(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
+    starts = guard.started(plan, jnp.full((64, 3, 3, 2), 0.5), jax.random.key(0))
+    assert starts.shape[1] == 4
+    np.testing.assert_array_equal(starts[:, 0], plan[:, 0])
+    assert (starts[:, 1] == 0.5).all()  # the last plan, moved on
+
+
+def test_the_best_of_the_safe_ones_is_taken():
+    safety, value = jnp.asarray([[0.0, 2.0, 3.0], [0.0, 0.1, 0.2]]), jnp.asarray([[9.0, 5.0, 1.0], [9.0, 5.0, 1.0]])
+    np.testing.assert_array_equal(pick(safety, value, 1.0), [1, 2])  # the second has no safe one: the safest
+
+
+def test_agents_that_are_alone_hear_of_nobody(small_store, present):
+    """Nobody's action depends on what another one sees or would do."""
+    world = worlds.fit(small_store, sight="own", **QUICK_WORLD)
+    assert world.alone and world.map.view == "decentralized"
+    seen = jnp.asarray(small_store.observations[:16])
+    bound = hazards.bind(hazards.Separation(), world.spec.feature_names, 3)
+    guard = make(world, bound, shield=4, refine=3, starts=3, select=True)
+    plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
+    last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3)), jax.random.key(0)
+    here = world.map(seen, None)
+    a = guard.decide(here, plan, last, margin, key)
+    b = guard.decide(here.at[:, 1].add(0.3), plan.at[..., 1, :].set(0.9), last, margin.at[:, 1].set(2.0), key)
+    np.testing.assert_allclose(a.plan[..., 0, :], b.plan[..., 0, :], atol=1e-6)
+    np.testing.assert_allclose(a.plan[..., 2, :], b.plan[..., 2, :], atol=1e-6)
+    assert a.chosen.shape == (16, 3)
+
+
+def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
+    """However wrong foresight is, the share of unsafe steps tends to the chosen one (Gibbs and Candès 2021)."""
+    guard = make(small_world, bound, shield=1, adapt=0.2, rate=0.05)
+    wrong = jnp.asarray([0.0, 0.1, 0.5])  # that foresight is off by, and tenfold in every hundredth step
+
+    def step(margin, key):
+        more, now = jax.random.split(key)
+        error = wrong * jnp.abs(jax.random.normal(now, (3,))) * (1 + 9 * (jax.random.uniform(more, (3,)) < 0.01))
+        unsafe = margin - error < 0  # the shield keeps what it foresees
+        return guard.adapted(margin, unsafe), (margin, unsafe)
+
+    _, (margins, unsafe) = jax.lax.scan(step, jnp.full(3, 1.0), jax.random.split(jax.random.key(0), 8000))
+    np.testing.assert_allclose(unsafe[2000:].mean(0)[1:], 0.05, atol=0.01)
+    kept = margins[2000:].mean(0)
+    assert kept[0] < 0.05 and kept[1] < kept[2]  # no more is kept than the errors ask for
+    assert float(guard.adapted(jnp.full(1, 2.99), jnp.ones(1, bool))[0]) == 3.0  # bounded
+
+
+def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
+    from ringfence.guards.policy import build
+    from ringfence.policies import Constant
+
+    policy = build(Constant(small_world.spec), small_world, hazards.Separation(), "adapt", "formula")
+    seen, state = small_store.observations[:2], small_store.state[:2]
+    memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))
+    assert (memory["margin"] == np.float32(0.6)).all()  # nobody chose the first state
+    memory, _ = policy.act(policy.hear(memory, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
+    o = policy.guard.options
+    expected = 0.6 + o.adapt * (np.array([0.0, 1.0]) - o.rate)
+    np.testing.assert_allclose(memory["margin"], expected, rtol=1e-5)
+
+
+def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
+    danger = Danger(small_world, "learned", None, False)
+    rows = jnp.stack([present, present], 1)[:, None]
+    near = danger.along(rows, jnp.zeros((64, 1, 1, 3)))
+    far = danger.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.strange))
+    np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
+
+
+def test_the_smaller_of_both(small_world, bound, present):
+    rows, spread = jnp.stack([present, present], 1)[:, None], jnp.zeros((64, 1, 1, 3))
+    told = {s: Danger(small_world, s, bound, False).along(rows, spread) for s in ("formula", "learned", "both")}
+    np.testing.assert_array_equal(told["both"], jnp.minimum(told["formula"], told["learned"]))
+
+
+def test_any_callable_is_guarded(small_world, small_store):
+    """A controller of NumPy arrays; what it may not return is said in a sentence."""
+    seen, state = small_store.observations[0], small_store.state[0]
+    pilot = ringfence.guard(lambda observations, state: np.zeros((3, 2)), small_world)
+    action, info = pilot.act(seen, state)
+    assert action.shape == (3, 2) and {"infeasible", "strange"} <= set(info)
+    pilot.reset()
+    pilot.act(seen, state, cost=1.0)
+    for wrong, said in (
+        (np.full((3, 2), np.nan), "returned actions that are not finite"),
+        (np.zeros((2, 2)), r"returned actions of shape \(2, 2\); this World takes \(3, 2\)"),
+        ("left", "returned no array of numbers"),
+    ):
+        with pytest.raises(UserError, match=said):
+            ringfence.guard(lambda *_, wrong=wrong: wrong, small_world).act(seen, state)
+    with pytest.raises(UserError, match="needs a formula that the World's view can read"):
+        ringfence.guard(lambda *_: np.zeros((3, 2)), small_world, danger="formula")
+    with pytest.raises(UserError, match="give a callable"):
+        ringfence.guard(3, small_world)
+    with pytest.raises(UserError, match="for a World"):
+        ringfence.guard(lambda *_: 0, None)
+
+
+def test_a_world_of_other_data_is_refused(small_store, tmp_path):
+    from ringfence import training
+
+    tiny = dict(changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)
+    run = training.train("bc", small_store, **tiny)[0]
+    card = {**small_store.card, "task": "other"}
+    other = worlds.fit(dataclasses.replace(small_store, card=card), **QUICK_WORLD)
+    with pytest.raises(UserError, match="The World is of 'other', the run .* of other data"):
+        evaluate.load(run, guard="shield", world=other)
+    with pytest.raises(UserError, match="needs the World of its data"):
+        evaluate.load(run, guard="shield")  # nothing that this package regenerates
+    alone = worlds.fit(small_store, sight="own", **QUICK_WORLD)
+    with pytest.raises(UserError, match="fitted with sight=own, the guard is to have sight=all"):
+        evaluate.load(run, guard="shield", world=alone)
+    same = worlds.fit(small_store, **QUICK_WORLD)
+    result = evaluate.evaluate(run, episodes=2, guard="shield", world=same)
+    assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible"] <= 1
+    assert tasks.get("simple_spread-random").name == result["task"]

@@ -1,0 +1,168 @@
+"""The World: what is learned of the logs before and without a policy."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import features, hazards, tasks, world, worlds
+from ringfence.errors import UserError
+from ringfence.features import FeatureMap
+from ringfence.world import barrier as cbf
+from ringfence.world import card
+from tests.conftest import QUICK_WORLD
+
+
+def with_costs(store, costs, task="mine"):
+    card = {**store.card, "task": task, "hazard": {"kind": "CostColumn"}}
+    return dataclasses.replace(store, costs=np.asarray(costs, np.float32), card=card)
+
+
+def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, tmp_path, monkeypatch):
+    """From the cache the second time, to the last bit; and from a file of its own."""
+    monkeypatch.setattr("ringfence.world.dynamics.regress", lambda *_, **__: pytest.fail("it was fitted again"))
+    again = worlds.fit(small_store, **QUICK_WORLD)
+    loaded = worlds.load(world.save(small_world, tmp_path / "w.safetensors"))
+    for other in (again, loaded):
+        for a, b in zip(jax.tree.leaves(small_world), jax.tree.leaves(other), strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert loaded.card["seed"] == 0 and str(loaded.card) == str(small_world.card)
+    (tmp_path / "w.safetensors").write_bytes(b"none")
+    with pytest.raises(UserError, match="is no World that can be read"):
+        worlds.load(tmp_path / "w.safetensors")
+
+
+def test_held_out_episodes_are_whole_and_differ_between_seeds(small_store):
+    from ringfence.world.fitting import held_out
+
+    a, b = held_out(small_store, 0), held_out(small_store, 1)
+    assert a.sum() == b.sum() == 4 and (a != b).any()
+    few = small_store.select(np.arange(small_store.episodes) < 4)
+    with pytest.raises(UserError, match="has 4 episodes, too few to hold some out"):
+        worlds.fit(few, **QUICK_WORLD)
+
+
+@pytest.mark.parametrize(("value", "said"), [(0.0, "No step of 'mine' is unsafe"), (1.0, "No step of 'mine' is safe")])
+def test_costs_that_tell_nothing_are_refused(small_store, value, said):
+    with pytest.raises(UserError, match=said):
+        worlds.fit(with_costs(small_store, np.full(small_store.steps, value)), **QUICK_WORLD, barrier=True)
+    assert worlds.fit(with_costs(small_store, np.full(small_store.steps, value)), **QUICK_WORLD).barrier is None
+
+
+def test_a_formula_that_is_not_there_is_refused(small_store):
+    with pytest.raises(UserError, match="labels='formula' needs a formula of danger"):
+        worlds.fit(with_costs(small_store, small_store.costs), **QUICK_WORLD, labels="formula")
+    with pytest.raises(UserError, match="did you mean 'members'"):
+        worlds.fit(small_store, membres=3)
+
+
+def test_names_tell_who_is_who():
+    """Pairs of own movement and each other; the own net reads what is about nobody else; bodies are read whole."""
+    spread = features.simple_spread("pruned", 3)
+    shape = cbf.shape_of(spread)
+    (kind, pairs), *more = shape.pairs
+    assert kind == "other" and not more and len(pairs) == 2 and shape.groups == 1 and shape.blame == "worst"
+    told = [spread.names[d] for d in pairs[1]]
+    assert told == ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"] or sorted(told) == sorted(
+        ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"]
+    )
+    assert "own.x" in [spread.names[d] for d in shape.own]
+    body = cbf.shape_of(tasks.get("ant_4x2-poor").feature_map("pruned"))
+    assert body.joint and body.blame == "all" and body.both_ends and not body.pairs
+    table = np.zeros((2, 3), int)
+    unnamed = FeatureMap("pruned", ("a", "b", "c"), "observations", table, table - 1)
+    assert cbf.shape_of(unnamed).groups == 2 and not cbf.shape_of(unnamed).pairs
+
+
+def test_the_worst_agent_explains_the_teams_cost():
+    """Three points on a line, one cost for all when any two are within 0.1: who was near is found out, and an offset turned
+    by any angle scores the same in distance."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform(-1, 1, (4000, 3, 2))
+    gap = np.stack([p[:, [j for j in range(3) if j != i]] - p[:, i : i + 1] for i in range(3)], 1)  # (M, N, 2, 2)
+    x = np.concatenate([p, gap.reshape(len(p), 3, 4)], -1).astype(np.float32)
+    names = ("own.x", "own.y", "other0.dx", "other0.dy", "other1.dx", "other1.dy")
+    table = np.tile(np.arange(6), (3, 1))
+    map = FeatureMap("pruned", names, "observations", table, table * 0 - 1)
+    near = np.linalg.norm(gap, axis=-1).min(-1) < 0.3  # (M, N)
+    unsafe = near.any(-1)[1:]
+    blank = cbf.blank_barrier(map, 32)
+    data = jnp.asarray(x), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
+    steps = np.arange(len(x) - 1)
+    told = dict(loss="cross-entropy", updates=800, width=32)
+    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **told)
+    h = np.asarray(fitted.of_steps(jnp.asarray(x), jnp.asarray(x)))
+    assert ((h < 0) == near).mean() > 0.95  # each agent's own danger, though nobody's was ever told
+    assert np.abs(h).max() <= cbf.FARTHEST
+
+
+def test_danger_is_seen_ahead():
+    """A point that runs into a wall and cannot turn: V tells it long before ℓ does."""
+    rng = np.random.default_rng(0)
+    episodes, steps = 300, 12
+    v = rng.uniform(-1, 1, (episodes, 1))
+    x = rng.uniform(-0.5, 0.5, (episodes, 1)) + 0.1 * v * np.arange(steps + 1)
+    rows = np.stack([x, np.repeat(v, steps + 1, 1)], -1).reshape(-1, 1, 2).astype(np.float32)
+    row = (np.arange(episodes)[:, None] * (steps + 1) + np.arange(steps)).ravel()
+    unsafe = rows[row + 1, 0, 0] > 0.8
+    table = np.zeros((1, 2), int)
+    blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), 32)
+    told = dict(loss="cross-entropy", updates=500, width=32)
+    data = jnp.asarray(rows), jnp.asarray(row), jnp.asarray(unsafe)
+    every = np.arange(len(row))
+    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **told)
+    arrays = {"features": data[0], "row": data[1], "terminated": jnp.zeros(len(row), bool)}
+    ahead = cbf.fit_future(
+        fitted, arrays, every, jax.random.key(1), discount=0.9, expectile=0.9, updates=2000, rate=0.02
+    )
+    doomed, fine = jnp.asarray([[[0.4, 0.9]]]), jnp.asarray([[[0.4, -0.9]]])
+    assert fitted.of_steps(doomed, doomed) > 0 and fitted.of_steps(fine, fine) > 0
+    assert ahead.ahead(doomed) < 0 < ahead.ahead(fine)
+
+
+def test_conformal_quantiles_cover_what_they_say():
+    rng = np.random.default_rng(0)
+    covered = [rng.normal() <= card.conformal(rng.normal(size=99), 0.9) for _ in range(4000)]
+    assert np.mean(covered) == pytest.approx(0.9, abs=0.02)
+    assert card.conformal(np.arange(5.0), 0.99) == 4.0  # too few to say more
+
+
+def test_own_entries_tell_the_rest_where_the_logs_agree(played):
+    """Offsets and relative velocities of anybody's data follow from everybody's own movement; one that does not is
+    predicted. A state that repeats what is observed adds nothing."""
+    view = features.simple_spread("pruned", 3)
+    x = view(None, played["state"]).reshape(-1, 3, 18)
+    state = played["state"].reshape(len(x), -1)
+    odd = x.copy()
+    odd[..., view.names.index("other0.dx")] = np.random.default_rng(0).normal(size=x.shape[:2])
+    firsts = np.arange(0, len(x), 26)
+    names = tuple(f"s{k}" for k in range(state.shape[1]))
+    found = features.from_data("pruned", x, state, view.names, names, firsts)
+    assert found.names == view.names and set(found.own) == set(view.own)
+    again = features.from_dict(features.to_dict(found))
+    plan = jnp.asarray(x[:8].reshape(1, 8, 3, 18) + 0.1)
+    np.testing.assert_allclose(again.reconcile(plan), view.reconcile(plan), atol=1e-5)
+    broken = features.from_data("pruned", odd, None, view.names, (), firsts)
+    assert view.names.index("other0.dx") in broken.own
+
+
+def test_a_hazard_keeps_what_it_reads(small_store):
+    card = {**small_store.card, "task": "mine", "observation_names": None, "hazard": hazards.Separation(0.3)}
+    card = {**card, "hazard": hazards.to_dict(card["hazard"])}
+    own = dataclasses.replace(small_store, card=card)
+    task = tasks.from_store(own)
+    assert {"agent0.x", "agent2.y"} <= set(task.feature_map("pruned", own).names)
+
+
+def test_costs_per_agent_label_agents(small_store):
+    """(T, N) costs: the team's is the largest, and every agent learns from its own."""
+    view = features.simple_spread("pruned", 3)
+    bound = hazards.bind(hazards.Separation(), view.names, 3)
+    row = np.arange(small_store.steps) + small_store.episode_of_step + 1
+    each = np.asarray(bound.labels(jnp.asarray(view(None, small_store.state[row])))[0])
+    own = with_costs(small_store, each)
+    np.testing.assert_array_equal(own.team_costs, each.any(1))
+    np.testing.assert_array_equal(own.episode_costs, small_store.episode_costs)
+    assert worlds.fit(own, **QUICK_WORLD).barrier is not None
