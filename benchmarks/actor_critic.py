@@ -31,19 +31,20 @@ def ours(algorithm: str, store, updates: int) -> tuple[float, float]:
     task = tasks.from_store(store)
     job = training.make_job(algorithm, task, None, {}, store)
     c = job.config
-    data = training.windows_of(store, task, c)
+    data = training.windows_of(job, store)
     state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     state = jax.tree.map(lambda x: x[None], state)
     begun = time.perf_counter()
-    state, metrics = advance(state, roots, data.arrays, 1)
+    scores = data.arrays["scores"][None]
+    state, metrics = advance(state, roots, data.arrays, scores, 1)
     jax.block_until_ready(metrics)
     compiling = time.perf_counter() - begun
     rates = []
     for _ in range(3):
         begun = time.perf_counter()
-        state, metrics = advance(state, roots, data.arrays, updates)
+        state, metrics = advance(state, roots, data.arrays, scores, updates)
         jax.block_until_ready(metrics)
         rates.append(updates / (time.perf_counter() - begun))
     return sorted(rates)[1], compiling

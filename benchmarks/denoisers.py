@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from _common import record
 
-from ringfence import tasks, training
+from ringfence import tasks, training, worlds
 from ringfence.data.make import make
 from ringfence.evaluate import evaluate_policy, make_policy
 
@@ -60,15 +60,17 @@ def trial(store, task, changes: dict, updates: int):
     """((job, state), ms per update) after `updates`, the first ten not timed."""
     job = training.make_job("madiff", task, None, changes, store)
     c = job.config
-    data = training.windows_of(store, task, c)
-    state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
+    world = worlds.fit(store, **job.world)
+    data = training.windows_of(job, store, world)
+    state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard, world)
+    scores = data.arrays["scores"][None]
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     state = jax.tree.map(lambda x: x[None], state)
-    state, metrics = advance(state, roots, data.arrays, 10)
+    state, metrics = advance(state, roots, data.arrays, scores, 10)
     jax.block_until_ready(metrics)
     begun = time.perf_counter()
-    state, metrics = advance(state, roots, data.arrays, updates - 10)
+    state, metrics = advance(state, roots, data.arrays, scores, updates - 10)
     jax.block_until_ready(metrics)
     ms = (time.perf_counter() - begun) / (updates - 10) * 1e3
     return (job, jax.tree.map(lambda x: x[0], state)), ms

@@ -27,7 +27,9 @@ def main() -> None:
             print(f"{folder}: no checkpoint here, left as it is")
             continue
         for variant, result in run.results.items():
-            _, policy = evaluate.load(run, **result["options"])
+            guard = {k: result[k] for k in ("guard", "danger", "sight")} | result["guard_options"]
+            guard = guard if result.get("guard", "none") != "none" else {}
+            _, policy = evaluate.load(run, **result["options"], **guard)
             took = evaluate.plan_latency(policy, tasks.get(a.task))
             run.add_result(variant, result | took)
             print(f"{folder.parent.name} {variant}: {took['plan_ms_p50']:.2f} ms, p99 {took['plan_ms_p99']:.2f}")

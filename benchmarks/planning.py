@@ -17,12 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from _common import record
 
-from ringfence import tasks, training
+from ringfence import tasks, training, worlds
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
 from ringfence.evaluate import make_policy, plan_latency
-from ringfence.policies import PLANNERS
+from ringfence.guards import guard
 from ringfence.tasks import Task
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "planning.json"
@@ -49,22 +49,25 @@ def measure_team(n: int, updates: int) -> tuple[dict[str, float], tuple]:
     """Milliseconds per update (batch 128), seconds to compile it, and the job and state for planning."""
     task = team_task(n)
     store = random_store(task, 400)
-    job = training.make_job("icbf", task, None, {"critic_updates": 10, "dynamics_updates": 10}, store)
-    data = training.windows_of(store, task, job.config)
-    state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard)
+    quick = {f"{part}_updates": 10 for part in ("dynamics", "value", "barrier", "future")}
+    job = training.make_job("icbf", task, None, {}, store, quick)
+    world = worlds.fit(store, **job.world)
+    data = training.windows_of(job, store, world)
+    state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard, world)
+    scores = data.arrays["scores"][None]
     advance, _ = training.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     stacked = jax.tree.map(lambda x: x[None], state)
     begun = time.perf_counter()
-    compiled = advance.lower(stacked, roots, data.arrays, updates).compile()
+    compiled = advance.lower(stacked, roots, data.arrays, scores, updates).compile()
     compile_seconds = time.perf_counter() - begun
     took = []
     for _ in range(6):
         begun = time.perf_counter()
-        stacked, metrics = compiled(stacked, roots, data.arrays, updates)
+        stacked, metrics = compiled(stacked, roots, data.arrays, scores, updates)
         jax.block_until_ready(metrics)
         took.append((time.perf_counter() - begun) / updates * 1e3)
-    return {"update_ms": float(np.median(took[1:])), "compile_s": compile_seconds}, (job, state)
+    return {"update_ms": float(np.median(took[1:])), "compile_s": compile_seconds}, (job, state, world)
 
 
 def main() -> None:
@@ -81,14 +84,16 @@ def main() -> None:
         print(f"{name}: {value:.4g} {unit}", flush=True)
 
     for n in a.teams:
-        cost, (job, state) = measure_team(n, a.updates)
+        cost, (job, state, world) = measure_team(n, a.updates)
         row(f"training update, {n} agents, batch {job.config.batch}", cost["update_ms"], "ms")
         row(f"training update per agent, {n} agents", cost["update_ms"] / n, "ms")
         row(f"compile time of the training step, {n} agents", cost["compile_s"], "s")
-        for name, chosen in (("8 plans", {"plans": 8}), ("guarded, 8 plans", PLANNERS["guarded"])):
-            took = plan_latency(make_policy(job, state, dict(chosen)), job.task, a.calls)
-            row(f"one joint action, {name}, {n} agents, p50", took["plan_ms_p50"], "ms")
-            row(f"one joint action, {name}, {n} agents, p99", took["plan_ms_p99"], "ms")
+        planner = make_policy(job, state, {})
+        for name in ("select", "full"):
+            policy = guard(planner, world, guard=name)
+            took = plan_latency(policy, job.task, a.calls)
+            row(f"one joint action, guard {name}, {n} agents, p50", took["plan_ms_p50"], "ms")
+            row(f"one joint action, guard {name}, {n} agents, p99", took["plan_ms_p99"], "ms")
     row("peak memory of this benchmark", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "GiB")
     record(a.out, rows)
 

@@ -3,7 +3,7 @@
     python benchmarks/robot_planner.py            # writes results/performance/robot_planner.json; a quarter of an hour
 
 Training is what `ringfence train icbf TASK` does with the task's preset, reading the data, the critic and compilation
-included; playing is `ringfence eval --planner shielded --episodes 20`. Each in a process of its own, on all cores.
+included; playing is `ringfence eval --planner steady --guard adapt --episodes 20`. Each in a process of its own, on all cores.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ if what == "train":
     changes = {"steps": steps} if steps else {}
     training.train("icbf", make(task)[0], folder=lambda seed: folder, changes=changes, quiet=True)
 else:
-    evaluate.evaluate(Run(folder), episodes=20, split="validation", planner=what)
+    guard = {"guard": what} if what != "none" else {}
+    evaluate.evaluate(Run(folder), episodes=20, split="validation", planner="steady", **guard)
 print(json.dumps([time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20]))
 """
 
@@ -50,8 +51,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             for what, name in (
                 ("train", "icbf, training one seed"),
-                ("plain", "icbf, 20 episodes, plain"),
-                ("shielded", "icbf, 20 episodes, 4 plans and shield"),
+                ("none", "icbf, 20 episodes, steady"),
+                ("adapt", "icbf, 20 episodes, shield that adapts"),
             ):
                 command = [sys.executable, "-c", MEASURED, what, task, f"{folder}/run", str(a.steps)]
                 done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)

@@ -1,7 +1,7 @@
 """What was tried on validation resets, as a table: one row per evaluation of the given run folders.
 
     ringfence train icbf halfcheetah_2x3-good --out runs/trials --set barrier_weight=3
-    ringfence eval runs/trials --split validation --episodes 10 --planner shielded
+    ringfence eval runs/trials --split validation --episodes 10 --planner steady --guard adapt
     python benchmarks/trials.py runs/trials/*/*/*          # writes results/tuning/mujoco.csv
 
 `changes` are the config fields that differ from the algorithm's defaults, `planner` the options that do.
@@ -17,6 +17,7 @@ from pathlib import Path
 from _rows import write
 
 from ringfence import algos
+from ringfence.guards import GuardOptions
 from ringfence.policies import PlanOptions
 from ringfence.runs import Run
 
@@ -43,6 +44,7 @@ def rows_of(run: Run) -> list[dict]:
                     "seed": r["seed"],
                     "changes": config,
                     "planner": differing(r["options"], PlanOptions()),
+                    "guard": f"{r['guard']}-{r['danger']} " + differing(r["guard_options"], GuardOptions()),
                     "episodes": r["episodes"],
                     "return": round(r["return_mean"], 1),
                     "cost": round(r["cost_mean"], 2),

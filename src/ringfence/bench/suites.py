@@ -101,11 +101,8 @@ SUITES = {
     "guards": Suite(
         tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random")),
         (
-            Entry(
-                "bc",
-                evaluations=("plain", "shield-learned", "shield-formula", "full-learned", "full-formula", "full-learned-own"),
-            ),
-            Entry("mpc", evaluations=("full-learned", "full-formula", "full-learned-own")),
+            Entry("bc", evaluations=("plain", "shield-learned", "shield-formula", "full-learned", "full-learned-own")),
+            Entry("mpc", evaluations=("full-learned",)),
             Entry("icbf", "split", ("plain", "shield-learned", "full-learned", "full-formula")),
         ),
     ),

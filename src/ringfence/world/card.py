@@ -19,6 +19,7 @@ STEPS = 60_000  # held-out steps that scores are judged on
 FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
 LEAST = 1.0  # a margin, in log-odds
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
+OUTLIERS = 3  # entries that may look safe however few there are: one freak of foresight is not to set the margin
 JUDGED = 3  # steps ahead that the margin is calibrated for
 
 
@@ -153,6 +154,7 @@ def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], fl
             before = x[row[start]] if back == 0 else rows[:, -2]
             seen.append(np.asarray(score(barrier, before, rows[:, -1])))
     foreseen = np.concatenate(seen)
+    missed = max(missed, OUTLIERS / len(foreseen))
     unit = max(LEAST, conformal(foreseen, 1 - missed))
     table = [_of_margin(m, h, truth, foreseen, share) for m in sorted({0.0, 1.0, 2.0, 4.0, 8.0, round(unit, 2)})]
     facts = {
@@ -229,6 +231,6 @@ def words(told: dict[str, Any]) -> list[str]:
         )
     lines.append(
         f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "
-        f"before, {1000 * danger['missed']:g} looked as safe as that."
+        f"before, {1000 * danger['missed']:.2g} looked as safe as that."
     )
     return lines

@@ -54,7 +54,7 @@ class Settings:
     barrier: bool = True
     loss: cbf.Loss = "cross-entropy"  # of labels
     both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
-    barrier_width: int = 128  # units of each of 3 hidden layers
+    barrier_width: int = 64  # units of each of 3 hidden layers
     barrier_updates: int = 6000  # of the labels
     future_updates: int = 3000  # of the value of danger
     future_discount: float = 0.95  # how far ahead danger is seen: 1 / (1 − it) steps

@@ -1,0 +1,52 @@
+"""What a World and a guard cost: fitting, and milliseconds of one joint action.
+
+    python benchmarks/guard.py                # writes results/performance/guard.json; some minutes, on a quiet machine
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+from _common import record
+
+from ringfence import tasks, training, worlds
+from ringfence.data.make import make
+from ringfence.evaluate import load, plan_latency
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "guard.json"
+GUARDS = ("none", "shield", "full")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=["simple_spread-expert", "halfcheetah_2x3-medium", "ant_4x2-medium"])
+    parser.add_argument("--out", type=Path, default=OUT)
+    a = parser.parse_args()
+    rows = []
+
+    def row(name: str, value: float, unit: str) -> None:
+        rows.append({"name": name, "value": value, "unit": unit})
+        print(f"{name}: {value:.4g} {unit}", flush=True)
+
+    for name in a.tasks:
+        store, _ = make(tasks.get(name))
+        begun = time.perf_counter()
+        world = worlds.fit(store, cached=False)
+        row(f"{name}: fitting a World", time.perf_counter() - begun, "s")
+        with tempfile.TemporaryDirectory() as folder:
+            (run,) = training.train("bc", store, out=folder, changes={"steps": 200}, quiet=True)
+            for guard in GUARDS:
+                how = {} if guard == "none" else {"guard": guard, "world": world}
+                took = plan_latency(load(run, **how)[1], tasks.get(name))
+                row(f"{name}: cloning, guard {guard}, one joint action, p50", took["plan_ms_p50"], "ms")
+                row(f"{name}: cloning, guard {guard}, one joint action, p99", took["plan_ms_p99"], "ms")
+    row("peak memory of this benchmark", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "GiB")
+    record(a.out, rows)
+
+
+if __name__ == "__main__":
+    main()
