@@ -1,6 +1,6 @@
 """What a World and a guard cost: fitting, and milliseconds of one joint action.
 
-    python benchmarks/guard.py                # writes results/performance/guard.json; some minutes, on a quiet machine
+python benchmarks/guard.py                # writes results/performance/guard.json; some minutes, on a quiet machine
 """
 
 from __future__ import annotations
@@ -23,7 +23,9 @@ GUARDS = ("none", "shield", "full")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--tasks", nargs="+", default=["simple_spread-expert", "halfcheetah_2x3-medium", "ant_4x2-medium"])
+    parser.add_argument(
+        "--tasks", nargs="+", default=["simple_spread-expert", "halfcheetah_2x3-medium", "ant_4x2-medium"]
+    )
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
     rows = []

@@ -3,7 +3,8 @@
     python benchmarks/robot_planner.py            # writes results/performance/robot_planner.json; a quarter of an hour
 
 Training is what `ringfence train icbf TASK` does with the task's preset, reading the data, the critic and compilation
-included; playing is `ringfence eval --planner steady --guard adapt --episodes 20`. Each in a process of its own, on all cores.
+included; playing is `ringfence eval --planner steady --guard adapt --episodes 20`. Each in a process of its own, on
+all cores.
 """
 
 from __future__ import annotations

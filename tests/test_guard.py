@@ -37,7 +37,9 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
     found = {}
     for name, margin in (("easy", -90.0), ("hard", 4.0)):
         guard = make(small_world, bound, shield=8)
-        found[name] = eqx.filter_jit(guard.decide)(present, plan[:, None], last, jnp.full(64, margin), jax.random.key(0))
+        found[name] = eqx.filter_jit(guard.decide)(
+            present, plan[:, None], last, jnp.full(64, margin), jax.random.key(0)
+        )
     np.testing.assert_array_equal(found["easy"].plan, plan)
     assert not found["easy"].short.any()
     assert np.abs(found["hard"].plan).max() <= 1.0

@@ -77,7 +77,8 @@ def test_names_tell_who_is_who():
 
 
 def test_the_worst_agent_explains_the_teams_cost():
-    """Three points on a line, one cost for all when any two are within 0.1: who was near is found out, and an offset turned
+    """Three points on a line, one cost for all when any two are within 0.1: who was near is found out, and an offset
+    turned
     by any angle scores the same in distance."""
     rng = np.random.default_rng(0)
     p = rng.uniform(-1, 1, (4000, 3, 2))

@@ -339,7 +339,8 @@ def evaluate(
 
 
 def _options(assigned: dict[str, str], given: dict) -> dict[str, str]:
-    """What --set says of planner and guard; refused where a flag said it already, or where it is an option of neither."""
+    """What --set says of planner and guard; refused where a flag said it already, or where it is an option of
+    neither."""
     from ringfence.evaluate import asked
     from ringfence.guards import GuardOptions
     from ringfence.policies import PlanOptions

@@ -1,4 +1,5 @@
-"""The whole job in one command: data, a World, training without and with barrier, evaluation on the same resets as it is
+"""The whole job in one command: data, a World, training without and with barrier, evaluation on the same resets as it
+is
 and under guard, told the formula of danger and not, report."""
 
 from __future__ import annotations

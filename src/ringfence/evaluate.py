@@ -255,9 +255,12 @@ def evaluate_policy(
 def load(run: Run | str, step: int | None = None, planner: str = "plain", **options):
     """(job, policy) of a finished run.
 
-    `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards (guard.GUARDS),
-    `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every agent guards its own
-    action by its own view ("own"), `world` the World it reads (default: that of the run's data and seed). Other options are
+    `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards
+    (guard.GUARDS),
+    `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every agent guards its
+    own
+    action by its own view ("own"), `world` the World it reads (default: that of the run's data and seed). Other
+    options are
     fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """

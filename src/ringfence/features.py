@@ -284,7 +284,8 @@ def from_data(
 
 
 def _confirmed(map: FeatureMap, observations, state, first_rows, steps: int = 4000) -> dict[int, tuple[int, int]]:
-    """Those of the `derived` entries that logged steps confirm: nine in ten are foreseen to a twentieth of their change."""
+    """Those of the `derived` entries that logged steps confirm: nine in ten are foreseen to a twentieth of their
+    change."""
     how = derived(map.names, map.plus.shape[0])
     if not how or len(observations) < 3:
         return {}

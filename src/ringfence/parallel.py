@@ -36,7 +36,8 @@ def play(
     `make_env()` makes a PettingZoo `ParallelEnv` whose agents, in the order of `possible_agents`, are those of the
     run's data, and who begin and end together. `at_once` of them are stepped side by side, so that one compiled call
     acts in all. Episode k is reset with the seed 7 000 001 + k, on the split "validation", for choosing settings,
-    with 9 000 001 + k; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are as in
+    with 9 000 001 + k; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are
+    as in
     `evaluate.load`.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the

@@ -255,7 +255,8 @@ class _Options:
 def make_program(job: Job):
     """(advance, diagnose): compiled functions over a leading axis of seeds.
 
-    advance(state, keys, arrays, scores, count) makes `count` updates, a traced number, so that one compilation serves every
+    advance(state, keys, arrays, scores, count) makes `count` updates, a traced number, so that one compilation serves
+    every
     chunk length; it returns the new state and the chunk's mean metrics.
     """
     config = job.config

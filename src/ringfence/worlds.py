@@ -90,7 +90,8 @@ def _of_same(run: Run, world: World, sight: str) -> None:
         )
     if world.alone != (sight == "own"):
         raise UserError(
-            f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; fit "
+            f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; "
+            "fit "
             f"one with `ringfence fit STORE --sight {sight}`."
         )
 

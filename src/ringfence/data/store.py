@@ -138,7 +138,8 @@ class EpisodeStore:
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
-        costs (E, L), (E, L, N) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves (none, if
+        costs (E, L), (E, L, N) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves
+        (none, if
         it is not given)."""
         observations, actions = _numbers("observations", observations), _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
@@ -201,7 +202,8 @@ class EpisodeStore:
         card=None,
     ):
         """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), state
-        (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the state each
+        (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the
+        state each
         episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
         ends = _numbers("episode_ends", episode_ends, 1)
         if (ends % 1 != 0).any():
@@ -461,7 +463,8 @@ def validate(store: EpisodeStore) -> None:
     known = np.isfinite(s.costs).mean()
     demand(
         known > 0.5 or known == 1,
-        f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop episodes "
+        f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop "
+        "episodes "
         "of which nobody knows.",
     )
     if s.speed is not None:

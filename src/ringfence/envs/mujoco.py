@@ -54,7 +54,8 @@ class SafeMuJoCo:
     parts: Parts = "2x3"
     speed_limit: float | None = None  # m/s; None: safety-gymnasium's
     episode_length: int = 1000
-    # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of 1000
+    # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of
+    # 1000
     # above it are allowed.
     world: ClassVar[dict] = {"dynamics_width": 256, "barrier_width": 128, "barrier_updates": 20_000, "missed": 0.02}
 

@@ -44,7 +44,8 @@ class Danger(eqx.Module):
             )
         if self.source != "learned" and not self.hazard.safe_margin > 0:
             raise UserError(
-                f"danger='{self.source}' measures its margin in safe margins, but the hazard's is 0; give it one above 0."
+                f"danger='{self.source}' measures its margin in safe margins, but the hazard's is 0; give it one "
+                "above 0."
             )
 
     def along(self, rows: Array, spread: Array) -> Array:

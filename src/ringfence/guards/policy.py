@@ -118,7 +118,8 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
 class Callback:
     """Anybody's function (observations, state) -> actions under guard, outside JAX: NumPy in, NumPy out.
 
-    `act` takes one environment, (N, O) and (S,) or None, and calls the function with the same; `reset` begins an episode.
+    `act` takes one environment, (N, O) and (S,) or None, and calls the function with the same; `reset` begins an
+    episode.
     As a policy of the library (`start`, `act` of four arguments) it is played in simulators that step outside JAX.
     """
 
@@ -226,7 +227,8 @@ def guard(
     """Any policy under guard.
 
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
-    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller, which
+    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
+    which
     gives a `Callback`. `guard` is a name in GUARDS, `danger` formula, learned or both, `options` fields of
     GuardOptions; `hazard` is the formula's definition, where one is to be used.
     """

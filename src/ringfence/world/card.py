@@ -210,7 +210,8 @@ def words(told: dict[str, Any]) -> list[str]:
         f"{100 * worth['value_r2']:.3g} % of their variance."
     )
     lines.append(
-        f"It calls a place strange where its forward models are more than {told['strange']['threshold']:.2g} usual steps "
+        f"It calls a place strange where its forward models are more than {told['strange']['threshold']:.2g} usual "
+        "steps "
         f"apart: {100 * told['strange']['level']:g} % of held-out episodes never are."
     )
     danger = told.get("barrier")
@@ -226,7 +227,8 @@ def words(told: dict[str, Any]) -> list[str]:
     )
     for row in danger["calibration"]:
         lines.append(
-            f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are unsafe; "
+            f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are "
+            "unsafe; "
             f"{100 * row['safe_kept']:.3g} % of the safe steps have it"
         )
     lines.append(

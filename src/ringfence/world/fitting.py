@@ -212,7 +212,8 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
     """(E,) bool: the episodes that no part of a World of this seed learns from."""
     if store.episodes < FEWEST:
         raise UserError(
-            f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} or "
+            f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
+            "or "
             "more: cut long recordings into episodes."
         )
     out = np.zeros(store.episodes, bool)
@@ -243,7 +244,8 @@ def labels_of(
     for empty, kind, none in ((0.0, "0", "unsafe"), (1.0, "above 0", "safe")):
         if share == empty:
             raise UserError(
-                f"No step of '{name}' is {none}: {where} are {kind} everywhere, so nothing tells a barrier what danger is; "
+                f"No step of '{name}' is {none}: {where} are {kind} everywhere, so nothing tells a barrier what "
+                "danger is; "
                 "give costs that are 0 on safe steps and above 0 on unsafe ones, or fit with barrier=False."
             )
     return unsafe
