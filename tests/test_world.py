@@ -90,7 +90,7 @@ def test_the_worst_agent_explains_the_teams_cost():
     near = np.linalg.norm(gap, axis=-1).min(-1) < 0.3  # (M, N)
     unsafe = near.any(-1)[1:]
     blank = cbf.blank_barrier(map, 32)
-    data = jnp.asarray(x), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
+    data = jnp.asarray(x), jnp.asarray(x[1:]), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
     steps = np.arange(len(x) - 1)
     told = dict(loss="cross-entropy", updates=800, width=32)
     fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **told)
@@ -111,10 +111,10 @@ def test_danger_is_seen_ahead():
     table = np.zeros((1, 2), int)
     blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), 32)
     told = dict(loss="cross-entropy", updates=500, width=32)
-    data = jnp.asarray(rows), jnp.asarray(row), jnp.asarray(unsafe)
+    data = jnp.asarray(rows), jnp.asarray(rows[row + 1]), jnp.asarray(row), jnp.asarray(unsafe)
     every = np.arange(len(row))
     fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **told)
-    arrays = {"features": data[0], "row": data[1], "terminated": jnp.zeros(len(row), bool)}
+    arrays = {"features": data[0], "row": data[2], "terminated": jnp.zeros(len(row), bool)}
     ahead = cbf.fit_future(
         fitted, arrays, every, jax.random.key(1), discount=0.9, expectile=0.9, updates=2000, rate=0.02
     )

@@ -150,10 +150,12 @@ def fit_view(
     )
     danger = None
     if settings.barrier:
-        danger = part("label", (), bad, blank.barrier, lambda key: _label(told, blank.barrier, settings, key, quiet))
+        danger = part(
+            "label", ("dynamics",), bad, blank.barrier, lambda key: _label(told, blank.barrier, acts, settings, key, quiet)
+        )
         ahead = part(
             "future",
-            ("label",),
+            ("dynamics", "label"),
             bad,
             blank.barrier,
             lambda key: cbf.fit_future(
@@ -204,6 +206,15 @@ class _Told:
         self.fitted, self.kept = np.flatnonzero(~out), np.flatnonzero(out)
         self.longest = int(self.store.lengths.max()) + 1
 
+    def foreseen(self, acts: dynamics.Dynamics) -> jax.Array:
+        """(T, N, D) where every step's actions were foreseen to lead."""
+        step = jax.jit(lambda acts, x, action: acts.step(x, action)[0])
+        parts, size = [], 50_000
+        for i in range(0, self.store.steps, size):
+            before = self.arrays["features"][self.arrays["row"][i : i + size]]
+            parts.append(step(acts, before, self.arrays["actions"][i : i + size]))
+        return jnp.concatenate(parts)
+
     def togo(self, discount: float):
         return jnp.asarray(returns_to_go(self.store.rewards.mean(1), self.store.lengths, discount), jnp.float32)
 
@@ -251,7 +262,9 @@ def labels_of(
     return unsafe
 
 
-def _label(told: _Told, blank: cbf.Barrier, settings: Settings, key: jax.Array, quiet: bool) -> cbf.Barrier:
+def _label(
+    told: _Told, blank: cbf.Barrier, acts: dynamics.Dynamics, settings: Settings, key: jax.Array, quiet: bool
+) -> cbf.Barrier:
     """ℓ of a data set, with the statistics that it reads by."""
     kd, kf = jax.random.split(key)
     row = told.arrays["row"][told.fitted]
@@ -271,7 +284,7 @@ def _label(told: _Told, blank: cbf.Barrier, settings: Settings, key: jax.Array, 
             f"All unsafe steps of '{told.store.card['task']}' lie in the episodes that are held out; log more of them, "
             "or take another seed."
         )
-    data = told.arrays["features"], told.arrays["row"], jnp.asarray(told.label)
+    data = told.arrays["features"], told.foreseen(acts), told.arrays["row"], jnp.asarray(told.label)
     sizes = dict(loss=settings.loss, updates=settings.barrier_updates, width=settings.barrier_width)
     return cbf.fit_label(start, data, bad, fine, kf, **sizes, quiet=quiet)
 
