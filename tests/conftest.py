@@ -60,21 +60,10 @@ def small_store(played) -> EpisodeStore:
     )
 
 
-# A World that is fitted in a second and knows little.
-QUICK_WORLD = dict(
-    members=2,
-    dynamics_updates=20,
-    dynamics_width=16,
-    value_updates=20,
-    barrier_updates=20,
-    barrier_width=8,
-    future_updates=20,
-)
-
-
 @pytest.fixture(scope="session")
 def small_world(small_store):
     """The World of the small store."""
     from ringfence import worlds
+    from tests.quick import QUICK_WORLD
 
     return worlds.fit(small_store, **QUICK_WORLD)

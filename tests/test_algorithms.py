@@ -16,7 +16,7 @@ from ringfence.errors import CheckpointError, UserError
 from ringfence.runs import Run, build_config
 from ringfence.types import PolicyStep
 from ringfence.windows import draw
-from tests.conftest import QUICK_WORLD
+from tests.quick import QUICK_WORLD
 
 TINY = {
     "icbf": dict(steps=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8,

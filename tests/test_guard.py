@@ -13,7 +13,7 @@ from ringfence import evaluate, hazards, tasks, worlds
 from ringfence.errors import UserError
 from ringfence.guards import Danger, Guard, GuardOptions
 from ringfence.guards.guard import pick
-from tests.conftest import QUICK_WORLD
+from tests.quick import QUICK_WORLD
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from ringfence.errors import UserError
 from ringfence.features import FeatureMap
 from ringfence.world import barrier as cbf
 from ringfence.world import card
-from tests.conftest import QUICK_WORLD
+from tests.quick import QUICK_WORLD
 
 
 def with_costs(store, costs, task="mine"):

@@ -150,9 +150,8 @@ def fit_view(
     )
     danger = None
     if settings.barrier:
-        danger = part(
-            "label", ("dynamics",), bad, blank.barrier, lambda key: _label(told, blank.barrier, acts, settings, key, quiet)
-        )
+        blanks = blank.barrier
+        danger = part("label", ("dynamics",), bad, blanks, lambda key: _label(told, blanks, acts, settings, key, quiet))
         ahead = part(
             "future",
             ("dynamics", "label"),
