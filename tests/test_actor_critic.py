@@ -16,6 +16,7 @@ from ringfence.normalise import Normaliser
 from ringfence.optim import Optimiser
 from ringfence.runs import build_config
 from ringfence.types import Batch, Spec
+from ringfence.world import Settings
 
 SPEC = Spec("t", 2, 2, ("a", "b", "c"), -1.0, 1.0, 25)
 
@@ -208,7 +209,7 @@ def test_bad_settings_are_refused(check, config, word):
         (td3bc.Config, {"multiplier_max": -1.0}),
         (omar.Config, {"search_iterations": 0}),
         (omar.Config, {"cql_samples": 0}),
-        (icbf.Config, {"critic_updates": 0}),
+        (Settings, {"value_updates": 0}),
         (icbf.Config, {"clip": 0.0}),
     ],
 )

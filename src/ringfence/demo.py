@@ -33,15 +33,16 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     fewer = {"steps": 2} if quick else {}
     world = worlds.of_run(guarded)
     console.print(str(world.card), soft_wrap=True, markup=False)
-    fewer_rounds = {"refine": 2} if quick else {}
     rows["BC"] = evaluate.evaluate(cloned, **told)
     rows["BC, shielded, formula"] = evaluate.evaluate(cloned, guard="shield", danger="formula", world=world, **told)
     rows["BC, shielded, learned"] = evaluate.evaluate(cloned, guard="shield", danger="learned", world=world, **told)
     rows["MADIFF"] = evaluate.evaluate(plain, **told, **fewer)
     rows["ICBF split"] = evaluate.evaluate(guarded, **told, **fewer)
     for danger in ("formula", "learned"):
-        how = dict(guard="full", danger=danger, **told, **fewer, **fewer_rounds)
-        rows[f"ICBF split, full guard, {danger}"] = evaluate.evaluate(guarded, **how)
+        how = dict(planner="climbing", guard="shield", danger=danger, **told, **fewer)
+        rows[f"ICBF split, shielded, {danger}"] = evaluate.evaluate(guarded, **how)
+    rounds = {"refine": 2} if quick else {}
+    rows["BC, full guard, learned"] = evaluate.evaluate(cloned, guard="full", world=world, **told, **rounds)
     table = Table(Column("", no_wrap=True), "return", "norm.", "cost", "avoidable", "unsafe episodes", title=task.name)
     for name, r in rows.items():
         table.add_row(
