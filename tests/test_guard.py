@@ -22,7 +22,7 @@ def bound(small_world):
 
 
 def make(world, bound, source="formula", **options) -> Guard:
-    return Guard(world, Danger(world, source, bound, False), GuardOptions(**options))
+    return Guard(Danger(world, source, bound, False), GuardOptions(**options))
 
 
 @pytest.fixture(scope="module")
@@ -65,12 +65,27 @@ def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, refine=10, starts=4, care=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
     worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
-    better = guard.refined(present, plan, jnp.zeros(64))
+    better = guard.refined(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros(64))
     assert (worth(better) > worth(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
-    starts = guard.started(plan, jnp.full((64, 3, 3, 2), 0.5), jax.random.key(0))
+    last = jnp.full((64, 3, 3, 2), 0.5)
+    starts = guard.started(plan, last, jax.random.key(0))[0]
     assert starts.shape[1] == 4
     np.testing.assert_array_equal(starts[:, 0], plan[:, 0])
     assert (starts[:, 1] == 0.5).all()  # the last plan, moved on
+    assert (jnp.abs(starts[:, 2:]) > 0.5).any()  # noisy copies
+
+
+def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present):
+    guard = make(small_world, bound, refine=10, starts=6, plans=2, reach=0.1)
+    plan = jnp.stack([jnp.full((64, 3, 3, 2), v) for v in (0.0, 0.95)], 1)
+    last = jnp.full((64, 3, 3, 2), 0.5)
+    starts, low, high = guard.started(plan, last, jax.random.key(0))
+    better = guard.refined(present, starts, low, high, jnp.zeros(64))
+    for found in (starts, better):
+        near = [jnp.abs(found - plan[:, k : k + 1]).max((2, 3, 4)) <= 0.1 + 1e-6 for k in range(2)]
+        np.testing.assert_array_equal(jnp.argmax(jnp.stack(near), 0)[0], [0, 1, 0, 0, 1, 0])
+        assert (near[0] | near[1]).all() and jnp.abs(found).max() <= 1
+    assert jnp.abs(better - starts).max() > 0.05
 
 
 def test_the_best_of_the_safe_ones_is_taken():

@@ -59,15 +59,6 @@ def test_clearance_is_distance_less_radius(rows, view):
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_endangered_states_are_unsafe_and_near(rows, view):
-    table, x = views_of(rows, view)
-    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
-    made = np.asarray(jax.jit(bound.endanger)(jnp.asarray(x), jax.random.key(0)))
-    assert bound.labels(jnp.asarray(made))[0].all()
-    assert ((made != x).sum(-1) <= 2).all()  # one other agent was moved, nothing else
-
-
-@pytest.mark.parametrize("view", VIEWS)
 def test_gradient_of_clearance_is_finite_even_where_agents_coincide(rows, view):
     table, x = views_of(rows, view)
     bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
@@ -97,13 +88,7 @@ def test_speed_limit(rows):
     assert bound.safe_margin == pytest.approx(0.16)
     unsafe, safe = map(np.asarray, labels(x))
     assert unsafe.any() and safe.any()
-    made = np.asarray(jax.jit(bound.endanger)(jnp.asarray(x), jax.random.key(0)))
-    assert np.asarray(labels(made)[0]).all()
-    assert (np.hypot(made[..., 0], made[..., 1]) <= 0.8 * 1.51).all()
-    np.testing.assert_array_equal(made[..., 2:], x[..., 2:])
-    moving = speed > 0.01
-    cross = made[..., 0] * x[..., 1] - made[..., 1] * x[..., 0]
-    np.testing.assert_allclose(cross[moving], 0, atol=1e-5)  # the direction is kept
+    np.testing.assert_array_equal(unsafe, speed > 0.8)
 
 
 def test_all_is_the_smallest_clearance(rows):
@@ -118,11 +103,6 @@ def test_all_is_the_smallest_clearance(rows):
     clearance = jax.jit(bound.clearance)
     np.testing.assert_allclose(clearance(x), np.minimum(each[0], each[1] * 0.075 / 0.16), atol=1e-6)
     np.testing.assert_array_equal(safe, clearance(x) >= bound.safe_margin)  # so one share of the margin suits both
-    made = jax.jit(bound.endanger)(x, jax.random.key(1))
-    assert (clearance(made) < 0).all()
-    for part, before in zip(parts, labels, strict=True):  # each hazard gets examples of its own
-        now = hazards.bind(part, table.names, 3).labels(made)[0]
-        assert (np.asarray(now) & ~np.asarray(before[0])).any()
     with pytest.raises(UserError, match="safe_margin above 0"):
         hazards.bind(hazards.All((parts[0], hazards.SpeedLimit(0.8, ("own.vx",), 0.0))), table.names, 3)
     with pytest.raises(UserError, match="a formula for each"):

@@ -256,13 +256,10 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
     """(job, policy) of a finished run.
 
     `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards
-    (guard.GUARDS),
-    `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every agent guards its
-    own
-    action by its own view ("own"), `world` the World it reads (default: that of the run's data and seed). Other
-    options are
-    fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
-    `Controller`.
+    (guard.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
+    agent guards its own action by its own view ("own"), `world` the World it reads (default: that of the run's data
+    and seed). Other options are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile
+    it with jax.jit, or use a `Controller`.
     """
     job, policy, _ = _loaded(run, step, asked(planner, **options))
     return job, policy
@@ -333,7 +330,7 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
     if not how.guarded:
         return job, policy, at
-    if how.world is not None or world is None or how.sight != "all" or world.map.view != "pruned":
+    if how.world is not None or world is None or how.sight != "all":
         world = worlds.of_run(run, how.sight, how.world, quiet=False)
     guarded = build(policy, world, job.hazard.hazard, how.guard, how.danger, **how.given)
     return job, guarded, at
@@ -363,8 +360,8 @@ class Controller:
 
     def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: float | None = None) -> np.ndarray:
         """(N, A) joint action within the task's bounds; `cost` is what the last step cost, which an adapting guard
-        follows. Arrays of another shape than the run's are refused, and so is
-        what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow NaN."""
+        follows. Arrays of another shape than the run's are refused, and so is what is not finite: indices beyond an
+        array's end would be clipped in silence, and noise would follow NaN."""
         width, state_width = self.job.widths
         seen = given_as("observations", observations, (self.job.spec.n_agents, width))
         if state is not None and state_width == 0:

@@ -15,12 +15,11 @@ import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.types import Array, Key
+from ringfence.types import Array
 
 
 @dataclass(frozen=True)
@@ -62,12 +61,10 @@ class BoundHazard:
     """A hazard resolved against a list of features.
 
     `clearance` maps features (..., N, D) in physical units to ℓ (..., N); it is None where danger has no formula.
-    `endanger` maps (features (..., N, D), key) to nearby states that are unsafe for each agent; None likewise.
     """
 
     hazard: Hazard
     clearance: Callable[[Array], Array] | None
-    endanger: Callable[[Array, Key], Array] | None
     safe_margin: float
     members: tuple[BoundHazard, ...] = ()  # of All: each has a margin of its own
 
@@ -99,7 +96,7 @@ def least(x: list[Array]) -> Array:
 def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
     """Resolve a hazard's feature names; an absent one is refused with the nearest name."""
     if isinstance(hazard, CostColumn):
-        return BoundHazard(hazard, None, None, 0.0)
+        return BoundHazard(hazard, None, 0.0)
     if isinstance(hazard, Separation):
         return _bind_separation(hazard, names, n_agents)
     if isinstance(hazard, SpeedLimit):
@@ -113,20 +110,20 @@ def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
         raise UserError("All(...) compares its hazards by their safe margins; give each a safe_margin above 0.")
     scales = [1.0 if p.safe_margin == unit else unit / p.safe_margin for p in parts]
 
-    def endanger(x: Array, key: Key) -> Array:
-        """Each by a hazard drawn at random."""
-        k1, k2 = jax.random.split(key)
-        made = jnp.stack([p.endanger(x, k1) for p in parts])
-        pick = jax.random.randint(k2, x.shape[:-1], 0, len(parts))
-        return jnp.take_along_axis(made, pick[None, ..., None], axis=0)[0]
-
     return BoundHazard(
         hazard,
         lambda x: least([s * p.clearance(x) for s, p in zip(scales, parts, strict=True)]),
-        endanger,
         unit,
         tuple(parts),
     )
+
+
+def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard | None:
+    """The hazard bound to a view; None where that view cannot read its formula."""
+    try:
+        return bind(hazard, names, n_agents)
+    except UserError:
+        return None
 
 
 def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
@@ -138,17 +135,6 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
 
         def offsets(x: Array) -> Array:
             return x[..., index]  # (..., N, N-1, 2)
-
-        def endanger(x: Array, key: Key) -> Array:
-            """Put one other agent, drawn at random, on its line of centres at a distance below the radius."""
-            k1, k2 = jax.random.split(key)
-            gap = offsets(x)
-            distance = jnp.linalg.norm(gap, axis=-1, keepdims=True)
-            near = jax.random.uniform(k1, distance.shape, minval=0.1, maxval=0.999) * hazard.radius
-            moved = gap / jnp.maximum(distance, 1e-6) * near
-            pick = jax.random.randint(k2, gap.shape[:-2], 0, gap.shape[-2])
-            chosen = jax.nn.one_hot(pick, gap.shape[-2], dtype=bool)[..., None]
-            return x.at[..., index].set(jnp.where(chosen, moved, gap))
     else:
         absolute = [(f"agent{j}.x", f"agent{j}.y") for j in range(n_agents)]
         wanted = [n for pair in relative for n in pair]
@@ -165,25 +151,12 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
             gap = p - own[..., None, :]
             return gap[..., rows, columns, :].reshape(*gap.shape[:-2], n_agents - 1, 2)
 
-        def endanger(x: Array, key: Key) -> Array:
-            k1, k2 = jax.random.split(key)
-            gap = offsets(x)
-            distance = jnp.linalg.norm(gap, axis=-1, keepdims=True)
-            near = jax.random.uniform(k1, distance.shape, minval=0.1, maxval=0.999) * hazard.radius
-            pick = jax.random.randint(k2, gap.shape[:-2], 0, n_agents - 1)[..., None, None]
-            shift = jnp.take_along_axis(gap / jnp.maximum(distance, 1e-6) * near - gap, pick, axis=-2)[..., 0, :]
-            table = columns.reshape(n_agents, n_agents - 1)
-            other = jnp.asarray(table)[np.arange(n_agents), pick[..., 0, 0]]  # (..., N) absolute index
-            mask = jax.nn.one_hot(other, n_agents, dtype=bool)[..., None]
-            p = x[..., index]
-            return x.at[..., index].set(jnp.where(mask, p + shift[..., None, :], p))
-
     def clearance(x: Array) -> Array:
         squared = (offsets(x) ** 2).sum(-1)
         distance = jnp.sqrt(jnp.maximum(squared, 1e-12))
         return least([distance[..., j] for j in range(n_agents - 1)]) - hazard.radius
 
-    return BoundHazard(hazard, clearance, endanger, hazard.safe_margin)
+    return BoundHazard(hazard, clearance, hazard.safe_margin)
 
 
 def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
@@ -195,16 +168,8 @@ def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
     def speed(x: Array) -> Array:
         return jnp.sqrt(jnp.maximum((x[..., index] ** 2).sum(-1), 1e-12))
 
-    def endanger(x: Array, key: Key) -> Array:
-        """Scale the velocity to between the limit and half as much again; what rests is sent in a random direction."""
-        k1, k2 = jax.random.split(key)
-        velocity = x[..., index]
-        velocity = jnp.where(speed(x)[..., None] > 1e-4, velocity, jax.random.normal(k2, velocity.shape))
-        target = jax.random.uniform(k1, x.shape[:-1], minval=1.001, maxval=1.5) * hazard.limit
-        return x.at[..., index].set(velocity * (target / jnp.linalg.norm(velocity, axis=-1))[..., None])
-
     margin = 0.2 * hazard.limit if hazard.safe_margin is None else hazard.safe_margin
-    return BoundHazard(hazard, lambda x: hazard.limit - speed(x), endanger, margin)
+    return BoundHazard(hazard, lambda x: hazard.limit - speed(x), margin)
 
 
 def reads(hazard: Hazard, n_agents: int, names: tuple[str, ...]) -> tuple[str, ...]:

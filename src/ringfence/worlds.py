@@ -45,12 +45,9 @@ def fit(store: EpisodeStore, *, seed: int = 0, cached: bool = True, quiet: bool 
     settings = settings_for(store, task, **changes)
     map = task.feature_map(settings.view, store)
     spec = task.spec(map, store)
-    try:
-        hazard = hazards.bind(task.hazard, spec.feature_names, spec.n_agents)
-    except UserError:
-        if settings.labels == "formula" and settings.barrier:
-            raise
-        hazard = None
+    needed = settings.labels == "formula" and settings.barrier
+    bind = hazards.bind if needed else hazards.bind_or_none
+    hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
     return fit_view(store, map, spec, settings, hazard=hazard, seed=int(seed), cached=cached, quiet=quiet)
 
 
@@ -91,8 +88,7 @@ def _of_same(run: Run, world: World, sight: str) -> None:
     if world.alone != (sight == "own"):
         raise UserError(
             f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; "
-            "fit "
-            f"one with `ringfence fit STORE --sight {sight}`."
+            f"fit one with `ringfence fit STORE --sight {sight}`."
         )
 
 

@@ -11,6 +11,7 @@ the planner is MADIFF's to the bit.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -502,7 +503,6 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 # 1: the scale of the critic that ranks plans missed some agents' views of states, or some moments. 2: forward dynamics
 # was trained with the planner, on fewer rows. 3: critic and forward dynamics were fitted with one seed for all, `split`
 # trained a barrier of its own.
-REVISION = 4
 ICBF = Algorithm(
     "icbf",
     Config,
@@ -516,24 +516,14 @@ ICBF = Algorithm(
     prepare=prepare,
     needs=needs,
     of_world=of_world,
-    revision=REVISION,
+    revision=4,
 )
-MADIFF = Algorithm(
-    "madiff",
-    Config,
-    check,
-    init,
-    make_update,
-    make_diagnose,
-    make_policy,
-    {
+MADIFF = dataclasses.replace(
+    ICBF,
+    name="madiff",
+    presets={
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
         "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },
-    reads=reads,
-    prepare=prepare,
-    needs=needs,
-    of_world=of_world,
-    revision=REVISION,
 )

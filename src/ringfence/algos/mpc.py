@@ -1,7 +1,6 @@
 """Model-predictive control with no prior at all: nothing is learned but the World, nothing is proposed but rest, and
 whatever is done a guard finds by climbing value from noise (guards/guard.py, `refine`). What a learned proposal is
-worth, is what
-it adds to this."""
+worth is what it adds to this."""
 
 from __future__ import annotations
 

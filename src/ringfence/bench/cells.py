@@ -27,7 +27,7 @@ from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import RunConflict, UserError, unknown
 from ringfence.files import whole
-from ringfence.guards import GUARDS, GuardOptions, margin_of
+from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run, build_config, read_json, write_json
 
@@ -115,7 +115,7 @@ def same_options(stored: dict, evaluation: dict) -> bool:
     guard = stored.get("guard_options") or {}
     if not how.guarded:
         return not guard
-    wanted = dataclasses.asdict(GuardOptions(**{**GUARDS[how.guard], **margin_of(how.danger), **how.given}))
+    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, **how.given)))
     told = {**dataclasses.asdict(GuardOptions()), **guard}  # an option newer than the result had its default then
     return bool(guard) and told == wanted
 

@@ -106,8 +106,12 @@ class EpisodeStore:
     @functools.cached_property
     def content(self) -> str:
         """Digest of all arrays: other steps have another."""
+        return self.digest(*ARRAYS, *OPTIONAL)
+
+    def digest(self, *names: str) -> str:
+        """Of some of the arrays."""
         digest = hashlib.blake2b(digest_size=8)
-        for name in (*ARRAYS, *OPTIONAL):
+        for name in names:
             array = getattr(self, name)
             if array is not None:
                 digest.update(f"{name} {array.shape} {array.dtype}".encode())

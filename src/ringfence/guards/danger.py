@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard, least
+from ringfence.hazards import BoundHazard
 from ringfence.types import Array
 from ringfence.world import World
 
@@ -50,23 +50,25 @@ class Danger(eqx.Module):
 
     def along(self, rows: Array, spread: Array) -> Array:
         """(..., K, N) scores of foreseen rows (..., K+1, N, D), the present first; spread (..., K, N)."""
-        scores = []
-        if self.source != "learned":
-            scores.append(self.hazard.clearance(rows[..., 1:, :, :]) / self.hazard.safe_margin)
-        if self.source != "formula":
-            barrier = self.world.barrier
-            told = barrier.of_steps(rows[..., :-1, :, :], rows[..., 1:, :, :])
-            if self.future:
-                last = jnp.minimum(told[..., -1:, :], barrier.ahead(rows[..., -1:, :, :]))
-                told = jnp.concatenate([told[..., :-1, :], last], -2)
-            scores.append(told / barrier.unit - jnp.maximum(spread / self.world.strange - 1.0, 0.0))
-        return least(scores)
+        before, after = rows[..., :-1, :, :], rows[..., 1:, :, :]
+        if self.source == "formula":
+            return self._by_formula(after)
+        told = self._by_barrier(before, after)
+        if self.future:
+            ahead = self.world.barrier.ahead(after[..., -1:, :, :]) / self.world.barrier.unit
+            told = jnp.concatenate([told[..., :-1, :], jnp.minimum(told[..., -1:, :], ahead)], -2)
+        told = told - jnp.maximum(spread / self.world.strange - 1.0, 0.0)
+        return told if self.source == "learned" else jnp.minimum(told, self._by_formula(after))
 
     def now(self, before: Array, present: Array) -> Array:
         """(..., N) scores of the step that led from one state (..., N, D) to the present."""
-        scores = []
-        if self.source != "learned":
-            scores.append(self.hazard.clearance(present) / self.hazard.safe_margin)
-        if self.source != "formula":
-            scores.append(self.world.barrier.of_steps(before, present) / self.world.barrier.unit)
-        return least(scores)
+        if self.source == "formula":
+            return self._by_formula(present)
+        told = self._by_barrier(before, present)
+        return told if self.source == "learned" else jnp.minimum(told, self._by_formula(present))
+
+    def _by_formula(self, x: Array) -> Array:
+        return self.hazard.clearance(x) / self.hazard.safe_margin
+
+    def _by_barrier(self, before: Array, after: Array) -> Array:
+        return self.world.barrier.of_steps(before, after) / self.world.barrier.unit

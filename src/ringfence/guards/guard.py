@@ -37,6 +37,7 @@ class GuardOptions:
     refine: int = 0  # Adam steps that climb the value; 0: none
     starts: int = 1  # refined: the proposals, the last plan moved on, and noisy copies, so many in all
     noise: float = 0.5  # deviation of noisy copies
+    reach: float = 2.0  # how far refining may take an action from its proposal; 2: anywhere
     care: float = 10.0  # weight of danger in what is climbed, in deviations of value per margin
     shield: int = 0  # rounds of correction; 0: none
     rows: int = 3  # foreseen rows that are judged
@@ -54,6 +55,8 @@ class GuardOptions:
         for name in ("noise", "care", "adapt"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+        if not 0 < self.reach <= 2:
+            raise UserError(f"reach={self.reach} must lie in (0, 2]: actions lie in [-1, 1].")
         if not 0 < self.rate < 1:
             raise UserError(f"rate={self.rate} must be a share of steps between 0 and 1.")
         if not 0 < self.alpha <= 1:
@@ -98,15 +101,18 @@ class Guard(eqx.Module):
     """The four operations on proposals (B, P, K, N, A), actions in [−1, 1]. Where the World is `alone`, every agent
     judges and corrects its own actions by its own view of things, and hears of nobody."""
 
-    world: World
     danger: Danger
     options: GuardOptions = eqx.field(static=True)
+
+    @property
+    def world(self) -> World:
+        return self.danger.world
 
     def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins (B,) or (B, N) to a plan."""
         o = self.options
         if o.refine:
-            proposals = self.refined(present, self.started(proposals, last, key), margin)
+            proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.foreseen(present, proposals)
         score = self.danger.along(rows, spread)
         chosen = self.selected(rows, proposals, score, margin)
@@ -149,21 +155,24 @@ class Guard(eqx.Module):
             return margin.reshape(-1, *[1] * axes, 1)
         return margin.reshape(margin.shape[0], *[1] * axes, margin.shape[1])
 
-    def started(self, proposals: Array, last: Array, key: Key) -> Array:
-        """(B, S, K, N, A): the proposals, the last plan moved on by a step, and noisy copies of these."""
-        count = max(self.options.starts, proposals.shape[1])
+    def started(self, proposals: Array, last: Array, key: Key) -> tuple[Array, Array, Array]:
+        """(B, S, K, N, A) thrice: what is refined (the proposals, the last plan moved on by a step, and noisy copies of
+        these), and the bounds of each, `reach` around the proposal that it belongs to."""
+        o, many = self.options, proposals.shape[1]
+        count = max(o.starts, many)
         moved = jnp.concatenate([last[:, 1:], last[:, -1:]], 1)[:, None]
         known = jnp.concatenate([proposals, moved], 1)[:, :count]
-        more = count - known.shape[1]
-        if more <= 0:
-            return known
-        copies = jnp.tile(known, (1, -(-more // known.shape[1]), 1, 1, 1))[:, :more]
-        copies = copies + self.options.noise * jax.random.normal(key, copies.shape)
-        return jnp.concatenate([known, jnp.clip(copies, -1.0, 1.0)], 1)
+        again = jnp.arange(count) % known.shape[1]
+        starts = known[:, again]
+        noise = o.noise * jax.random.normal(key, starts[:, known.shape[1] :].shape)
+        starts = starts.at[:, known.shape[1] :].add(noise)
+        around = proposals[:, jnp.where(again < many, again, 0)]
+        low, high = jnp.maximum(around - o.reach, -1.0), jnp.minimum(around + o.reach, 1.0)
+        return jnp.clip(starts, low, high), low, high
 
-    def refined(self, present: Array, actions: Array, margin: Array) -> Array:
-        """Actions (B, S, K, N, A) after Adam's ascent of value, in deviations of the logs', less `care` for every
-        margin that is missing and for places where the World knows nothing."""
+    def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
+        """Actions (B, S, K, N, A) after Adam's ascent of value within bounds, in deviations of the logs', less `care`
+        for every margin that is missing and for places where the World knows nothing."""
 
         def worth(actions: Array) -> Array:
             rows, spread = self.foreseen(present, actions)
@@ -178,7 +187,7 @@ class Guard(eqx.Module):
             g = jax.grad(worth)(a)
             m, s = 0.9 * m + 0.1 * g, 0.99 * s + 0.01 * g * g
             move = (m / (1 - 0.9 ** (t + 1))) / (jnp.sqrt(s / (1 - 0.99 ** (t + 1))) + 1e-6)
-            return (jnp.clip(a + RATE * move, -1.0, 1.0), m, s), None
+            return (jnp.clip(a + RATE * move, low, high), m, s), None
 
         zero = jnp.zeros_like(actions)
         rounds = jnp.arange(self.options.refine, dtype=jnp.float32)

@@ -15,7 +15,6 @@ from ringfence.errors import UserError, unknown
 from ringfence.features import translation
 from ringfence.guards.danger import Danger
 from ringfence.guards.guard import GUARDS, Guard, GuardOptions
-from ringfence.hazards import BoundHazard
 from ringfence.types import Array, Key, PolicyStep, PyTree
 from ringfence.world import World
 
@@ -119,8 +118,8 @@ class Callback:
     """Anybody's function (observations, state) -> actions under guard, outside JAX: NumPy in, NumPy out.
 
     `act` takes one environment, (N, O) and (S,) or None, and calls the function with the same; `reset` begins an
-    episode.
-    As a policy of the library (`start`, `act` of four arguments) it is played in simulators that step outside JAX.
+    episode. As a policy of the library (`start`, `act` of four arguments) it is played in simulators that step outside
+    JAX.
     """
 
     def __init__(self, function: Callable, guarded: Guarded, seed: int = 0):
@@ -180,38 +179,25 @@ class Nothing(eqx.Module):
         return {}
 
 
-def margin_of(danger: str) -> dict[str, float]:
-    """The margin that is kept unless another is asked for: a calibrated one of what is learned; of a formula less than
-    its safe margin, which is what examples of safety have."""
-    return {"margin": 1.0} if danger == "learned" else {}
+def options_of(name: str, danger: str, **changes) -> dict:
+    """Fields of GuardOptions that a named guard has. The margin, unless another is asked for, is a calibrated one of
+    what is learned; of a formula less than its safe margin, which is what examples of safety have."""
+    return {**GUARDS[name], **({"margin": 1.0} if danger == "learned" else {}), **changes}
 
 
-def build(
-    proposal: Any, world: World, hazard: hazards.Hazard | BoundHazard | None, name: str, danger: str, **changes
-) -> Guarded:
-    """A policy under the named guard with changed options; without a named margin, that of the danger's source."""
+def build(proposal: Any, world: World, hazard: hazards.Hazard | None, name: str, danger: str, **changes) -> Guarded:
+    """A policy under the named guard with changed options."""
     from ringfence.runs import build_config
 
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
-    told = {**GUARDS[name], **margin_of(danger), **changes}
-    options = build_config(GuardOptions, told, "the guard")
+    options = build_config(GuardOptions, options_of(name, danger, **changes), "the guard")
     if not options.judges:
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
-    bound = hazard
-    if hazard is not None and not isinstance(hazard, BoundHazard):
-        bound = bound_or_none(hazard, world)
-    return Guarded(proposal, Guard(world, Danger(world, danger, bound, options.future), options))
-
-
-def bound_or_none(hazard: hazards.Hazard, world: World) -> BoundHazard | None:
-    """The hazard in the World's view; None where that view cannot read its formula."""
-    try:
-        return hazards.bind(hazard, world.spec.feature_names, world.spec.n_agents)
-    except UserError:
-        return None
+    bound = None if hazard is None else hazards.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
+    return Guarded(proposal, Guard(Danger(world, danger, bound, options.future), options))
 
 
 def guard(
@@ -228,8 +214,7 @@ def guard(
 
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which
-    gives a `Callback`. `guard` is a name in GUARDS, `danger` formula, learned or both, `options` fields of
+    which gives a `Callback`. `guard` is a name in GUARDS, `danger` formula, learned or both, `options` fields of
     GuardOptions; `hazard` is the formula's definition, where one is to be used.
     """
     if not isinstance(world, World):

@@ -16,7 +16,7 @@ from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
-from ringfence.guards import GUARDS, GuardOptions, margin_of
+from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.table import NAMES, Row, Section, sections
@@ -312,7 +312,7 @@ def _how(result: dict) -> str:
     if result.get("guard_options"):
         words += [f"--guard {name} --danger {result['danger']}"]
         words += [f"--sight {result['sight']}"] if result["sight"] != "all" else []
-        usual = dataclasses.asdict(GuardOptions()) | GUARDS[name] | margin_of(result["danger"])
+        usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"])
         given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
     if given:
         words.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))

@@ -2,20 +2,17 @@
 
     ℓ   what is dangerous now, of a step: fitted to the end, classes balanced, by held-out episodes
     V   what will be dangerous whatever one does: V = max over what the logs do of min(ℓ, V(s')), so that {V ≥ 0} is
-    where
-        logged behaviour can stay safe; h = V meets the paper's (3), sup_a h(f(s, a)) ≥ (1 − α) h(s)
+        where logged behaviour can stay safe; h = V meets the paper's (3), sup_a h(f(s, a)) ≥ (1 − α) h(s)
 
 A team's label is explained by its *worst* agent, min_i ℓ_i, so the data itself finds out who was in danger; and an
 agent's score by its worst neighbour, ℓ_i = min(g_0(own), min_j g(own, other j)), one g for all pairs, wherever names
-tell
-which entries belong to whom. Without that, what is learned of few unsafe steps does not carry over to new ones. Agents
-that share a body share its danger: they are all to blame, and each looks at all it sees.
+tell which entries belong to whom. Without that, what is learned of few unsafe steps does not carry over to new ones.
+Agents that share a body share its danger: they are all to blame, and each looks at all it sees.
 
 Scores are log-odds of "safe" with both classes equally frequent: 0 is where either is as likely.
 
 Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample backup with an upper expectile, FISOR
-(Zheng
-et al. 2024) and V-OCBF (2025).
+(Zheng et al. 2024) and V-OCBF (2025).
 """
 
 from __future__ import annotations
@@ -206,7 +203,7 @@ def fit_label(
     Hinges are the paper's with a margin of 1; `gradient-penalty` adds E(‖∇ℓ(ŝ)‖ − 1)² between the classes.
     """
     kn, kf = jax.random.split(key)
-    shape, some = barrier.shape, min(batch // 4, batch)
+    shape, some = barrier.shape, batch // 4
     bad, fine = jnp.asarray(unsafe), jnp.asarray(safe)
 
     def objective(net: dict[str, MLP], data, pick: Array) -> Array:

@@ -211,8 +211,7 @@ def words(told: dict[str, Any]) -> list[str]:
     )
     lines.append(
         f"It calls a place strange where its forward models are more than {told['strange']['threshold']:.2g} usual "
-        "steps "
-        f"apart: {100 * told['strange']['level']:g} % of held-out episodes never are."
+        f"steps apart: {100 * told['strange']['level']:g} % of held-out episodes never are."
     )
     danger = told.get("barrier")
     if danger is None:
@@ -228,8 +227,7 @@ def words(told: dict[str, Any]) -> list[str]:
     for row in danger["calibration"]:
         lines.append(
             f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are "
-            "unsafe; "
-            f"{100 * row['safe_kept']:.3g} % of the safe steps have it"
+            f"unsafe; {100 * row['safe_kept']:.3g} % of the safe steps have it"
         )
     lines.append(
         f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "

@@ -33,7 +33,7 @@ from ringfence.world import card as cards
 from ringfence.world import dynamics, values
 from ringfence.world.world import Card, World
 
-FORMAT = 1
+FORMAT = 2  # of what is fitted and how it is judged: what is cached of another is made again
 HELD_OUT = 0.1  # of the episodes, whole ones
 FEWEST = 5  # episodes that can be divided
 STRANGE = 0.95  # of held-out episodes stay below the ensemble's threshold throughout
@@ -68,6 +68,7 @@ PARTS = {
     "label": ("labels", "loss", "both_ends", "barrier_width", "barrier_updates"),
     "future": ("future_updates", "future_discount", "expectile"),
 }
+UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}  # what a part reads
 
 
 def fit_view(
@@ -86,43 +87,42 @@ def fit_view(
     `hazard`, bound to the view, labels states where `settings.labels` is "formula". A tenth of the episodes is held
     out of every part; the card tells what they say.
     """
-    if settings.sight == "own":
-        map = features.alone(map)
-    held = held_out(store, seed)
-    label = labels_of(store, map, settings, hazard) if settings.barrier else None
-    told = _Told(store, map, held, label)
-    begun, seconds, blank = time.perf_counter(), {}, _blank(map, spec, settings)
+    by = None if hazard is None or settings.labels != "formula" else hazards.to_dict(hazard.hazard)
+    parts = _Parts(settings, seed, by, cached)
+    file = parts.file("world", list(PARTS), [store.content, features.to_dict(map), settings.missed, settings.barrier])
+    if cached and (kept := _kept_world(file, map)) is not None:
+        return kept
+    world = _fitted(store, map, spec, settings, hazard, seed, parts, quiet)
+    if cached:
+        save(world, file)
+    return world
 
-    def part(name: str, upon: tuple[str, ...], content: str, template: PyTree, make: Callable[[jax.Array], PyTree]):
-        """A part from the cache, or made and kept there."""
-        fields = {f: getattr(settings, f) for p in (*upon, name) for f in PARTS[p]}
-        about = [FORMAT, name, content, settings.view, settings.sight, fields, seed]
-        if name in ("label", "future") and hazard is not None and settings.labels == "formula":
-            about.append(hazards.to_dict(hazard.hazard))
-        code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
-        file = cache_dir() / "worlds" / f"{name}-{code}.safetensors"
-        if cached and (kept := _read(file, template)) is not None:
-            return kept
-        started = time.perf_counter()
-        made = make(jax.random.fold_in(jax.random.key(seed), list(PARTS).index(name)))
-        seconds[name] = time.perf_counter() - started
-        if cached:
-            _write(file, made)
-        return made
 
-    moved = digest(store, ("observations", "state", "actions", "episode_ends", "terminated"))
-    paid = digest(store, ("rewards",)) + moved
-    bad = moved + ("" if label is None else hashlib.blake2b(label.tobytes(), digest_size=8).hexdigest())
-    s, fitted = settings, told.fitted
-    acts = part(
+def _fitted(
+    store: EpisodeStore,
+    map: features.FeatureMap,
+    spec: Spec,
+    settings: Settings,
+    hazard: hazards.BoundHazard | None,
+    seed: int,
+    parts: _Parts,
+    quiet: bool,
+) -> World:
+    begun, s, alone = time.perf_counter(), settings, settings.sight == "own"
+    map = features.alone(map) if alone else map
+    label = labels_of(store, map, s, hazard) if s.barrier else None
+    told = _Told(store, map, held_out(store, seed), label)
+    fitted, arrays, blank = told.fitted, told.arrays, _blank(map, spec, s)
+    moved = store.digest("observations", "state", "actions", "episode_ends", "terminated")
+
+    acts = parts.get(
         "dynamics",
-        (),
-        moved,
+        [moved],
         blank.dynamics,
         lambda key: dynamics.fit_dynamics(
-            told.arrays["features"],
-            told.arrays["actions"][fitted],
-            told.arrays["row"][fitted],
+            arrays["features"],
+            arrays["actions"][fitted],
+            arrays["row"][fitted],
             map,
             key,
             members=s.members,
@@ -131,35 +131,33 @@ def fit_view(
             label="" if quiet else "forward dynamics, what actions do",
         ),
     )
-    worth = part(
+    worth = parts.get(
         "values",
-        (),
-        paid,
+        [moved, store.digest("rewards")],
         blank.values,
         lambda key: values.fit_values(
-            told.arrays | {"togo": told.togo(s.discount)},
+            arrays | {"togo": told.togo(s.discount)},
             jnp.asarray(fitted),
             map,
             key,
             discount=s.discount,
             updates=s.value_updates,
             period=told.longest,
-            alone=s.sight == "own",
+            alone=alone,
             quiet=quiet,
         ),
     )
     danger = None
-    if settings.barrier:
-        blanks = blank.barrier
-        danger = part("label", ("dynamics",), bad, blanks, lambda key: _label(told, blanks, acts, settings, key, quiet))
-        ahead = part(
+    if label is not None:
+        bad = [moved, hashlib.blake2b(label.tobytes(), digest_size=8).hexdigest()]
+        now = parts.get("label", bad, blank.barrier, lambda key: _label(told, blank.barrier, acts, s, key, quiet))
+        danger = parts.get(
             "future",
-            ("dynamics", "label"),
             bad,
             blank.barrier,
             lambda key: cbf.fit_future(
-                danger,
-                told.arrays,
+                now,
+                arrays,
                 fitted,
                 key,
                 discount=s.future_discount,
@@ -168,11 +166,10 @@ def fit_view(
                 quiet=quiet,
             ),
         )
-        danger = ahead
-    world = World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
-    facts, strange, unit = cards.judge(world, told, STRANGE, settings.missed)
+    world = World(acts, worth, danger, jnp.ones(()), map, spec, alone, Card({}))
+    judged, strange, unit = cards.judge(world, told, STRANGE, s.missed)
     if danger is not None:
-        world = eqx.tree_at(lambda w: w.barrier.unit, world, jnp.asarray(unit, jnp.float32))
+        danger = eqx.tree_at(lambda b: b.unit, danger, jnp.asarray(unit, jnp.float32))
     facts = {
         "format": FORMAT,
         "data": {
@@ -181,13 +178,45 @@ def fit_view(
             "episodes": store.episodes,
             "hazard": store.card["hazard"],
         },
-        "settings": dataclasses.asdict(settings),
+        "settings": dataclasses.asdict(s),
         "seed": seed,
         "shape": _shape_in_words(danger),
-        "seconds": {k: round(v, 1) for k, v in seconds.items()} | {"in all": round(time.perf_counter() - begun, 1)},
-        **facts,
+        "seconds": {k: round(v, 1) for k, v in parts.seconds.items()}
+        | {"in all": round(time.perf_counter() - begun, 1)},
+        **judged,
     }
-    return World(acts, worth, world.barrier, jnp.asarray(strange, jnp.float32), map, spec, world.alone, Card(facts))
+    return World(acts, worth, danger, jnp.asarray(strange, jnp.float32), map, spec, alone, Card(facts))
+
+
+@dataclass(eq=False)
+class _Parts:
+    """Parts of a World, from the cache where they have been made of the same data, settings and seed."""
+
+    settings: Settings
+    seed: int
+    formula: dict | None  # the hazard that labels states
+    cached: bool
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # that making took
+
+    def file(self, name: str, of: list[str], content: list) -> Path:
+        """Where what depends on the settings of the parts `of` and on `content` is kept."""
+        s = self.settings
+        fields = {f: getattr(s, f) for part in of for f in PARTS[part]}
+        about = [FORMAT, name, content, s.view, s.sight, fields, self.seed]
+        about += [self.formula] if self.formula and {"label", "future"} & set(of) else []
+        code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
+        return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+
+    def get(self, name: str, content: list, template: PyTree, make: Callable[[jax.Array], PyTree]) -> PyTree:
+        file = self.file(name, [*UPON[name], name], content)
+        if self.cached and (kept := _read(file, template)) is not None:
+            return kept
+        begun = time.perf_counter()
+        made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
+        self.seconds[name] = time.perf_counter() - begun
+        if self.cached:
+            _write(file, made)
+        return made
 
 
 @dataclass(eq=False)
@@ -223,8 +252,7 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
     if store.episodes < FEWEST:
         raise UserError(
             f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
-            "or "
-            "more: cut long recordings into episodes."
+            "or more: cut long recordings into episodes."
         )
     out = np.zeros(store.episodes, bool)
     count = max(1, round(HELD_OUT * store.episodes))
@@ -255,8 +283,7 @@ def labels_of(
         if share == empty:
             raise UserError(
                 f"No step of '{name}' is {none}: {where} are {kind} everywhere, so nothing tells a barrier what "
-                "danger is; "
-                "give costs that are 0 on safe steps and above 0 on unsafe ones, or fit with barrier=False."
+                "danger is; give costs that are 0 on safe steps and above 0 on unsafe ones, or fit with barrier=False."
             )
     return unsafe
 
@@ -311,17 +338,6 @@ def _shape_in_words(barrier: cbf.Barrier | None) -> str:
     )
 
 
-def digest(store: EpisodeStore, names: tuple[str, ...]) -> str:
-    """Of some of a store's arrays."""
-    found = hashlib.blake2b(digest_size=8)
-    for name in names:
-        array = getattr(store, name)
-        if array is not None:
-            found.update(f"{name} {array.shape} {array.dtype}".encode())
-            found.update(np.ascontiguousarray(array).data)
-    return found.hexdigest()
-
-
 # --- files ---
 
 
@@ -337,6 +353,16 @@ def _read(file: Path, template: PyTree) -> PyTree | None:
     try:
         return load_named(file, template)
     except (SafetensorError, OSError, UserError):
+        return None
+
+
+def _kept_world(file: Path, map: features.FeatureMap) -> World | None:
+    """A cached World; None likewise."""
+    if not file.exists():
+        return None
+    try:
+        return load(file, lambda *_: map)
+    except UserError:
         return None
 
 
