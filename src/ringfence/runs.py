@@ -171,7 +171,13 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps", "inverse_width"), (1, None))
 RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "gradient_batch", "barrier_updates"), (1, None))
 RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates", "dynamics_width"), (1, None))
-RANGES |= {"members": (1, 20), "future_discount": (0, 0.999), "expectile": (0.5, 1)}
+RANGES |= {
+    "members": (1, 20),
+    "future_discount": (0, 0.999),
+    "expectile": (0.5, 1),
+    "foreseen": (0, 1),
+    "penalty": (0, None),
+}
 RANGES |= dict.fromkeys(("search_iterations", "search_samples", "cql_samples"), (1, None))
 RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
 RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))

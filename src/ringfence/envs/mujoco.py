@@ -57,7 +57,12 @@ class SafeMuJoCo:
     # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of
     # 1000
     # above it are allowed.
-    world: ClassVar[dict] = {"dynamics_width": 256, "barrier_width": 128, "barrier_updates": 20_000, "missed": 0.02}
+    world: ClassVar[dict] = {
+        "dynamics_updates": 40_000,
+        "barrier_width": 128,
+        "barrier_updates": 20_000,
+        "missed": 0.02,
+    }
 
     def __post_init__(self):
         if self.parts not in ROBOTS:

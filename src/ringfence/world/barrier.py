@@ -83,9 +83,10 @@ def soft(score: Array) -> Array:
     return FARTHEST * jnp.tanh(score / FARTHEST)
 
 
-def shape_of(map: FeatureMap, both_ends: bool | None = None) -> Shape:
-    """The shape that a view's names tell. A body's danger is of a step (a mean speed), so both its ends are read; of
-    agents in a plane it is of the state that a step leads to, unless told otherwise."""
+def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = True) -> Shape:
+    """The shape that a view's names tell; without `distances` pairs do not read how far apart they are. A body's danger
+    is of a step (a mean speed), so both its ends are read; of agents in a plane it is of the state that a step leads
+    to, unless told otherwise."""
     names, n = map.names, map.plus.shape[0]
     found: dict[str, dict[int, dict[str, int]]] = {}
     for d, name in enumerate(names):
@@ -112,7 +113,7 @@ def shape_of(map: FeatureMap, both_ends: bool | None = None) -> Shape:
             tuple(k for k, f in enumerate(fields) if is_of[k] and re.fullmatch(word, f))
             for word in ("d[xyz]", "dv[xyz]")
         )
-        offsets.append((place, speed if len(speed) == len(place) else ()))
+        offsets.append((place, speed if len(speed) == len(place) else ()) if distances else ((), ()))
     own = tuple(d for d in range(len(names)) if d not in inside)
     return Shape(own, pairs, tuple(offsets), bool(both_ends), 1, False, "worst")
 
@@ -189,6 +190,8 @@ def fit_label(
     key: Key,
     *,
     loss: Loss,
+    penalty: float = 1.0,
+    share: float = 0.5,
     updates: int,
     width: int,
     batch: int = 512,
@@ -197,10 +200,10 @@ def fit_label(
     """ℓ fitted to the end. data: features (M, N, D), foreseen (T, N, D), row (T,), label (T,) or (T, N) bool of steps;
     `unsafe` and `safe` index the steps to learn from. A quarter of every batch is unsafe.
 
-    Every second step is read as it was *foreseen* to end: that is what a barrier is asked about. Learned from what came
-    to be alone, it may take the rebound after a contact for the contact, which nobody foresees.
+    A `share` of the steps is read as it was *foreseen* to end: that is what a barrier is asked about. Learned from what
+    came to be alone, it may take the rebound after a contact for the contact, which nobody foresees.
 
-    Hinges are the paper's with a margin of 1; `gradient-penalty` adds E(‖∇ℓ(ŝ)‖ − 1)² between the classes.
+    Hinges are the paper's with a margin of 1; `gradient-penalty` adds `penalty` · E(‖∇ℓ(ŝ)‖ − 1)² between the classes.
     """
     kn, kf = jax.random.split(key)
     shape, some = barrier.shape, batch // 4
@@ -210,8 +213,8 @@ def fit_label(
         x, foreseen, row, label, bad, fine = data
         step = jnp.concatenate([bad[pick[:some] % len(unsafe)], fine[pick[some:] % len(safe)]])
         before, came, told = x[row[step]], x[row[step] + 1], label[step]
-        every_second = (jnp.arange(batch) % 2 == 0)[:, None, None]
-        after = jnp.where(every_second, foreseen[step], came)
+        read = (jnp.floor(jnp.arange(1, batch + 1) * share) > jnp.floor(jnp.arange(batch) * share))[:, None, None]
+        after = jnp.where(read, foreseen[step], came)
         z = barrier._seen(before, after)
         h = _score(net, shape, z, after.shape[:-1])
         if told.ndim == 1 and shape.blame == "worst":
@@ -225,7 +228,7 @@ def fit_label(
             part = jnp.linspace(0.0, 1.0, some)[:, None, None]
             between = part * z[:some] + (1 - part) * z[some : 2 * some]
             slope = jax.grad(lambda z: _score(net, shape, z, after[:some].shape[:-1]).sum())(between)
-            total = total + ((jnp.sqrt((slope**2).sum(-1) + 1e-9) - 1.0) ** 2).mean()
+            total = total + penalty * ((jnp.sqrt((slope**2).sum(-1) + 1e-9) - 1.0) ** 2).mean()
         return total
 
     net = networks(kn, shape, width)
@@ -279,8 +282,8 @@ def fit_future(
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
-def blank_barrier(map: FeatureMap, width: int, both_ends: bool | None = None) -> Barrier:
+def blank_barrier(map: FeatureMap, width: int, both_ends: bool | None = None, distances: bool = True) -> Barrier:
     """A barrier of the right shapes that says nothing."""
-    shape, one = shape_of(map, both_ends), jnp.ones(len(map.names))
+    shape, one = shape_of(map, both_ends, distances), jnp.ones(len(map.names))
     nets = networks(jax.random.key(0), shape, width), networks(jax.random.key(0), _still(shape), width)
     return Barrier(*nets, one, one, one, one, jnp.ones(()), shape)

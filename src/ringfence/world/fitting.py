@@ -48,11 +48,14 @@ class Settings:
     labels: Literal["costs", "formula"] = "costs"  # where labels of danger come from
     discount: float = 0.9  # of values
     members: int = 3  # of the ensemble of forward models
-    dynamics_updates: int = 40_000
+    dynamics_updates: int = 20_000
     dynamics_width: int = 128  # units of each of 2 hidden layers
     value_updates: int = 8000  # of the critic, and again of rewards
     barrier: bool = True
     loss: cbf.Loss = "cross-entropy"  # of labels
+    penalty: float = 1.0  # weight of the gradient's, where the loss has one
+    foreseen: float = 0.5  # share of labelled steps that are read as they were foreseen to end
+    distances: bool = True  # pairs read how far apart they are and how fast they close
     both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
     barrier_width: int = 64  # units of each of 3 hidden layers
     barrier_updates: int = 6000  # of the labels
@@ -65,7 +68,7 @@ class Settings:
 PARTS = {
     "dynamics": ("members", "dynamics_updates", "dynamics_width"),
     "values": ("discount", "value_updates"),
-    "label": ("labels", "loss", "both_ends", "barrier_width", "barrier_updates"),
+    "label": ("labels", "loss", "penalty", "foreseen", "distances", "both_ends", "barrier_width", "barrier_updates"),
     "future": ("future_updates", "future_discount", "expectile"),
 }
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}  # what a part reads
@@ -311,15 +314,26 @@ def _label(
             "or take another seed."
         )
     data = told.arrays["features"], told.foreseen(acts), told.arrays["row"], jnp.asarray(told.label)
-    sizes = dict(loss=settings.loss, updates=settings.barrier_updates, width=settings.barrier_width)
-    return cbf.fit_label(start, data, bad, fine, kf, **sizes, quiet=quiet)
+    return cbf.fit_label(
+        start,
+        data,
+        bad,
+        fine,
+        kf,
+        loss=settings.loss,
+        penalty=settings.penalty,
+        share=settings.foreseen,
+        updates=settings.barrier_updates,
+        width=settings.barrier_width,
+        quiet=quiet,
+    )
 
 
 def _blank(map: features.FeatureMap, spec: Spec, s: Settings) -> World:
     """Zeros in the shapes of a World."""
     acts = dynamics.blank_dynamics(map, spec.action_dim, s.members, s.dynamics_width)
     worth = values.blank_values(map, spec.action_dim, s.discount, s.sight == "own")
-    danger = cbf.blank_barrier(map, s.barrier_width, s.both_ends) if s.barrier else None
+    danger = cbf.blank_barrier(map, s.barrier_width, s.both_ends, s.distances) if s.barrier else None
     return World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
 
 
