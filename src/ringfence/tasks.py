@@ -39,6 +39,11 @@ class Task:
         """What settings of a World its simulator asks for."""
         return dict(getattr(self.env, "world", {}))
 
+    @property
+    def guard(self) -> dict[str, dict]:
+        """Options of named guards that its simulator asks for."""
+        return dict(getattr(self.env, "guard", {}))
+
     def normalised_return(self, r):
         return (r - self.return_min) / (self.return_max - self.return_min)
 

@@ -15,7 +15,7 @@ import shutil
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,7 @@ class Cell:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
             same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
-            return same and same_options(r, EVALUATIONS[name])
+            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task).guard)
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -106,8 +106,9 @@ class Cell:
         return read_json(file, "is damaged; delete it") if file.exists() else {}
 
 
-def same_options(stored: dict, evaluation: dict) -> bool:
-    """Whether a result was played with the options of planner and guard that an evaluation's name stands for today."""
+def same_options(stored: dict, evaluation: dict, usual: Mapping[str, dict]) -> bool:
+    """Whether a result was played with the options of planner and guard that an evaluation's name stands for today,
+    where `usual` are those that the task's simulator asks for."""
     how = evaluate.asked(**evaluation)
     plan = dataclasses.asdict(PlanOptions(**{**PLANNERS[how.planner], **how.plan}))
     if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
@@ -115,7 +116,7 @@ def same_options(stored: dict, evaluation: dict) -> bool:
     guard = stored.get("guard_options") or {}
     if not how.guarded:
         return not guard
-    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, **how.given)))
+    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, usual, **how.given)))
     told = {**dataclasses.asdict(GuardOptions()), **guard}  # an option newer than the result had its default then
     return bool(guard) and told == wanted
 

@@ -20,7 +20,10 @@ EVALUATIONS: dict[str, dict] = {
         f"steady+adapt-{danger}": {"planner": "steady", "guard": "adapt", "danger": danger}
         for danger in ("learned", "formula")
     },
-    **{f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"} for guard in ("adapt", "full")},
+    **{
+        f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"}
+        for guard in ("shield", "adapt", "full")
+    },
 }
 
 
@@ -63,9 +66,13 @@ class Suite:
     episodes: int = 200  # per run, unless told otherwise
 
 
+_SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random"))
+# Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
+_ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
+
 SUITES = {
     "simple_spread": Suite(
-        tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random")),
+        _SPREAD,
         (
             Entry("bc"),
             Entry("bc-safe"),
@@ -81,8 +88,7 @@ SUITES = {
         ),
     ),
     "mujoco": Suite(
-        # Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
-        tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol),
+        _ROBOTS,
         (
             Entry("bc"),
             Entry("bc-safe"),
@@ -99,19 +105,24 @@ SUITES = {
     ),
     # Proposal x guard x danger's source, under Worlds that are fitted for every seed.
     "guards": Suite(
-        tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random")),
+        _SPREAD,
         (
-            Entry("bc", evaluations=("plain", "shield-learned", "shield-formula", "full-learned", "full-learned-own")),
+            Entry("bc", evaluations=("plain", "shield-learned", "shield-formula", "full-learned")),
             Entry("mpc", evaluations=("full-learned",)),
             Entry("icbf", "split", ("plain", "shield-learned", "full-learned", "full-formula")),
         ),
     ),
     "guards-mujoco": Suite(
-        tuple(name for name, t in TASKS.items() if t.protocol),
+        _ROBOTS,
         (
-            Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "adapt-learned-own")),
+            Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
             Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
         ),
         episodes=20,
+    ),
+    # Every agent guards its own action by its own view, and hears of nobody.
+    "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=("plain", "shield-learned-own", "full-learned-own")),)),
+    "own-sight-mujoco": Suite(
+        _ROBOTS, (Entry("bc", evaluations=("plain", "adapt-learned-own", "full-learned-own")),), episodes=20
     ),
 }

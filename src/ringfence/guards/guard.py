@@ -46,7 +46,7 @@ class GuardOptions:
     margin: float = 0.6  # distance that is kept
     future: bool = False  # judge the last row by the value of danger, where it is learned
     adapt: float = 0.0  # step of the margin after a cost; 0: it stays
-    rate: float = 0.00625  # share of steps with a cost at which an adapting margin settles
+    rate: float = 0.0125  # share of steps with a cost at which an adapting margin settles
 
     def __post_init__(self):
         for name, bound in (("plans", 1), ("starts", 1), ("rows", 1), ("refine", 0), ("shield", 0)):

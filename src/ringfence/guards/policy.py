@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import equinox as eqx
@@ -179,19 +180,29 @@ class Nothing(eqx.Module):
         return {}
 
 
-def options_of(name: str, danger: str, **changes) -> dict:
-    """Fields of GuardOptions that a named guard has. The margin, unless another is asked for, is a calibrated one of
-    what is learned; of a formula less than its safe margin, which is what examples of safety have."""
-    return {**GUARDS[name], **({"margin": 1.0} if danger == "learned" else {}), **changes}
+def options_of(name: str, danger: str, usual: Mapping[str, dict] = MappingProxyType({}), **changes) -> dict:
+    """Fields of GuardOptions that a named guard has, where `usual` holds what a task's simulator asks for by name. The
+    margin, unless another is asked for, is a calibrated one of what is learned; of a formula less than its safe margin,
+    which is what examples of safety have."""
+    margin = {"margin": 1.0} if danger == "learned" else {}
+    return {**GUARDS[name], **usual.get(name, {}), **margin, **changes}
 
 
-def build(proposal: Any, world: World, hazard: hazards.Hazard | None, name: str, danger: str, **changes) -> Guarded:
-    """A policy under the named guard with changed options."""
+def build(
+    proposal: Any,
+    world: World,
+    hazard: hazards.Hazard | None,
+    name: str,
+    danger: str,
+    usual: Mapping[str, dict] = MappingProxyType({}),
+    **changes,
+) -> Guarded:
+    """A policy under the named guard with changed options; `usual` as in `options_of`."""
     from ringfence.runs import build_config
 
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
-    options = build_config(GuardOptions, options_of(name, danger, **changes), "the guard")
+    options = build_config(GuardOptions, options_of(name, danger, usual, **changes), "the guard")
     if not options.judges:
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."

@@ -312,7 +312,9 @@ def _how(result: dict) -> str:
     if result.get("guard_options"):
         words += [f"--guard {name} --danger {result['danger']}"]
         words += [f"--sight {result['sight']}"] if result["sight"] != "all" else []
-        usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"])
+        task = tasks.TASKS.get(result["task"])
+        usual = {} if task is None else task.guard
+        usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"], usual)
         given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
     if given:
         words.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))
