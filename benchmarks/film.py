@@ -14,6 +14,8 @@ from pathlib import Path
 
 from PIL import Image, ImageDraw
 
+from ringfence.envs import film
+from ringfence.envs.mujoco import DT
 from ringfence.errors import UserError
 from ringfence.evaluate import load_job
 from ringfence.report import video
@@ -37,7 +39,7 @@ def main() -> None:
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
     films = video.with_one_palette([pair(*frames) for frames in zip(left, right)])
-    shown = round(1000 * video.DT * video.stride(STEPS))  # ms
+    shown = round(1000 * DT * video.stride(STEPS))  # ms
     films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
     print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
 
@@ -50,10 +52,10 @@ def half(run: Run, variant: str) -> list[Image.Image]:
     name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)
     title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
     made = []
-    for frame in video.frames(env, states[: STEPS + 1], costs[:STEPS]):
-        whole = Image.new("RGB", (frame.width, frame.height + HEAD), video.PAPER)
+    for frame in env.frames(states[: STEPS + 1], video.moments(costs[:STEPS])):
+        whole = Image.new("RGB", (frame.width, frame.height + HEAD), film.PAPER)
         whole.paste(frame, (0, HEAD))
-        ImageDraw.Draw(whole).text((10, 5), title, fill=video.DARK)
+        ImageDraw.Draw(whole).text((10, 5), title, fill=film.DARK)
         made.append(whole)
     return made
 

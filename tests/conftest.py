@@ -24,7 +24,6 @@ from ringfence import hazards
 from ringfence.data.behaviour import collect
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
-from ringfence.features import simple_spread
 
 
 @pytest.fixture(scope="session")
@@ -36,7 +35,7 @@ def played() -> dict[str, np.ndarray]:
 @pytest.fixture(scope="session")
 def own_store(played) -> EpisodeStore:
     """The same episodes as anybody's own logs: what agents see, by name, a hazard, and no state."""
-    names = simple_spread("decentralized", 3).names
+    names = SimpleSpread().feature_map("decentralized").names
     seen = played["observations"][..., : len(names)]
     card = {"task": "my-robots", "observation_names": list(names), "hazard": hazards.Separation(0.3)}
     return EpisodeStore.from_episodes(seen, played["actions"], played["rewards"], played["costs"], card=card)

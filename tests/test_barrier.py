@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ringfence import barrier as cbf
-from ringfence import features, hazards, normalise
+from ringfence import hazards, normalise
 from ringfence.algos import icbf, joint
 from ringfence.diffusion import cosine_schedule
+from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.nets import MLP
 from ringfence.nets.heads import barrier_on
@@ -122,7 +123,7 @@ def test_shaping_only_ever_raises_h_and_never_blames_the_present():
 def scene(small_store):
     """Real windows, their normaliser and hazard, and a barrier that is positive everywhere, so that all hinges of
     unsafe states bite."""
-    table = features.simple_spread("pruned", 3)
+    table = SimpleSpread().feature_map("pruned")
     data = WindowData(small_store, table)
     hazard = hazards.bind(hazards.Separation(), table.names, 3)
     batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(0, data.steps, 40), 4, 0)
@@ -233,7 +234,7 @@ def test_means_do_not_depend_on_the_number_of_agents():
 
 
 def test_paper_needs_a_formula():
-    hazard = hazards.bind(hazards.CostColumn(), features.simple_spread("pruned", 3).names, 3)
+    hazard = hazards.bind(hazards.CostColumn(), SimpleSpread().feature_map("pruned").names, 3)
     with pytest.raises(UserError, match="routing='paper' labels generated states"):
         icbf.check(config("paper"), hazard)
 

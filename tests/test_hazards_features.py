@@ -23,7 +23,7 @@ def rows(played):
 
 
 def views_of(rows, view):
-    table = features.simple_spread(view, 3)
+    table = SimpleSpread().feature_map(view)
     return table, table(*rows)
 
 
@@ -69,13 +69,13 @@ def test_gradient_of_clearance_is_finite_even_where_agents_coincide(rows, view):
 
 
 def test_absent_features_are_named_with_the_nearest():
-    names = features.simple_spread("pruned", 3).names
+    names = SimpleSpread().feature_map("pruned").names
     with pytest.raises(UserError, match=r"'other2\.dx'.*did you mean 'other[01]\.d.'"):
         hazards.bind(hazards.Separation(), names, 4)
     with pytest.raises(UserError, match=r"SpeedLimit reads the feature 'own\.vz'.*did you mean 'own\.v.'"):
         hazards.bind(hazards.SpeedLimit(1.0, ("own.vx", "own.vz")), names, 3)
     with pytest.raises(UserError, match="at least 2 agents"):
-        hazards.bind(hazards.Separation(), features.simple_spread("pruned", 1).names, 1)
+        hazards.bind(hazards.Separation(), SimpleSpread(n_agents=1).feature_map("pruned").names, 1)
 
 
 def test_speed_limit(rows):
@@ -140,7 +140,7 @@ def test_views_equal_the_simulators_observations(rows):
     np.testing.assert_array_equal(own, observations[..., :14])  # all but the silent channel
     table, pruned = views_of(rows, "pruned")
     np.testing.assert_allclose(pruned[..., :14], observations[..., :14], atol=1e-6)
-    assert table.names[:14] == features.simple_spread("decentralized", 3).names
+    assert table.names[:14] == SimpleSpread().feature_map("decentralized").names
     velocity = observations[..., :2]
     for i in range(3):
         for k, j in enumerate(j for j in range(3) if j != i):
@@ -160,7 +160,7 @@ def test_views_of_other_teams(agents):
     state = np.zeros((4, 6 * agents), np.float32)
     width = {"pruned": 4 + 2 * agents + 4 * (agents - 1), "centralized": 6 * agents, "decentralized": 2 + 4 * agents}
     for view in VIEWS:
-        table = features.simple_spread(view, agents)
+        table = SimpleSpread(n_agents=agents).feature_map(view)
         x = table(observations, state)
         assert x.shape == (4, agents, width[view]) and len(set(table.names)) == len(table.names) == width[view]
 
@@ -200,6 +200,6 @@ def test_entries_that_vary_late_in_a_log_are_kept():
 
 def test_a_view_of_the_state_needs_it(rows):
     with pytest.raises(UserError, match="needs the global state"):
-        features.simple_spread("pruned", 3)(rows[0], None)
+        SimpleSpread().feature_map("pruned")(rows[0], None)
     with pytest.raises(UserError, match="did you mean 'pruned'"):
-        features.simple_spread("prune", 3)
+        SimpleSpread().feature_map("prune")

@@ -9,21 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import features, normalise
+from ringfence import normalise
+from ringfence.envs import SimpleSpread
 from ringfence.windows import WindowData, at
 
 
 @pytest.fixture(scope="module", params=[0, 2], ids=["present", "history"])
 def windows(request, small_store):
     """(windows (M, H, N, D), valid (M, H), row of the present)."""
-    data = WindowData(small_store, features.simple_spread("pruned", 3))
+    data = WindowData(small_store, SimpleSpread().feature_map("pruned"))
     batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(data.steps), 6, request.param)
     return np.asarray(batch.features), np.asarray(batch.valid), request.param
 
 
 def test_bounds_of_actions_change_no_lesson(small_store):
     """Actions told in other units teach the same; those bounded by −1 and 1 are not touched."""
-    view = features.simple_spread("pruned", 3)
+    view = SimpleSpread().feature_map("pruned")
     plain = WindowData(small_store, view).arrays["actions"]
     np.testing.assert_array_equal(plain, small_store.actions)
     np.testing.assert_array_equal(normalise.from_unit(plain, -1.0, 1.0), plain)

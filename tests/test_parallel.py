@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ringfence import evaluate, play, training
+from ringfence.envs import SimpleSpread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
-from ringfence.features import simple_spread
 
 TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -66,7 +66,9 @@ class Own(SimpleSpreadParallel):
     end = 25
 
     def _observations(self):
-        return {a: x[: len(simple_spread("decentralized", 3).names)] for a, x in super()._observations().items()}
+        return {
+            a: x[: len(SimpleSpread().feature_map("decentralized").names)] for a, x in super()._observations().items()
+        }
 
     def step(self, actions):
         seen, reward, terminated, truncated, infos = super().step(actions)

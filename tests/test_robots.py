@@ -31,7 +31,7 @@ PARTS = ("2x3", "2x4", "4x2")
 
 
 def view_of(env: SafeMuJoCo, view: str = "pruned") -> features.FeatureMap:
-    return features.robot(view, env.state_names, env.joints, env.own_joints, env.observed)
+    return env.feature_map(view)
 
 
 @pytest.mark.parametrize("parts", PARTS)

@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import features, scores
+from ringfence import scores
+from ringfence.envs import SimpleSpread
 from ringfence.world import values
 
 
@@ -65,7 +66,7 @@ def test_entries_are_read_by_their_weight():
     r, _ = values.state_values(weighed, x)
     again, _ = values.state_values(weighed, x.at[..., 2].set(0.0))
     np.testing.assert_array_equal(r, again)
-    view = features.simple_spread("pruned", 3)
+    view = SimpleSpread().feature_map("pruned")
     weights = dict(zip(view.names, view.critic_weight))
     assert weights["own.vx"] == weights["other1.dvy"] == 0.25 and weights["own.x"] == weights["landmark0.dx"] == 1.0
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ringfence import features, hazards, tasks, world, worlds
+from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.features import FeatureMap
 from ringfence.world import barrier as cbf
@@ -60,7 +61,7 @@ def test_a_formula_that_is_not_there_is_refused(small_store):
 
 def test_names_tell_who_is_who():
     """Pairs of own movement and each other; the own net reads what is about nobody else; bodies are read whole."""
-    spread = features.simple_spread("pruned", 3)
+    spread = SimpleSpread().feature_map("pruned")
     shape = cbf.shape_of(spread)
     (kind, pairs), *more = shape.pairs
     assert kind == "other" and not more and len(pairs) == 2 and shape.groups == 1 and shape.blame == "worst"
@@ -133,7 +134,7 @@ def test_conformal_quantiles_cover_what_they_say():
 def test_own_entries_tell_the_rest_where_the_logs_agree(played):
     """Offsets and relative velocities of anybody's data follow from everybody's own movement; one that does not is
     predicted. A state that repeats what is observed adds nothing."""
-    view = features.simple_spread("pruned", 3)
+    view = SimpleSpread().feature_map("pruned")
     x = view(None, played["state"]).reshape(-1, 3, 18)
     state = played["state"].reshape(len(x), -1)
     odd = x.copy()
@@ -159,7 +160,7 @@ def test_a_hazard_keeps_what_it_reads(small_store):
 
 def test_costs_per_agent_label_agents(small_store):
     """(T, N) costs: the team's is the largest, and every agent learns from its own."""
-    view = features.simple_spread("pruned", 3)
+    view = SimpleSpread().feature_map("pruned")
     bound = hazards.bind(hazards.Separation(), view.names, 3)
     row = np.arange(small_store.steps) + small_store.episode_of_step + 1
     each = np.asarray(bound.labels(jnp.asarray(view(None, small_store.state[row])))[0])

@@ -64,99 +64,6 @@ class FeatureMap:
         return jnp.concatenate([plan[:, :history], self.reconcile(plan[:, history:])], 1)
 
 
-def simple_spread(view: str, n_agents: int) -> FeatureMap:
-    """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""
-    n = n_agents
-    if view == "decentralized":
-        names = ["own.vx", "own.vy", "own.x", "own.y"]
-        names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
-        names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
-        table = np.tile(np.arange(len(names)), (n, 1))
-        plain = FeatureMap(
-            view, tuple(names), "observations", table, np.full_like(table, -1), critic_weight=_worth(names)
-        )
-        return _following(plain, derived(plain.names, n))
-    position = np.arange(2 * n).reshape(n, 2)
-    velocity, landmark = position + 2 * n, position + 4 * n
-    if view == "centralized":
-        names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
-        names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
-        table = np.tile(np.arange(6 * n), (n, 1))
-        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), critic_weight=_worth(names))
-    if view != "pruned":
-        raise unknown("view", view, VIEWS)
-    names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
-    names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
-    names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]
-    names += [f"other{j}.dv{c}" for j in range(n - 1) for c in "xy"]  # makes the hazard's dynamics Markov
-    for i in range(n):
-        others = [j for j in range(n) if j != i]
-        p = [*velocity[i], *position[i], *landmark.ravel(), *position[others].ravel(), *velocity[others].ravel()]
-        m = [-1] * 4 + list(position[i]) * n + list(position[i]) * (n - 1) + list(velocity[i]) * (n - 1)
-        plus.append(p)
-        minus.append(m)
-    plain = FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), critic_weight=_worth(names))
-    return _following(plain, derived(plain.names, n))
-
-
-def _worth(names: list[str]) -> tuple[float, ...]:
-    """A quarter for velocities. The reward is about positions, but a plan's velocities vary more than its positions
-    do, in deviations: a critic that hears both alike steers plans to speeds that their positions do not follow."""
-    return tuple(0.25 if name.split(".")[1].lstrip("d")[0] == "v" else 1.0 for name in names)
-
-
-def robot(
-    view: str, state_names: tuple[str, ...], joints: tuple[str, ...], own_joints: np.ndarray, observed: np.ndarray
-) -> FeatureMap:
-    """The views of one robot whose joints are shared out: torso, own joints, others' joints.
-
-    own_joints (N, A) index `joints`; observed (N, O) are the entries of the state in everybody's observation.
-    """
-    n, a = own_joints.shape
-    torso = [name for name in state_names if name.startswith("torso.")]
-    if view == "centralized":
-        table = np.tile(np.arange(len(state_names)), (n, 1))
-        less = np.full_like(table, -1)
-        return FeatureMap(view, tuple(state_names), "state", table, less, body=True, joint=True, origin=table)
-    if view == "decentralized":
-        own = {f"{joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(own_joints[0]) for c in "qv"}
-        seen = [state_names[k] for k in observed[0]]
-        near = {name: f"near{m}.q" for m, name in enumerate(x for x in seen if x not in own and x not in torso)}
-        table = np.tile(np.arange(len(seen)), (n, 1))
-        names = tuple((own | near).get(x, x) for x in seen)
-        less = np.full_like(table, -1)
-        return FeatureMap(view, names, "observations", table, less, body=True, joint=True, origin=observed)
-    if view != "pruned":
-        raise unknown("view", view, VIEWS)
-    at = {name: k for k, name in enumerate(state_names)}
-    whose = ["own", *(f"other{j}" for j in range(n - 1))]
-    names = [*torso, *(f"{w}.joint{k}.{c}" for w in whose for k in range(a) for c in "qv")]
-    rows = []
-    for i in range(n):
-        order = [i, *(j for j in range(n) if j != i)]
-        rows.append([at[f"{joints[k]}.{c}"] for j in order for k in own_joints[j] for c in "qv"])
-    table = np.array([[at[t] for t in torso] + row for row in rows])
-    own = tuple(range(len(torso) + 2 * a))
-    agree = _reconcile_shared(len(torso), 2 * a, n)
-    less = np.full_like(table, -1)
-    return FeatureMap(view, tuple(names), "state", table, less, own, agree, body=True, joint=True, origin=table)
-
-
-def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:
-    """A function on plans (..., H, N, D), row 0 the present: everybody's torso is the mean of the planned ones, and
-    others' joints are where their owners plan to have them."""
-    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int)
-
-    def agree(x: Array) -> Array:
-        start, later = x[..., :1, :, :], x[..., 1:, :, :]
-        body = jnp.broadcast_to(later[..., :torso].mean(-2, keepdims=True), later[..., :torso].shape)
-        own = later[..., torso : torso + joints]
-        rest = own[..., others, :].reshape(*own.shape[:-1], (n - 1) * joints)
-        return jnp.concatenate([start, jnp.concatenate([body, own, rest], -1)], -3)
-
-    return agree
-
-
 def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     """Entries that follow from everybody's own ones, as names tell: entry -> (own entry whose change it follows, which
     of the others it is about, -1: a thing that stands still).
@@ -193,7 +100,7 @@ def translation(wanted: FeatureMap, told: FeatureMap) -> np.ndarray | None:
     return np.tile(np.arange(len(names)), (n, 1)) if wanted.names == told.names else None
 
 
-def _following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
+def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     """A map whose entries in `how` follow from the rest (`derived`)."""
     if not how:
         return map
@@ -205,7 +112,7 @@ def alone(map: FeatureMap) -> FeatureMap:
     """The map as one agent has it who hears of nobody: others' entries are predicted like its own, and only what
     stands still follows from its own movement. Bodies are moved by others, whose actions it does not know."""
     how = {d: (own, j) for d, (own, j) in derived(map.names, map.plus.shape[0]).items() if d in map.follows and j < 0}
-    return _following(replace(map, own=None, reconcile=None, follows=(), joint=False), how)
+    return following(replace(map, own=None, reconcile=None, follows=(), joint=False), how)
 
 
 def _reconcile_relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:
@@ -280,7 +187,7 @@ def from_data(
     plain = kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
     if view == "centralized":
         return plain
-    return _following(plain, _confirmed(plain, observations, state, first_rows))
+    return following(plain, _confirmed(plain, observations, state, first_rows))
 
 
 def _confirmed(map: FeatureMap, observations, state, first_rows, steps: int = 4000) -> dict[int, tuple[int, int]]:
@@ -350,7 +257,7 @@ def from_dict(data: dict) -> FeatureMap:
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(data["plus"]), np.array(data["minus"]))
     kept = set(data.get("follows", ()))
-    return _following(map, {d: rule for d, rule in derived(map.names, map.plus.shape[0]).items() if d in kept})
+    return following(map, {d: rule for d, rule in derived(map.names, map.plus.shape[0]).items() if d in kept})
 
 
 def to_dict(map: FeatureMap) -> dict:

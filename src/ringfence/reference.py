@@ -10,7 +10,6 @@ import numpy as np
 from ringfence import hazards
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import SimpleSpread
 from ringfence.evaluate import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
 from ringfence.runs import read_json, write_json
@@ -84,8 +83,8 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
             return known
     spec = task.spec(task.feature_map("pruned"))
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
-    if isinstance(task.env, SimpleSpread) and task.tier in behaviour.TARGETS:  # robots' tiers mix several policies
-        policies["behaviour policy"] = Behaviour(behaviour.shipped_policy(task.tier))
+    if task.recipe is not None and (behaved := task.recipe.behaviour(task.tier)) is not None:
+        policies["behaviour policy"] = Behaviour(behaved)
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)

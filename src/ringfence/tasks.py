@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import ModuleType
 
 import numpy as np
 
 from ringfence import features, hazards
+from ringfence.data.recipes import robots, spread
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SafeMuJoCo, SimpleSpread
 from ringfence.envs.mujoco import Parts
@@ -33,6 +35,7 @@ class Task:
     protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
     action_high: float = 1.0
+    recipe: ModuleType | None = None  # how its data sets are regenerated (data/recipes); None: they cannot be
 
     @property
     def world(self) -> dict:
@@ -52,11 +55,8 @@ class Task:
 
     def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
         """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
-        if isinstance(self.env, SimpleSpread):
-            return features.simple_spread(view, self.env.n_agents)
-        if isinstance(self.env, SafeMuJoCo):
-            e = self.env
-            return features.robot(view, e.state_names, e.joints, e.own_joints, e.observed)
+        if self.env is not None:
+            return self.env.feature_map(view)
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
         width = 0 if store.state is None else store.state.shape[1]
@@ -89,6 +89,7 @@ def _spread(tier: str, mean: float, deviation: float, transitions: int = 1_000_0
         presets=(tier,),
         published_return=(mean, deviation),
         transitions=transitions,
+        recipe=spread,
         **_SPREAD,
     )
 
@@ -131,6 +132,7 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
         presets=("mujoco",),
         published_return=(mean, deviation),
         protocol="quantile" if quantile else "native",
+        recipe=robots,
         **_ROBOTS[parts],
     )
 

@@ -114,19 +114,16 @@ def _bound(task: Task, spec: Spec, reads: str, view: str, store: EpisodeStore | 
     except UserError:
         if reads not in ("labels", "world"):
             return hazards.bind(hazards.CostColumn(), spec.feature_names, spec.n_agents)
-        if view != "pruned" and store is not None and _binds(task, "pruned", store):
+        if view != "pruned" and store is not None and _binds(task, store):
             raise UserError(
                 f"The view '{view}' leaves out what the hazard {type(task.hazard).__name__} reads; set view=pruned."
             ) from None
         raise
 
 
-def _binds(task: Task, view: str, store: EpisodeStore) -> bool:
-    try:
-        hazards.bind(task.hazard, task.feature_map(view, store).names, store.n_agents)
-    except UserError:
-        return False
-    return True
+def _binds(task: Task, store: EpisodeStore) -> bool:
+    names = task.feature_map("pruned", store).names
+    return hazards.bind_or_none(task.hazard, names, store.n_agents) is not None
 
 
 def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: str) -> None:
@@ -140,7 +137,7 @@ def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: 
     if reads in ("labels", "world"):  # a World's barrier learns from the formula then
         return
     unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
-    if unsafe > (APART if "mujoco" in task.presets else 0.0):
+    if unsafe > (APART if isinstance(task.hazard, hazards.SpeedLimit) else 0.0):
         raise UserError(
             f"{algorithm} knows danger by costs alone, which in '{task.name}' are 0 everywhere, but the hazard calls "
             f"{100 * unsafe:.3g} % of its states unsafe; give costs to EpisodeStore, e.g. 1 where the hazard's labels "

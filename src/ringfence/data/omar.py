@@ -20,7 +20,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from ringfence import features, hazards, tasks
+from ringfence import hazards, tasks
 from ringfence.data.store import EpisodeStore, complete_card
 from ringfence.envs import SimpleSpread
 from ringfence.errors import StoreError
@@ -253,7 +253,7 @@ def _costs(
     hazard: hazards.Hazard, env: SimpleSpread, state: np.ndarray, final_state: np.ndarray, ends: np.ndarray
 ) -> np.ndarray:
     """(T,) 1 where the state that a step leads to is unsafe for any agent."""
-    view = features.simple_spread("pruned", env.n_agents)
+    view = env.feature_map("pruned")
     bound = hazards.bind(hazard, view.names, env.n_agents)
     if not bound.has_formula:
         raise StoreError("OMAR's files hold no costs, so CostColumn has nothing to read; pass a hazard with a formula.")
@@ -267,7 +267,7 @@ def _costs(
 def _observation_names(n: int) -> tuple[str, ...]:
     """Names as in the `decentralized` view, with the silent channel behind them."""
     spoken = tuple(f"other{j}.said{c}" for j in range(n - 1) for c in "01")
-    return features.simple_spread("decentralized", n).names + spoken
+    return SimpleSpread(n_agents=n).feature_map("decentralized").names + spoken
 
 
 def _task_name(directory: Path, n: int) -> str:

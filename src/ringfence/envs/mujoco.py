@@ -16,16 +16,19 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
+from ringfence.features import VIEWS, FeatureMap
+from ringfence.types import Array
 
 FRAME_SKIP = 5  # substeps of an environment step
 DT = 0.05  # s of an environment step
@@ -54,6 +57,7 @@ class SafeMuJoCo:
     parts: Parts = "2x3"
     speed_limit: float | None = None  # m/s; None: safety-gymnasium's
     episode_length: int = 1000
+    dt: ClassVar[float] = DT
     # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of
     # 1000 above it are allowed.
     world: ClassVar[dict] = {
@@ -174,6 +178,16 @@ class SafeMuJoCo:
     def observation_names(self) -> tuple[str, ...]:
         """Of agent 0; other agents see their own joints in the same places."""
         return tuple(self.state_names[k] for k in self.observed[0])
+
+    def feature_map(self, view: str) -> FeatureMap:
+        """s̃_i in a view (features.py)."""
+        return views(view, self)
+
+    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
+        """Pictures of an episode (film.py)."""
+        from ringfence.envs import film
+
+        return film.frames(self, states, moments)
 
     def model(self):
         """The MuJoCo model; the Ant's is refused on versions whose physics differs."""
@@ -375,3 +389,51 @@ class _Loop:
     def _read(self, k: int) -> None:
         d = self._data[k]
         self.qpos[k], self.qvel[k], self.torso[k] = d.qpos, d.qvel, d.xpos[1, :2]
+
+
+def views(view: str, env: SafeMuJoCo) -> FeatureMap:
+    """The views of one robot whose joints are shared out: torso, own joints, others' joints."""
+    state_names, joints, own_joints, observed = env.state_names, env.joints, env.own_joints, env.observed
+    n, a = own_joints.shape
+    torso = [name for name in state_names if name.startswith("torso.")]
+    if view == "centralized":
+        table = np.tile(np.arange(len(state_names)), (n, 1))
+        less = np.full_like(table, -1)
+        return FeatureMap(view, tuple(state_names), "state", table, less, body=True, joint=True, origin=table)
+    if view == "decentralized":
+        own = {f"{joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(own_joints[0]) for c in "qv"}
+        seen = [state_names[k] for k in observed[0]]
+        near = {name: f"near{m}.q" for m, name in enumerate(x for x in seen if x not in own and x not in torso)}
+        table = np.tile(np.arange(len(seen)), (n, 1))
+        names = tuple((own | near).get(x, x) for x in seen)
+        less = np.full_like(table, -1)
+        return FeatureMap(view, names, "observations", table, less, body=True, joint=True, origin=observed)
+    if view != "pruned":
+        raise unknown("view", view, VIEWS)
+    at = {name: k for k, name in enumerate(state_names)}
+    whose = ["own", *(f"other{j}" for j in range(n - 1))]
+    names = [*torso, *(f"{w}.joint{k}.{c}" for w in whose for k in range(a) for c in "qv")]
+    rows = []
+    for i in range(n):
+        order = [i, *(j for j in range(n) if j != i)]
+        rows.append([at[f"{joints[k]}.{c}"] for j in order for k in own_joints[j] for c in "qv"])
+    table = np.array([[at[t] for t in torso] + row for row in rows])
+    own = tuple(range(len(torso) + 2 * a))
+    agree = _reconcile_shared(len(torso), 2 * a, n)
+    less = np.full_like(table, -1)
+    return FeatureMap(view, tuple(names), "state", table, less, own, agree, body=True, joint=True, origin=table)
+
+
+def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:
+    """A function on plans (..., H, N, D), row 0 the present: everybody's torso is the mean of the planned ones, and
+    others' joints are where their owners plan to have them."""
+    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int)
+
+    def agree(x: Array) -> Array:
+        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        body = jnp.broadcast_to(later[..., :torso].mean(-2, keepdims=True), later[..., :torso].shape)
+        own = later[..., torso : torso + joints]
+        rest = own[..., others, :].reshape(*own.shape[:-1], (n - 1) * joints)
+        return jnp.concatenate([start, jnp.concatenate([body, own, rest], -1)], -3)
+
+    return agree

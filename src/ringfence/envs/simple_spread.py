@@ -18,7 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
+from ringfence.features import VIEWS, FeatureMap, derived, following
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s
@@ -83,6 +84,10 @@ class SimpleSpread:
             + tuple(f"agent{i}.v{c}" for i in rows for c in "xy")
             + tuple(f"landmark{i}.{c}" for i in rows for c in "xy")
         )
+
+    def feature_map(self, view: str) -> FeatureMap:
+        """s̃_i in a view (features.py)."""
+        return views(view, self.n_agents)
 
     def reset(self, key: Key, batch: int) -> SpreadState:
         """Positions and landmarks uniform in the arena, at rest; starts in contact are part of the task."""
@@ -216,3 +221,44 @@ def _others(pairs: Array) -> Array:
     n = pairs.shape[-2]
     rows, columns = np.nonzero(~np.eye(n, dtype=bool))
     return pairs[..., rows, columns, :].reshape(*pairs.shape[:-2], n - 1, pairs.shape[-1])
+
+
+def views(view: str, n_agents: int) -> FeatureMap:
+    """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""
+    n = n_agents
+    if view == "decentralized":
+        names = ["own.vx", "own.vy", "own.x", "own.y"]
+        names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
+        names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
+        table = np.tile(np.arange(len(names)), (n, 1))
+        plain = FeatureMap(
+            view, tuple(names), "observations", table, np.full_like(table, -1), critic_weight=_worth(names)
+        )
+        return following(plain, derived(plain.names, n))
+    position = np.arange(2 * n).reshape(n, 2)
+    velocity, landmark = position + 2 * n, position + 4 * n
+    if view == "centralized":
+        names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
+        names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
+        table = np.tile(np.arange(6 * n), (n, 1))
+        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), critic_weight=_worth(names))
+    if view != "pruned":
+        raise unknown("view", view, VIEWS)
+    names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
+    names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
+    names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]
+    names += [f"other{j}.dv{c}" for j in range(n - 1) for c in "xy"]  # makes the hazard's dynamics Markov
+    for i in range(n):
+        others = [j for j in range(n) if j != i]
+        p = [*velocity[i], *position[i], *landmark.ravel(), *position[others].ravel(), *velocity[others].ravel()]
+        m = [-1] * 4 + list(position[i]) * n + list(position[i]) * (n - 1) + list(velocity[i]) * (n - 1)
+        plus.append(p)
+        minus.append(m)
+    plain = FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), critic_weight=_worth(names))
+    return following(plain, derived(plain.names, n))
+
+
+def _worth(names: list[str]) -> tuple[float, ...]:
+    """A quarter for velocities. The reward is about positions, but a plan's velocities vary more than its positions
+    do, in deviations: a critic that hears both alike steers plans to speeds that their positions do not follow."""
+    return tuple(0.25 if name.split(".")[1].lstrip("d")[0] == "v" else 1.0 for name in names)

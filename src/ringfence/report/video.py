@@ -1,11 +1,13 @@
-"""Robots as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
+"""Episodes as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
 
-MuJoCo decides how to draw when it is imported, so drawing happens in a process of its own.
+A simulator that has `frames` draws them (envs/film.py). MuJoCo decides how to draw when it is imported, so drawing
+happens in a process of its own.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import subprocess
@@ -15,18 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ringfence.envs.mujoco import DT, SafeMuJoCo
+from ringfence.envs.film import DRAWN
 from ringfence.errors import UserError
 from ringfence.evaluate import load_job
 from ringfence.files import whole
 from ringfence.report.animation import recording
 from ringfence.runs import Run
 from ringfence.tasks import Task
+from ringfence.types import Env
 
-WIDTH, HEIGHT = 320, 240  # pixels
 EVERY = 2  # steps per frame, at least
 LONGEST = 200  # frames
-DRAWN = EMPTY, RED, BLUE, DARK, PAPER = (225, 225, 225), (190, 50, 40), (70, 100, 200), (20, 20, 20), (255, 255, 255)
 # MUJOCO_GL's values that can work on a platform (others are Linux), and what to do where none does.
 BACKENDS = {"darwin": ("cgl",), "win32": ("wgl",)}
 HELP = "install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6)"
@@ -47,8 +48,8 @@ def backend() -> str:
 
 def check(task: Task) -> None:
     """`UserError` where no film of a task's episodes can be made."""
-    if not isinstance(task.env, SafeMuJoCo):
-        raise UserError(f"Films show robots, and '{task.name}' has none; `ringfence report` animates its episodes.")
+    if not hasattr(task.env, "frames"):
+        raise UserError(f"The simulator of '{task.name}' draws no films; `ringfence report` animates its episodes.")
     backend()
 
 
@@ -68,7 +69,7 @@ def recorded(run: Run, variant: str) -> dict[str, np.ndarray]:
     return kept
 
 
-def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
+def animate(env: Env, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
     """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
     The film ends with a fall, after which the last state is repeated.
 
@@ -79,7 +80,9 @@ def animate(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray, out: str | P
     steps = int(moved[-1]) + 1 if len(moved) else len(costs)
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
         file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
-        np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=json.dumps(dataclasses.asdict(env)))
+        kind = f"{type(env).__module__}:{type(env).__qualname__}"
+        told = json.dumps([kind, dataclasses.asdict(env)])
+        np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=told)
         made = _run([sys.executable, "-m", "ringfence.report.video", str(file), str(picture)], name)
         if made.returncode:
             said = (made.stderr.strip().splitlines() or ["nothing"])[-1]
@@ -108,40 +111,6 @@ def moments(costs: np.ndarray) -> list[tuple[int, bool]]:
     return [(t, bool(costs[max(0, t - every) : t].any())) for t in times]
 
 
-def frames(env: SafeMuJoCo, states: np.ndarray, costs: np.ndarray):
-    """Pictures of an episode: states (T+1, S), costs (T,). The planar position is not in the state, so it is summed up
-    from the velocity."""
-    import mujoco
-    from PIL import Image, ImageDraw
-
-    model = env.model()
-    model.light_castshadow[:] = 0
-    data, planar = mujoco.MjData(model), 2 if env.ant else 1
-    moving = [env.state_names.index(f"torso.v{c}") for c in "xy"[:planar]]
-    # Robots run off the floor, so they are drawn in the same place of its pattern near the middle.
-    floor = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)[0]
-    tile = 2 * model.geom_size[floor, :planar] / model.mat_texrepeat[model.geom_matid[floor], :planar]
-    place = (np.cumsum(states[:, moving], 0) * DT) % tile
-    speed = np.linalg.norm(states[:, moving], axis=1)
-    renderer = mujoco.Renderer(model, HEIGHT, WIDTH)
-    nq = model.nq
-    for t, over in moments(costs):
-        data.qpos[:] = np.concatenate([place[t], states[t, : nq - planar]])
-        mujoco.mj_forward(model, data)
-        renderer.update_scene(data, camera="track")
-        picture = Image.fromarray(renderer.render())
-        draw = ImageDraw.Draw(picture)
-        scale = (WIDTH - 20) / (2 * env.limit)
-        draw.rectangle((10, HEIGHT - 16, WIDTH - 10, HEIGHT - 8), fill=EMPTY)
-        end = 10 + min(speed[t], 2 * env.limit) * scale
-        draw.rectangle((10, HEIGHT - 16, end, HEIGHT - 8), fill=RED if over else BLUE)
-        draw.line((10 + env.limit * scale, HEIGHT - 20, 10 + env.limit * scale, HEIGHT - 4), fill=DARK, width=2)
-        text = f"{t * DT:4.1f} s   {speed[t]:.2f} m/s, limit {env.limit:g}" + ("   over" if over else "")
-        draw.rectangle((0, 0, WIDTH, 16), fill=PAPER)
-        draw.text((10, 3), text, fill=RED if over else DARK)
-        yield picture
-
-
 def with_one_palette(pictures: list, colours: int = 64) -> list:
     """RGB pictures in the same few colours, those of bars and words among them: nothing flickers, nothing is lost."""
     from PIL import Image
@@ -162,10 +131,11 @@ def with_one_palette(pictures: list, colours: int = 64) -> list:
 def main() -> None:
     """Draw the episode in a file that `animate` wrote."""
     with np.load(sys.argv[1]) as file:
-        env = SafeMuJoCo(**json.loads(str(file["env"])))
+        kind, fields = json.loads(str(file["env"]))
         states, costs = file["states"], file["costs"]
-    pictures = with_one_palette(list(frames(env, states, costs)))
-    shown = round(1000 * DT * stride(len(costs)))  # ms
+    env = getattr(importlib.import_module(kind.partition(":")[0]), kind.partition(":")[2])(**fields)
+    pictures = with_one_palette(list(env.frames(states, moments(costs))))
+    shown = round(1000 * env.dt * stride(len(costs)))  # ms
     pictures[0].save(sys.argv[2], save_all=True, append_images=pictures[1:], duration=shown, loop=0)
 
 

@@ -1,0 +1,52 @@
+"""Simple Spread's data sets, as OMAR describes the public ones: MATD3 at two levels, its replay, random actions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import jax
+
+from ringfence import __version__
+from ringfence.data import behaviour as policies
+from ringfence.data.store import EpisodeStore
+
+if TYPE_CHECKING:
+    from ringfence.tasks import Task
+
+COLLECTION = 271_828  # root of the collection keys, far from those of evaluation
+
+
+def about(task: Task) -> dict:
+    """The simulator, for the card."""
+    told = {"integrator": task.env.integrator, "reward": task.env.reward}
+    return {"simulator": f"ringfence {__version__} simple_spread", **told}
+
+
+def whole(task: Task, transitions: int) -> int:
+    """Whole episodes, all of one length."""
+    return -(-transitions // task.env.episode_length) * task.env.episode_length
+
+
+def behaviour(tier: str) -> policies.BehaviourPolicy | None:
+    """The policy of `medium` and `expert`."""
+    return policies.shipped_policy(tier) if tier in policies.TARGETS else None
+
+
+def relabelled(task: Task, store: EpisodeStore) -> None:
+    """There is one definition of danger."""
+
+
+def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+    """The data set of a tier."""
+    env, tier = task.env, task.tier
+    episodes = transitions // env.episode_length
+    if tier == "medium-replay":
+        played = policies.replay_episodes(env, episodes, seed)
+        how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
+    else:
+        policy = behaviour(tier) or "random"
+        played = policies.collect(env, policy, episodes, jax.random.fold_in(jax.random.key(COLLECTION), seed))
+        how = "uniform actions" if policy == "random" else f"MATD3 policy, Gaussian action noise {policy.noise:g}"
+    arrays = (played[k] for k in ("observations", "actions", "rewards", "costs"))
+    card = card | {"transitions": transitions, "collected": how}
+    return EpisodeStore.from_episodes(*arrays, state=played["state"], card=card)
