@@ -66,9 +66,6 @@ class SafeMuJoCo:
         "barrier_updates": 20_000,
         "missed": 0.02,
     }
-    # What guards do otherwise (guards.options_of): four steps ahead foresight errs by a tenth of what changes, and what
-    # climbs far from where the logs were climbs errors.
-    guard: ClassVar[dict] = {name: {"rows": 3, "refine": 10, "starts": 4, "reach": 0.5} for name in ("refine", "full")}
 
     def __post_init__(self):
         if self.parts not in ROBOTS:
@@ -95,6 +92,13 @@ class SafeMuJoCo:
     def terminates(self) -> bool:
         """The Ant's episode ends with its fall."""
         return self.ant
+
+    @property
+    def guard(self) -> dict[str, dict]:
+        """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what changes,
+        and what climbs far from where the logs were climbs errors: the Ant falls."""
+        climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
+        return {"refine": climb, "full": climb}
 
     @property
     def limit(self) -> float:

@@ -33,7 +33,7 @@ from ringfence.world import card as cards
 from ringfence.world import dynamics, values
 from ringfence.world.world import Card, World
 
-FORMAT = 2  # of what is fitted and how it is judged: what is cached of another is made again
+FORMAT = 2  # of what is fitted: what is cached of another is made again
 HELD_OUT = 0.1  # of the episodes, whole ones
 FEWEST = 5  # episodes that can be divided
 STRANGE = 0.95  # of held-out episodes stay below the ensemble's threshold throughout
@@ -92,7 +92,9 @@ def fit_view(
     """
     by = None if hazard is None or settings.labels != "formula" else hazards.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, by, cached)
-    file = parts.file("world", list(PARTS), [store.content, features.to_dict(map), settings.missed, settings.barrier])
+    file = parts.file(
+        "world", list(PARTS), [cards.VERSION, store.content, features.to_dict(map), settings.missed, settings.barrier]
+    )
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
     world = _fitted(store, map, spec, settings, hazard, seed, parts, quiet)
