@@ -95,8 +95,8 @@ class SafeMuJoCo:
 
     @property
     def guard(self) -> dict[str, dict]:
-        """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what changes,
-        and what climbs far from where the logs were climbs errors: the Ant falls."""
+        """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what
+        changes, and what climbs far from where the logs were climbs errors: the Ant falls."""
         climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
         return {"refine": climb, "full": climb}
 
