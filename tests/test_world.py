@@ -1,7 +1,9 @@
 """The World: what is learned of the logs before and without a policy."""
 
 import dataclasses
+from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +35,32 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
         worlds.load(tmp_path / "w.safetensors")
+
+
+class Head(eqx.Module):
+    """Two cars in a lane, features (gap, closing speed), that brake by at most 1 m/s²: dynamics and barrier in one."""
+
+    shape: object = eqx.field(static=True, default=None)
+    dynamics = barrier = property(lambda self: self)
+
+    def step(self, x, action):
+        speed = x[..., 1] - 0.1 * action.mean((-1, -2))[..., None]
+        return jnp.stack([x[..., 0] - 0.1 * speed, speed], -1), jnp.zeros(x.shape[:-1])
+
+    def of_steps(self, before, after):
+        return after[..., 0]
+
+
+def test_the_card_says_how_far_ahead_danger_is_decided():
+    """Cars that close in at 1 m/s stop in half a metre: from five steps before it is too late, from seven it is not."""
+    gap = 1.93 - 0.1 * np.arange(21)
+    x = np.stack([gap, np.ones(21)], -1)[:, None].repeat(2, 1)
+    arrays = {"features": jnp.asarray(x, jnp.float32), "actions": jnp.zeros((20, 2, 1))}
+    arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
+    entered = np.array([19])  # the step that ends with a gap below 0
+    found = card._avoidable(Head(), SimpleNamespace(arrays=arrays), entered)
+    assert found["before"] == list(card.BEFORE) and found["rows"] == 7
+    assert found["avoided"] == [0, 0, 0, 0, 1, 1, 1]
 
 
 def test_held_out_episodes_are_whole_and_differ_between_seeds(small_store):

@@ -22,6 +22,7 @@ from ringfence.errors import UserError
 from ringfence.guards.danger import Danger
 from ringfence.types import Array, Key
 from ringfence.world import World
+from ringfence.world.dynamics import Dynamics
 
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
@@ -128,17 +129,30 @@ class Guard(eqx.Module):
         unknown = spread[:, 0, 0] > self.world.strange
         return Decision(plan, chosen, rows, score.min(1), short, unknown)
 
-    def foreseen(self, present: Array, actions: Array) -> tuple[Array, Array]:
+    def foreseen(self, present: Array, actions: Array, dynamics: Dynamics | None = None) -> tuple[Array, Array]:
         """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A)."""
         x = jnp.broadcast_to(present[:, None], (*actions.shape[:2], *present.shape[1:]))
 
         def step(x: Array, action: Array):
-            after, spread = self.world.dynamics.step(x, action)
+            after, spread = (dynamics or self.world.dynamics).step(x, action)
             return after, (after, spread)
 
         _, (rows, spread) = jax.lax.scan(step, x, jnp.moveaxis(actions, 2, 0), unroll=True)
         rows = jnp.concatenate([x[:, :, None], jnp.moveaxis(rows, 0, 2)], 2)
         return rows, jnp.moveaxis(spread, 0, 2)
+
+    def imagined(self, present: Array, actions: Array) -> tuple[Array, Array]:
+        """`foreseen`, each start by one member of the ensemble, in turn (Chua et al. 2018, TS∞): a third of the work, and
+        what is climbed is no average that no member believes; all of them judge what comes of it."""
+        dynamics, starts = self.world.dynamics, actions.shape[1]
+        members = jax.tree.leaves(dynamics.net)[0].shape[0]
+        nets = jax.tree.map(lambda x: x[jnp.arange(starts) % members][:, None], dynamics.net)
+
+        def by(net, actions: Array) -> tuple[Array, Array]:
+            rows, spread = self.foreseen(present, actions[:, None], eqx.tree_at(lambda d: d.net, dynamics, net))
+            return rows[:, 0], spread[:, 0]
+
+        return jax.vmap(by, (0, 1), 1)(nets, actions)
 
     def missing(self, present: Array, score: Array, margin: Array) -> Array:
         """(B, K, N) how much scores (B, K, N) of foreseen rows fall short of the condition, 0 or negative."""
@@ -175,7 +189,7 @@ class Guard(eqx.Module):
         for every margin that is missing and for places where the World knows nothing."""
 
         def worth(actions: Array) -> Array:
-            rows, spread = self.foreseen(present, actions)
+            rows, spread = self.imagined(present, actions)
             value = self.world.values.of_plan(rows, actions) / self.world.values.usual
             score = self.danger.along(rows, spread)
             short = jnp.minimum(score - self._wide(margin, 2), 0.0).sum((2, 3))

@@ -13,7 +13,7 @@ from ringfence.types import Array
 from ringfence.world.barrier import team_score
 from ringfence.world.world import World
 
-VERSION = 2  # of the judgement: cached cards of another are made again
+VERSION = 4  # of the judgement: cached cards of another are made again
 AHEAD = 8  # steps that foresight is judged over
 WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
@@ -26,6 +26,7 @@ BEFORE = (1, 2, 3, 5, 7, 10, 15)  # steps before danger at which it is asked whe
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
 ENTERED = 300  # entries that are asked about
 ROUNDS = 30  # of the search for actions that avoid it
+AIM = 0.01  # score that the search aims at: steps towards 0 itself end a hair below
 
 
 def judge(world: World, told, level: float, missed: float) -> tuple[dict[str, Any], float, float]:
@@ -179,28 +180,28 @@ def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], fl
 
 
 def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
-    """How many of the steps that entered danger could have been avoided by other actions from so many steps before, as
-    this World foresees them; `rows` is how far ahead a guard has to look to avoid nearly all that can be."""
+    """How many of the steps that entered danger other actions could have avoided from so many steps before, and any
+    danger within the longest such time, as this World foresees it; `rows` is how far ahead a guard has to look to avoid
+    nearly all that can be."""
     row, first, last = (np.asarray(told.arrays[k]) for k in ("row", "first_row", "last_row"))
     most = max(BEFORE)
 
     @jax.jit
-    def avoided(world: World, x: Array, actions: Array, asked: Array) -> Array:
+    def avoided(world: World, x: Array, actions: Array) -> Array:
         def worst(actions: Array) -> Array:
             def step(before: Array, action: Array):
                 after, _ = world.dynamics.step(before, action)
                 h = team_score(world.barrier.of_steps(before, after), world.barrier.shape)
                 return after, h
 
-            h = jax.lax.scan(step, x, actions)[1]
-            return jnp.where(asked[:, None], h, jnp.inf).min(0)
+            return jax.lax.scan(step, x, actions)[1].min(0)
 
         def correct(_, carry):
             actions, best = carry
             h, back = jax.vjp(worst, actions)
-            slope = back(jnp.where(h < 0, 1.0, 0.0))[0]
+            slope = back(jnp.where(h < AIM, 1.0, 0.0))[0]
             size = jnp.maximum((slope**2).sum((0, 2, 3)), 1e-6)
-            moved = actions - (jnp.minimum(h, 0.0) / size)[:, None, None] * slope
+            moved = actions - (jnp.minimum(h - AIM, 0.0) / size)[:, None, None] * slope
             return jnp.clip(moved, -1.0, 1.0), jnp.maximum(best, h)
 
         actions, best = jax.lax.fori_loop(0, ROUNDS, correct, (actions, jnp.full(len(x), -jnp.inf)))
@@ -214,7 +215,7 @@ def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
         start = ends - (k - 1)
         left = np.minimum(np.arange(most)[:, None], (last[ends] - row[start] - 1)[None])
         actions = told.arrays["actions"][start + left]
-        found = avoided(world, told.arrays["features"][row[start]], actions, jnp.arange(most) < k)
+        found = avoided(world, told.arrays["features"][row[start]], actions)
         shares[k] = float(np.asarray(found).mean())
     reached = [k for k, share in shares.items() if share >= AVOIDED * max(shares.values())]
     return {"before": list(shares), "avoided": list(shares.values()), "rows": reached[0]}
@@ -280,8 +281,8 @@ def words(told: dict[str, Any]) -> list[str]:
     told_of = danger["avoidable"]
     shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(told_of["before"], told_of["avoided"]))
     lines.append(
-        f"Could still be avoided, steps before entering danger: {shares}. A guard should look {told_of['rows']} "
-        f"ahead (rows={told_of['rows']})."
+        f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
+        f"{told_of['rows']} ahead (rows={told_of['rows']}), where foresight reaches that far."
     )
     lines.append(
         f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "
