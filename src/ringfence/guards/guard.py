@@ -142,8 +142,8 @@ class Guard(eqx.Module):
         return rows, jnp.moveaxis(spread, 0, 2)
 
     def imagined(self, present: Array, actions: Array) -> tuple[Array, Array]:
-        """`foreseen`, each start by one member of the ensemble, in turn (Chua et al. 2018, TS∞): a third of the work, and
-        what is climbed is no average that no member believes; all of them judge what comes of it."""
+        """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work. All
+        of them judge what comes of it."""
         dynamics, starts = self.world.dynamics, actions.shape[1]
         members = jax.tree.leaves(dynamics.net)[0].shape[0]
         nets = jax.tree.map(lambda x: x[jnp.arange(starts) % members][:, None], dynamics.net)
@@ -186,15 +186,14 @@ class Guard(eqx.Module):
 
     def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
         """Actions (B, S, K, N, A) after Adam's ascent of value within bounds, in deviations of the logs', less `care`
-        for every margin that is missing and for places where the World knows nothing."""
+        for every margin that is missing."""
 
         def worth(actions: Array) -> Array:
             rows, spread = self.imagined(present, actions)
             value = self.world.values.of_plan(rows, actions) / self.world.values.usual
             score = self.danger.along(rows, spread)
             short = jnp.minimum(score - self._wide(margin, 2), 0.0).sum((2, 3))
-            lost = jnp.maximum(spread / self.world.strange - 1.0, 0.0).sum((2, 3))
-            return value.sum() + self.options.care * (short - lost).sum()
+            return value.sum() + self.options.care * short.sum()
 
         def climb(carry, t):
             a, m, s = carry
