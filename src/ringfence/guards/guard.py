@@ -142,8 +142,8 @@ class Guard(eqx.Module):
         return rows, jnp.moveaxis(spread, 0, 2)
 
     def imagined(self, present: Array, actions: Array) -> tuple[Array, Array]:
-        """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work. All
-        of them judge what comes of it."""
+        """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work.
+        All of them judge what comes of it."""
         dynamics, starts = self.world.dynamics, actions.shape[1]
         members = jax.tree.leaves(dynamics.net)[0].shape[0]
         nets = jax.tree.map(lambda x: x[jnp.arange(starts) % members][:, None], dynamics.net)
