@@ -13,12 +13,12 @@ from ringfence.types import Array
 from ringfence.world.barrier import team_score
 from ringfence.world.world import World
 
-VERSION = 4  # of the judgement: cached cards of another are made again
+VERSION = 5  # of the judgement: cached cards of another are made again
 AHEAD = 8  # steps that foresight is judged over
 WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
 FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
-LEAST = 1.0  # a margin, in log-odds
+LEAST = 4.0  # a margin, in log-odds: 1 in 55, with both classes equally frequent
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 OUTLIERS = 3  # entries that may look safe however few there are: one freak of foresight is not to set the margin
 JUDGED = 3  # steps ahead that the margin is calibrated for
