@@ -142,14 +142,14 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
 
 
 def test_the_whole_job(tmp_path, monkeypatch, capsys):
-    """`make demo`, tiny: data, three trainings, evaluations on the same resets, the table and the page."""
+    """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
     page = demo.run(tmp_path / "demo", "random", quick=True)
     text = page.read_text()
     assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text
     results = [json.loads(f.read_text()) for f in (tmp_path / "demo").rglob("results.json")]
     starts = {tuple(r["per_episode"]["unsafe_start"]) for found in results for r in found.values()}
-    assert len(results) == 3 and len(starts) == 1
+    assert len(results) == 2 and len(starts) == 1
     told = capsys.readouterr().out
     assert "BC, full guard, learned" in told and "ICBF split, shielded, learned" in told
     assert "of 1000 held-out steps" in told
