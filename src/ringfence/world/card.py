@@ -13,7 +13,7 @@ from ringfence.types import Array
 from ringfence.world.barrier import team_score
 from ringfence.world.world import World
 
-VERSION = 5  # of the judgement: cached cards of another are made again
+VERSION = 6  # of the judgement: cached cards of another are made again
 AHEAD = 8  # steps that foresight is judged over
 WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
@@ -24,8 +24,8 @@ OUTLIERS = 3  # entries that may look safe however few there are: one freak of f
 JUDGED = 3  # steps ahead that the margin is calibrated for
 BEFORE = (1, 2, 3, 5, 7, 10, 15)  # steps before danger at which it is asked whether it could still be avoided
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
-ENTERED = 300  # entries that are asked about
-ROUNDS = 30  # of the search for actions that avoid it
+ENTERED = 100  # entries that are asked about
+ROUNDS = 15  # of the search for actions that avoid it
 AIM = 0.01  # score that the search aims at: steps towards 0 itself end a hair below
 
 
@@ -184,7 +184,6 @@ def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
     danger within the longest such time, as this World foresees it; `rows` is how far ahead a guard has to look to avoid
     nearly all that can be."""
     row, first, last = (np.asarray(told.arrays[k]) for k in ("row", "first_row", "last_row"))
-    most = max(BEFORE)
 
     @jax.jit
     def avoided(world: World, x: Array, actions: Array) -> Array:
@@ -207,16 +206,13 @@ def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
         actions, best = jax.lax.fori_loop(0, ROUNDS, correct, (actions, jnp.full(len(x), -jnp.inf)))
         return jnp.maximum(best, worst(actions)) >= 0
 
-    shares = {}
-    for k in BEFORE:
-        ends = entered[row[entered] - (k - 1) >= first[entered]]
-        if not len(ends):
-            break
-        start = ends - (k - 1)
-        left = np.minimum(np.arange(most)[:, None], (last[ends] - row[start] - 1)[None])
-        actions = told.arrays["actions"][start + left]
-        found = avoided(world, told.arrays["features"][row[start]], actions)
-        shares[k] = float(np.asarray(found).mean())
+    asked = {k: entered[row[entered] - (k - 1) >= first[entered]] for k in BEFORE}
+    asked = {k: ends for k, ends in asked.items() if len(ends)}
+    start = np.concatenate([ends - (k - 1) for k, ends in asked.items()])
+    left = np.minimum(np.arange(max(BEFORE))[:, None], (last - row - 1)[start][None])
+    found = np.asarray(avoided(world, told.arrays["features"][row[start]], told.arrays["actions"][start + left]))
+    parts = np.split(found, np.cumsum([len(ends) for ends in asked.values()])[:-1])
+    shares = {k: float(part.mean()) for k, part in zip(asked, parts)}
     reached = [k for k, share in shares.items() if share >= AVOIDED * max(shares.values())]
     return {"before": list(shares), "avoided": list(shares.values()), "rows": reached[0]}
 
