@@ -230,18 +230,21 @@ class Guard(eqx.Module):
             short = self.missing(present, self.danger.along(rows, spread)[:, 0], margin)
             return short.sum(1) if alone else short.sum((1, 2))[:, None]  # (B, N) or (B, 1)
 
-        def correct(carry, _):
-            plan, best, least = carry
+        def correct(carry):
+            plan, best, least, _, round = carry
             f, back = jax.vjp(shortfall, plan)
             slope = back(jnp.ones_like(f))[0]
             better = (f > least)[:, None, :, None]
             best, least = jnp.where(better, plan, best), jnp.maximum(f, least)
             size = (slope**2).sum((1, 3)) if alone else (slope**2).sum((1, 2, 3))[:, None]
             moved = plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
-            return (jnp.clip(moved, -1.0, 1.0), best, least), None
+            return jnp.clip(moved, -1.0, 1.0), best, least, f, round + 1
+
+        def goes_on(carry):  # until the round after the last in which something was missing
+            return (carry[4] < self.options.shield) & (carry[3] < 0).any()
 
         nothing = jnp.full((plan.shape[0], plan.shape[2] if alone else 1), -jnp.inf)
-        (plan, best, least), _ = jax.lax.scan(correct, (plan, plan, nothing), length=self.options.shield)
+        plan, best, least, *_ = jax.lax.while_loop(goes_on, correct, (plan, plan, nothing, nothing, 0))
         return jnp.where((shortfall(plan) >= least)[:, None, :, None], plan, best)
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
