@@ -31,6 +31,14 @@ def command() -> str:
     return shlex.join(["python", str(script), *sys.argv[1:]])
 
 
+class Rows(list):
+    """Measurements as they come: `rows(name, value, unit)` keeps one for `record` and prints it."""
+
+    def __call__(self, name: str, value: float, unit: str) -> None:
+        self.append({"name": name, "value": value, "unit": unit})
+        print(f"{name}: {value:.4g} {unit}", flush=True)
+
+
 def record(path: str | Path, rows: list[dict[str, Any]]) -> None:
     """Print rows {name, value, unit, ...} and write them to `path` as a JSON list; `command` and `machine` are added
     where a row lacks them."""

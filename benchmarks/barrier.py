@@ -16,8 +16,9 @@ import time
 from pathlib import Path
 
 import ringfence
-from ringfence import evaluate, tasks, training, worlds
+from ringfence import tasks, training, worlds
 from ringfence.data.make import make
+from ringfence.evaluate import evaluate_policy, load
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parent / "results" / "tuning" / "barrier.csv"
@@ -55,8 +56,8 @@ class Simulated:
         self.episodes = max(1, episodes // 20) if body else episodes
 
     def play(self, world, **options) -> dict:
-        policy = evaluate.load(self.run, world=world, **self.guard, **options)[1]
-        return evaluate.evaluate_policy(policy, self.task, self.episodes, "validation", self.seed)[0]
+        policy = load(self.run, world=world, **self.guard, **options)[1]
+        return evaluate_policy(policy, self.task, self.episodes, "validation", self.seed)[0]
 
 
 class Yard:

@@ -11,7 +11,7 @@ import tempfile
 import time
 from pathlib import Path
 
-from _common import record
+from _common import Rows, record
 
 from ringfence import tasks, training, worlds
 from ringfence.data.make import make
@@ -28,12 +28,7 @@ def main() -> None:
     )
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
-    rows = []
-
-    def row(name: str, value: float, unit: str) -> None:
-        rows.append({"name": name, "value": value, "unit": unit})
-        print(f"{name}: {value:.4g} {unit}", flush=True)
-
+    row = Rows()
     for name in a.tasks:
         store, _ = make(tasks.get(name))
         begun = time.perf_counter()
@@ -47,7 +42,7 @@ def main() -> None:
                 row(f"{name}: cloning, guard {guard}, one joint action, p50", took["plan_ms_p50"], "ms")
                 row(f"{name}: cloning, guard {guard}, one joint action, p99", took["plan_ms_p99"], "ms")
     row("peak memory of this benchmark", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "GiB")
-    record(a.out, rows)
+    record(a.out, row)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
-from _common import record
+from _common import Rows, record
 
 from ringfence import tasks, training, worlds
 from ringfence.data import behaviour
@@ -77,12 +77,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=20)
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
-    rows = []
-
-    def row(name: str, value: float, unit: str) -> None:
-        rows.append({"name": name, "value": value, "unit": unit})
-        print(f"{name}: {value:.4g} {unit}", flush=True)
-
+    row = Rows()
     for n in a.teams:
         cost, (job, state, world) = measure_team(n, a.updates)
         row(f"training update, {n} agents, batch {job.config.batch}", cost["update_ms"], "ms")
@@ -95,7 +90,7 @@ def main() -> None:
             row(f"one joint action, guard {name}, {n} agents, p50", took["plan_ms_p50"], "ms")
             row(f"one joint action, guard {name}, {n} agents, p99", took["plan_ms_p99"], "ms")
     row("peak memory of this benchmark", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "GiB")
-    record(a.out, rows)
+    record(a.out, row)
 
 
 if __name__ == "__main__":

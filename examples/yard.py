@@ -3,8 +3,7 @@
     python examples/yard.py            # logs, World, cloning, and what a guard makes of it; some minutes
 
 Nothing here is known to the library: the simulator stands for your robots, its careless controller for whatever made
-your
-logs. Full braking takes ten steps, and 16 to 20 % of the logged episodes end with a contact.
+your logs. Full braking takes ten steps, and 16 to 20 % of the logged episodes end with a contact.
 """
 
 from __future__ import annotations

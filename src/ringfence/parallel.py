@@ -37,8 +37,7 @@ def play(
     run's data, and who begin and end together. `at_once` of them are stepped side by side, so that one compiled call
     acts in all. Episode k is reset with the seed 7 000 001 + k, on the split "validation", for choosing settings,
     with 9 000 001 + k; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are
-    as in
-    `evaluate.load`.
+    as in `evaluate.load`.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); where there

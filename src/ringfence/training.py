@@ -253,8 +253,7 @@ def make_program(job: Job):
     """(advance, diagnose): compiled functions over a leading axis of seeds.
 
     advance(state, keys, arrays, scores, count) makes `count` updates, a traced number, so that one compilation serves
-    every
-    chunk length; it returns the new state and the chunk's mean metrics.
+    every chunk length; it returns the new state and the chunk's mean metrics.
     """
     config = job.config
     update = job.algorithm.make_update(config, job.spec, job.feature_map, job.hazard)

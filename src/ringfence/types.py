@@ -92,10 +92,8 @@ class Policy(Protocol):
     """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
 
     A policy may have `hear(memory, cost) -> memory`: it is then told the cost (B,) of every step. One that knows
-    several
-    steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions (B, P, K, N, A)
-    in
-    [−1, 1], info), which guards choose from.
+    several steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions
+    (B, P, K, N, A) in [−1, 1], info), which guards choose from.
     """
 
     def start(self, batch: int) -> PyTree: ...

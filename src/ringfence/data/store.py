@@ -143,8 +143,7 @@ class EpisodeStore:
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
         costs (E, L), (E, L, N) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves
-        (none, if
-        it is not given)."""
+        (none, if it is not given)."""
         observations, actions = _numbers("observations", observations), _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
             raise StoreError(
@@ -207,8 +206,7 @@ class EpisodeStore:
     ):
         """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), state
         (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the
-        state each
-        episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
+        state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
         ends = _numbers("episode_ends", episode_ends, 1)
         if (ends % 1 != 0).any():
             raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
@@ -468,8 +466,7 @@ def validate(store: EpisodeStore) -> None:
     demand(
         known > 0.5 or known == 1,
         f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop "
-        "episodes "
-        "of which nobody knows.",
+        "episodes of which nobody knows.",
     )
     if s.speed is not None:
         demand(s.speed.shape == (t,), f"speed has shape {s.speed.shape}, expected ({t},); give one of every step.")

@@ -97,7 +97,7 @@ def fit_view(
     )
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
-    world = _fitted(store, map, spec, settings, hazard, seed, parts, quiet)
+    world = _fitted(store, map, spec, hazard, parts, quiet)
     if cached:
         save(world, file)
     return world
@@ -107,16 +107,14 @@ def _fitted(
     store: EpisodeStore,
     map: features.FeatureMap,
     spec: Spec,
-    settings: Settings,
     hazard: hazards.BoundHazard | None,
-    seed: int,
     parts: _Parts,
     quiet: bool,
 ) -> World:
-    begun, s, alone = time.perf_counter(), settings, settings.sight == "own"
+    begun, s, alone = time.perf_counter(), parts.settings, parts.settings.sight == "own"
     map = features.alone(map) if alone else map
     label = labels_of(store, map, s, hazard) if s.barrier else None
-    told = _Told(store, map, held_out(store, seed), label)
+    told = _Told(store, map, held_out(store, parts.seed), label)
     fitted, arrays, blank = told.fitted, told.arrays, _blank(map, spec, s)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated")
 
@@ -184,7 +182,7 @@ def _fitted(
             "hazard": store.card["hazard"],
         },
         "settings": dataclasses.asdict(s),
-        "seed": seed,
+        "seed": parts.seed,
         "shape": _shape_in_words(danger),
         "seconds": {k: round(v, 1) for k, v in parts.seconds.items()}
         | {"in all": round(time.perf_counter() - begun, 1)},

@@ -9,3 +9,5 @@ module with
     relabelled(task, store) -> (costs (T,), dict) | None       the costs of kept steps under this task's danger and what
                                                                the card says then, where they can be told
 """
+
+COLLECTION = 271_828  # root of the collection keys and seeds, far from those of evaluation

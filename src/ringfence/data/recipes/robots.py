@@ -13,13 +13,12 @@ import numpy as np
 
 from ringfence import __version__
 from ringfence.data import robots as policies
+from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
 
 if TYPE_CHECKING:
     from ringfence.tasks import Task
-
-COLLECTION = 271_828  # root of the collection seeds, far from those of evaluation
 
 
 def about(task: Task) -> dict:

@@ -8,12 +8,11 @@ import jax
 
 from ringfence import __version__
 from ringfence.data import behaviour as policies
+from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
 
 if TYPE_CHECKING:
     from ringfence.tasks import Task
-
-COLLECTION = 271_828  # root of the collection keys, far from those of evaluation
 
 
 def about(task: Task) -> dict:
