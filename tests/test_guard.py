@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence import evaluate, hazards, tasks, worlds
+from ringfence import evaluate, hazards, tasks, training, worlds
 from ringfence.errors import UserError
 from ringfence.guards import Danger, Guard, GuardOptions
 from ringfence.guards.guard import pick
@@ -180,8 +180,6 @@ def test_any_callable_is_guarded(small_world, small_store):
 
 
 def test_a_world_of_other_data_is_refused(small_store, tmp_path):
-    from ringfence import training
-
     tiny = dict(changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)
     run = training.train("bc", small_store, **tiny)[0]
     card = {**small_store.card, "task": "other"}
@@ -197,3 +195,25 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
     result = evaluate.evaluate(run, episodes=2, guard="shield", world=same)
     assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible"] <= 1
     assert tasks.get("simple_spread-random").name == result["task"]
+
+
+def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_path, monkeypatch):
+    """A planner whose training read values of its own discount is guarded by the task's World, not by those."""
+    changes = dict(steps=2, batch=8, width=16, depth=1, barrier_batch=4, barrier_width=8)
+    far, usual = (
+        training.train(
+            "icbf",
+            small_store,
+            out=tmp_path / f"{d}",
+            changes={**changes, "discount": d},
+            world=QUICK_WORLD,
+            quiet=True,
+        )[0]
+        for d in (0.8, 0.9)
+    )
+    assert worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
+    monkeypatch.setattr(worlds, "_made_here", lambda run: True)
+    monkeypatch.setattr(worlds, "_of_data", lambda run, sight, quiet: "the task's")
+    assert worlds.for_guard(far) == "the task's"
+    assert worlds.for_guard(usual).values.discount == 0.9
+    assert worlds.of_run(far).values.discount == 0.8

@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import scores
+from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
+from ringfence.hazards import Separation
+from ringfence.windows import WindowData
 from ringfence.world import values
 
 
@@ -78,3 +81,27 @@ def test_plan_value_sums_rewards_and_the_last_value():
     expected = r[:, 0] + 0.5 * r[:, 1] + 0.25 * r[:, 2] + 0.125 * g[:, 2]
     np.testing.assert_allclose(values.plan_value(critic, rows, 0.5), expected, rtol=1e-5)
     assert jnp.isfinite(expected).all()
+
+
+def test_what_ended_for_good_is_worth_nothing(played, monkeypatch):
+    """The critic reads the states that falls left behind, too, with the reward of the fall and no return to go."""
+    fallen = np.zeros(40, bool)
+    fallen[:3] = True
+    card = {"task": "fallen", "hazard": Separation()}
+    parts = (played[k] for k in ("observations", "actions", "rewards", "costs"))
+    store = EpisodeStore.from_episodes(*parts, state=played["state"], terminated=fallen, card=card)
+    view = SimpleSpread().feature_map("pruned")
+    seen = {}
+
+    def fit_critic(x, arrived, togo, *_, **__):
+        seen.update(x=x, arrived=arrived, togo=togo)
+        return values.blank_critic(x.shape[-1])
+
+    monkeypatch.setattr(values, "fit_critic", fit_critic)
+    arrays = WindowData(store, view).arrays | {"togo": jnp.ones(store.steps)}
+    picked = jnp.arange(25, store.steps)  # the first fall is held out
+    values.fit_values(arrays, picked, view, jax.random.key(0), discount=0.9, updates=1, period=26)
+    assert len(seen["x"]) == len(seen["togo"]) == len(picked) + 2
+    np.testing.assert_array_equal(seen["togo"][-3:], [1, 0, 0])
+    np.testing.assert_array_equal(seen["x"][-2:], arrays["features"][jnp.asarray([51, 77])])
+    np.testing.assert_allclose(seen["arrived"][-1], store.rewards[74].mean(), rtol=1e-6)

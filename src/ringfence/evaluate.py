@@ -330,8 +330,7 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
     if not how.guarded:
         return job, policy, at
-    if how.world is not None or world is None or how.sight != "all":
-        world = worlds.of_run(run, how.sight, how.world, quiet=False)
+    world = worlds.for_guard(run, how.sight, how.world, quiet=False)
     guarded = build(policy, world, job.hazard.hazard, how.guard, how.danger, job.task.guard, **how.given)
     return job, guarded, at
 

@@ -51,25 +51,47 @@ def fit(store: EpisodeStore, *, seed: int = 0, cached: bool = True, quiet: bool 
     return fit_view(store, map, spec, settings, hazard=hazard, seed=int(seed), cached=cached, quiet=quiet)
 
 
-def of_run(run: Run, sight: str = "all", world: World | str | Path | None = None, quiet: bool = True) -> World:
-    """The World of a run's data and seed: the one that is given, that of its folder, or one that is fitted to the data
-    that this package regenerates; of anybody's own data it has to be given."""
-    told = run.config
+def of_run(run: Run, quiet: bool = True) -> World:
+    """The World that a run's training read, in its folder; of runs that read none, that of their data (`for_guard`)."""
+    kept = run.path / WORLD
+    return load(kept) if kept.exists() else _of_data(run, "all", quiet)
+
+
+def for_guard(run: Run, sight: str = "all", world: World | str | Path | None = None, quiet: bool = True) -> World:
+    """The World that guards a run: the one that is given; else that of its task and seed, whatever the run's own
+    training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
+    is the one in the run's folder, or has to be given."""
     if world is not None:
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, sight)
         return world
     kept = run.path / WORLD
     if sight == "all" and kept.exists():
-        return load(kept)
-    card = told["data"]
-    if not regenerated(card) or told["task"] not in tasks.TASKS:
+        found = load(kept)
+        # Training may ask for another view, or for values that look less far.
+        usual = Settings(**tasks.TASKS[run.config["task"]].world) if _made_here(run) else None
+        told = found.card["settings"]
+        if usual is None or (usual.view, usual.discount) == (told["view"], told["discount"]):
+            return found
+    return _of_data(run, sight, quiet)
+
+
+def _made_here(run: Run) -> bool:
+    """Whether this package regenerates the data of a run."""
+    return regenerated(run.config["data"]) and run.config["task"] in tasks.TASKS
+
+
+def _of_data(run: Run, sight: str, quiet: bool) -> World:
+    """The World of a run's data and seed, where that is regenerated."""
+    told = run.config
+    if not _made_here(run):
         raise UserError(
             f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
             f"STORE --out FILE{' --sight own' if sight == 'own' else ''}` and name it with world=FILE."
         )
     from ringfence.data.make import make
 
+    card = told["data"]
     size = card.get("size", card.get("transitions"))
     store, _ = make(tasks.get(told["task"]), size, card.get("seed", 0))
     return fit(store, seed=told["seed"], sight=sight, quiet=quiet)

@@ -18,7 +18,8 @@ AHEAD = 8  # steps that foresight is judged over
 WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
 FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
-LEAST = 4.0  # a margin, in log-odds: 1 in 55, with both classes equally frequent
+# The least margin, by loss: log-odds (4: 1 in 55, with both classes equally frequent), or of the 1 that hinges ask for.
+LEAST = {"cross-entropy": 4.0, "hinges": 0.1, "gradient-penalty": 0.1}
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 OUTLIERS = 3  # entries that may look safe however few there are: one freak of foresight is not to set the margin
 JUDGED = 3  # steps ahead that the margin is calibrated for
@@ -29,7 +30,9 @@ ROUNDS = 15  # of the search for actions that avoid it
 AIM = 0.01  # score that the search aims at: steps towards 0 itself end a hair below
 
 
-def judge(world: World, told, level: float, missed: float) -> tuple[dict[str, Any], float, float]:
+def judge(
+    world: World, told, level: float, missed: float, loss: str = "cross-entropy"
+) -> tuple[dict[str, Any], float, float]:
     """(facts, the ensemble's threshold, the margin that calibration asks for)."""
     rng = np.random.default_rng(0)
     facts: dict[str, Any] = {"held_out": {"episodes": int(told.held.sum()), "steps": int(len(told.kept))}}
@@ -37,9 +40,9 @@ def judge(world: World, told, level: float, missed: float) -> tuple[dict[str, An
     facts["values"] = _values(world, told, rng)
     strange = _strange(world, told, level)
     facts["strange"] = {"threshold": strange, "level": level}
-    unit = LEAST
+    unit = LEAST[loss]
     if world.barrier is not None:
-        facts["barrier"], unit = _barrier(world, told, rng, missed)
+        facts["barrier"], unit = _barrier(world, told, rng, missed, unit)
     return facts, strange, unit
 
 
@@ -125,7 +128,7 @@ def conformal(values: np.ndarray, level: float) -> float:
     return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
 
 
-def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], float]:
+def _barrier(world: World, told, rng, missed: float, least: float) -> tuple[dict[str, Any], float]:
     barrier, x, row = world.barrier, told.arrays["features"], np.asarray(told.arrays["row"])
     unsafe = told.label if told.label.ndim == 1 else told.label.any(1)
     bad, fine = (told.kept[unsafe[told.kept] == v] for v in (True, False))
@@ -161,7 +164,7 @@ def _barrier(world: World, told, rng, missed: float) -> tuple[dict[str, Any], fl
             seen.append(np.asarray(score(barrier, before, rows[:, -1])))
     foreseen = np.concatenate(seen)
     missed = max(missed, OUTLIERS / len(foreseen))
-    unit = max(LEAST, conformal(foreseen, 1 - missed))
+    unit = max(least, conformal(foreseen, 1 - missed))
     table = [_of_margin(m, h, truth, foreseen, share) for m in sorted({0.0, 1.0, 2.0, 4.0, 8.0, round(unit, 2)})]
     facts = {
         "unsafe_share": float(share),

@@ -170,7 +170,7 @@ def _fitted(
             ),
         )
     world = World(acts, worth, danger, jnp.ones(()), map, spec, alone, Card({}))
-    judged, strange, unit = cards.judge(world, told, STRANGE, s.missed)
+    judged, strange, unit = cards.judge(world, told, STRANGE, s.missed, s.loss)
     if danger is not None:
         danger = eqx.tree_at(lambda b: b.unit, danger, jnp.asarray(unit, jnp.float32))
     facts = {

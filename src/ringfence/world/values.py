@@ -84,7 +84,12 @@ def fit_values(
     arrived = jnp.where(first, team, arrays["rewards"][before].mean(1))
     weight = map.critic_weight
     x = arrays["features"][row]
-    critic = fit_critic(x, arrived, togo, kc, updates, period=period, weight=weight, each=alone, quiet=quiet)
+    # An episode that ended for good left a state that nothing follows; guards foresee such states, too.
+    over = picked[jnp.flatnonzero(arrays["terminated"][picked])]
+    seen = jnp.concatenate([x, arrays["features"][arrays["row"][over] + 1]])
+    arrived = jnp.concatenate([arrived, arrays["rewards"][over].mean(1)])
+    togo = jnp.concatenate([togo, jnp.zeros(len(over))])
+    critic = fit_critic(seen, arrived, togo, kc, updates, period=period, weight=weight, each=alone, quiet=quiet)
     told = critic["value"][0]
     n, d, a = x.shape[1], x.shape[2], arrays["actions"].shape[-1]
     net = MLP(kn, (2 * d + (n if map.joint else 1) * a, WIDTH, WIDTH, 1), linear=True)
