@@ -61,8 +61,11 @@ def rollout(
             memory, state = carry
             memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
-            memory = heard(policy, memory, out.cost)
-            kept = {"reward": out.reward.mean(-1), "cost": out.cost, "state": env.global_state(after)}
+            cost = (
+                out.cost if out.cost.ndim == 1 else out.cost.max(-1)
+            )  # of agents with costs of their own, the largest
+            memory = heard(policy, memory, cost)
+            kept = {"reward": out.reward.mean(-1), "cost": cost, "state": env.global_state(after)}
             kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
                 kept |= {k: v[:keep] for k, v in decided.info.items() if k not in COUNTED}
@@ -222,7 +225,8 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
     """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
     view = task.feature_map("pruned")
     bound = hazards.bind(task.hazard, view.names, view.plus.shape[0])
-    unsafe, _ = bound.labels(jnp.asarray(view(None, states)))
+    seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(jnp.asarray(states)))
+    unsafe, _ = bound.labels(jnp.asarray(view(seen, states)))
     return np.asarray(unsafe.any(-1))
 
 

@@ -40,6 +40,7 @@ class FeatureMap:
     origin: np.ndarray | None = None  # (N, D) where each entry stands in the global state, if it is one of it as it is
     body: bool = False  # the agents are limbs of one body: its danger is everybody's
     joint: bool = False  # what comes next depends on everybody's action, which is known
+    solitary: bool = False  # what follows does so from the agent's own movement alone
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
 
@@ -108,9 +109,58 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     return replace(map, own=own, reconcile=_reconcile_relative(how, map.plus.shape[0]), follows=tuple(how))
 
 
+def coasting(map: FeatureMap, dt: float) -> FeatureMap:
+    """A map of agents who know where they are by their speed alone: everything named `goal.dx`, `obstacle0.dx` moves
+    by `own.vx` in a step of `dt` seconds, and `other0.dx`, `other0.dvx` as if that other kept its velocity. So what is
+    foreseen of an agent is its own velocity, whoever the others are and however many; what else is told of things
+    (`obstacle0.radius`) stays."""
+    names = {name: d for d, name in enumerate(map.names)}
+    axes = [c for c in "xyz" if f"own.v{c}" in names]
+    rules = []  # entry of the place, entry of the relative velocity or -1, entry of the own velocity
+    for name, d in names.items():
+        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
+        if match and match[2] in axes:
+            rules.append((d, names.get(f"{match[1]}.dv{match[2]}", -1), names[f"own.v{match[2]}"]))
+    if not rules:
+        return map
+    moved = {d for place, speed, _ in rules for d in (place, speed) if d >= 0}
+    stays = {d for name, d in names.items() if d not in moved and not name.startswith("own.")}
+    follows = tuple(sorted(moved | stays))
+    own = tuple(d for d in range(len(map.names)) if d not in follows)
+    return replace(
+        map,
+        own=own,
+        follows=follows,
+        solitary=True,
+        reconcile=_reconcile_coasting(np.array(rules), np.array(sorted(stays), int), dt),
+    )
+
+
+def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Callable[[Array], Array]:
+    """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities."""
+    place, mine = rules[:, 0], rules[:, 2]
+    relative = rules[:, 1] >= 0
+
+    def agree(x: Array) -> Array:
+        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        steps = later.shape[-3]
+        own = later[..., mine]
+        theirs = jnp.where(relative, start[..., rules[:, 1]] + start[..., mine], 0.0)  # their velocity, which they keep
+        count = jnp.arange(1, steps + 1, dtype=x.dtype)[:, None, None]
+        later = later.at[..., stays].set(start[..., stays])
+        later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, -3)))
+        if relative.any():
+            later = later.at[..., rules[relative, 1]].set((theirs - own)[..., relative])
+        return jnp.concatenate([start, later], -3)
+
+    return agree
+
+
 def alone(map: FeatureMap) -> FeatureMap:
     """The map as one agent has it who hears of nobody: others' entries are predicted like its own, and only what
     stands still follows from its own movement. Bodies are moved by others, whose actions it does not know."""
+    if map.solitary:
+        return map
     how = {d: (own, j) for d, (own, j) in derived(map.names, map.plus.shape[0]).items() if d in map.follows and j < 0}
     return following(replace(map, own=None, reconcile=None, follows=(), joint=False), how)
 

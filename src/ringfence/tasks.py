@@ -8,9 +8,9 @@ from types import ModuleType
 import numpy as np
 
 from ringfence import features, hazards
-from ringfence.data.recipes import robots, spread
+from ringfence.data.recipes import crossing, robots, spread
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import SafeMuJoCo, SimpleSpread
+from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
 from ringfence.envs.mujoco import Parts
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.types import Env, Spec
@@ -74,7 +74,8 @@ class Task:
             n, a, length = store.n_agents, store.actions.shape[2], int(store.lengths.max())
         else:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
-        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length)
+        alike = getattr(env, "interchangeable", False)
+        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length, alike)
 
 
 # OMAR's constants (Pan et al. 2022, as printed by MADIFF): a random and an expert policy's return.
@@ -150,6 +151,20 @@ _ROBOT_TIERS: tuple[tuple[Parts, str, float, float | None], ...] = (
     ("4x2", "poor", 542.73, None),
 )
 
+
+def _crossing(tier: str) -> Task:
+    """A million agent-steps; 1 is what the certificates earn at full speed."""
+    return Task(
+        f"crossing-{tier}",
+        Crossing(),
+        hazards.Separation(0.30),
+        tier=tier,
+        return_max=4.2,
+        transitions=125_000,
+        recipe=crossing,
+    )
+
+
 TASKS = {
     t.name: t
     for t in (
@@ -159,6 +174,7 @@ TASKS = {
         _spread("random", 159.57, 60.46),
         *(_robot(*facts) for facts in _ROBOT_TIERS),
         *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
+        *(_crossing(tier) for tier in crossing.TIERS),
     )
 }
 

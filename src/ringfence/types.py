@@ -22,7 +22,7 @@ class Transition(NamedTuple):
     """What one environment step gives, for a batch of environments."""
 
     reward: Array  # (B, N) per agent; the team's reward is the mean over N
-    cost: Array  # (B,) shared; 0 means nothing dangerous happened
+    cost: Array  # (B,) shared, or (B, N) of each agent; 0 means nothing dangerous happened
     terminated: Array  # (B,) bool: the task itself ended; the time limit is never a termination
 
 
@@ -63,6 +63,12 @@ class Spec:
     action_low: float
     action_high: float
     episode_length: int
+    alike: bool = False  # agents are of one kind: they share weights, and so one checkpoint plays any number of them
+
+    @property
+    def groups(self) -> int:
+        """Sets of weights."""
+        return 1 if self.alike else self.n_agents
 
     @property
     def feature_dim(self) -> int:

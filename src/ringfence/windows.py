@@ -77,11 +77,11 @@ def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) ->
 
 
 def returns_to_go(reward: np.ndarray, lengths: np.ndarray, discount: float) -> np.ndarray:
-    """(T,) discounted sum of `reward` (T,) from every step to the end of its episode."""
-    out = np.zeros(len(reward), np.float64)
+    """(T, ...) discounted sum of `reward` (T, ...) from every step to the end of its episode."""
+    out = np.zeros(reward.shape, np.float64)
     ends = np.cumsum(lengths)
     # Episodes advance together, from their last steps backwards: as many passes as the longest has steps.
-    carry = np.zeros(len(lengths))
+    carry = np.zeros((len(lengths), *reward.shape[1:]))
     for back in range(1, int(lengths.max()) + 1):
         alive = lengths >= back
         index = ends[alive] - back

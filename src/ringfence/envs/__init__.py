@@ -1,6 +1,7 @@
 """Simulators, batched and deterministic given their key."""
 
+from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 
-__all__ = ["SafeMuJoCo", "SimpleSpread", "SpreadState"]
+__all__ = ["Crossing", "SafeMuJoCo", "SimpleSpread", "SpreadState"]

@@ -33,7 +33,7 @@ from ringfence.world import card as cards
 from ringfence.world import dynamics, values
 from ringfence.world.world import Card, World
 
-FORMAT = 2  # of what is fitted: what is cached of another is made again
+FORMAT = 3  # of what is fitted: what is cached of another is made again
 HELD_OUT = 0.1  # of the episodes, whole ones
 FEWEST = 5  # episodes that can be divided
 STRANGE = 0.95  # of held-out episodes stay below the ensemble's threshold throughout
@@ -139,7 +139,7 @@ def _fitted(
         [moved, store.digest("rewards")],
         blank.values,
         lambda key: values.fit_values(
-            arrays | {"togo": told.togo(s.discount)},
+            arrays | {"togo": told.togo(s.discount, alone)},
             jnp.asarray(fitted),
             map,
             key,
@@ -246,8 +246,10 @@ class _Told:
             parts.append(step(acts, before, self.arrays["actions"][i : i + size]))
         return jnp.concatenate(parts)
 
-    def togo(self, discount: float):
-        return jnp.asarray(returns_to_go(self.store.rewards.mean(1), self.store.lengths, discount), jnp.float32)
+    def togo(self, discount: float, each: bool = False) -> jax.Array:
+        """(T,) return-to-go of the team, or (T, N) of each agent."""
+        rewards = self.store.rewards if each else self.store.rewards.mean(1)
+        return jnp.asarray(returns_to_go(rewards, self.store.lengths, discount), jnp.float32)
 
 
 def held_out(store: EpisodeStore, seed: int) -> np.ndarray:

@@ -27,13 +27,13 @@ WIDTH = 128  # units of each of the critic's 2 hidden layers
 
 
 class Values(eqx.Module):
-    """What states and steps are worth to the team; to each agent, as far as it can tell, where it is `alone`."""
+    """What states and steps are worth to the team; to each agent itself, as it sees them, where it is `alone`."""
 
     critic: dict[str, Array]  # fit_critic's
     reward: MLP  # r̂(s̃, a, s̃'), standardised as the critic's first target
     discount: float = eqx.field(static=True)
     joint: bool = eqx.field(static=True)  # a body: one look at all of it, with everybody's action
-    alone: bool = eqx.field(static=True)  # every agent's own estimate, from its own view and action
+    alone: bool = eqx.field(static=True)  # what every agent earns, from its own view and action
 
     def of_plan(self, rows: Array, actions: Array) -> Array:
         """Σ_k γ^k r̂(s_k, a_k, s_{k+1}) + γ^K V̂(s_K) of rows (..., K+1, N, D), the present first, and actions
@@ -73,35 +73,37 @@ def fit_values(
     alone: bool = False,
     quiet: bool = True,
 ) -> Values:
-    """Values of a data set's `arrays` (windows.py) by the steps in `picked` (K,); `period` as in `fit_critic`."""
+    """Values of a data set's `arrays` (windows.py) by the steps in `picked` (K,); `period` as in `fit_critic`. Agents
+    that are `alone` learn what each of them earns, (T, N) rewards and `togo`, the others what the team does, (T,)."""
     kc, kr, kn = jax.random.split(key, 3)
     row = arrays["row"][picked]
-    togo, team = arrays["togo"][picked], arrays["rewards"][picked].mean(1)
+    rewards = arrays["rewards"] if alone else arrays["rewards"].mean(1)
+    togo, earned = arrays["togo"][picked], rewards[picked]
     # A state that was arrived in by a step and left by another: the critic's two targets. First rows take the reward of
     # their own first step, a fair stand-in.
     before = jnp.maximum(picked - 1, 0)
     first = arrays["row"][picked] == arrays["first_row"][picked]
-    arrived = jnp.where(first, team, arrays["rewards"][before].mean(1))
+    arrived = jnp.where(first[:, None] if alone else first, earned, rewards[before])
     weight = map.critic_weight
     x = arrays["features"][row]
     # An episode that ended for good left a state that nothing follows; guards foresee such states, too.
     over = picked[jnp.flatnonzero(arrays["terminated"][picked])]
     seen = jnp.concatenate([x, arrays["features"][arrays["row"][over] + 1]])
-    arrived = jnp.concatenate([arrived, arrays["rewards"][over].mean(1)])
-    togo = jnp.concatenate([togo, jnp.zeros(len(over))])
-    critic = fit_critic(seen, arrived, togo, kc, updates, period=period, weight=weight, each=alone, quiet=quiet)
+    arrived = jnp.concatenate([arrived, rewards[over]])
+    togo = jnp.concatenate([togo, jnp.zeros_like(rewards[over])])
+    critic = fit_critic(seen, arrived, togo, kc, updates, period=period, weight=weight, quiet=quiet)
     told = critic["value"][0]
     n, d, a = x.shape[1], x.shape[2], arrays["actions"].shape[-1]
     net = MLP(kn, (2 * d + (n if map.joint else 1) * a, WIDTH, WIDTH, 1), linear=True)
 
     def loss(net: MLP, data, pick: Array) -> Array:
-        features, actions, row, team = data
+        features, actions, row, earned = data
         inputs = _of_step(critic, map.joint, features[row[pick]], actions[pick], features[row[pick] + 1])
         out = net(inputs)[..., 0]
-        goal = (team[pick] - told[0]) / told[1]
-        return ((out - goal[:, None]) ** 2 if alone else (out.mean(-1) - goal) ** 2).mean()
+        goal = (earned[pick] - told[0]) / told[1]
+        return (((out if alone else out.mean(-1)) - goal) ** 2).mean()
 
-    data = arrays["features"], arrays["actions"][picked], row, team
+    data = arrays["features"], arrays["actions"][picked], row, earned
     label = "" if quiet else "rewards, what steps are worth"
     reward = regress(loss, net, data, len(picked), kr, updates, 512, 4e-3, label)
     return Values(critic, reward, discount, map.joint, alone)
@@ -133,18 +135,19 @@ def fit_critic(
     batch: int = 512,
     period: int = 1,
     weight: tuple[float, ...] | None = None,
-    each: bool = False,
     quiet: bool = True,
 ) -> dict[str, Array]:
     """{'net', 'mean', 'scale', 'value'}: regression of (reward on arrival, return-to-go) on states.
 
-    features (M, N, D), rewards (M,) of arriving in each row, togo (M,); 'value' (2, 2) holds mean and deviation of
-    both targets. Adam with cosine decay; the loss is the mean squared error of standardised targets. `period`: rows of
-    an episode, which are not to be in step with the rows that features are standardised by. `weight` (D): how strongly
-    the standardised entries are read; `each`: every agent is to tell by itself, not the mean over agents.
+    features (M, N, D), rewards (M,) of arriving in each row and togo (M,) of the team, told by the mean over agents, or
+    (M, N) of each agent, told by itself; 'value' (2, 2) holds mean and deviation of both targets. Adam with cosine
+    decay; the loss is the mean squared error of standardised targets. `period`: rows of an episode, which are not to be
+    in step with the rows that features are standardised by. `weight` (D): how strongly the standardised entries are
+    read.
     """
-    targets = jnp.stack([rewards, togo], -1)
-    value = jnp.stack([targets.mean(0), jnp.maximum(targets.std(0), 1e-6)], -1)
+    targets, each = jnp.stack([rewards, togo], -1), jnp.ndim(rewards) == 2
+    flat = targets.reshape(-1, 2)
+    value = jnp.stack([flat.mean(0), jnp.maximum(flat.std(0), 1e-6)], -1)
     # Some states, with every agent's view of them. A stride in step with the episodes would see the same few moments
     # of all of them, e.g. the start, where everybody rests.
     stride = next(n for n in itertools.count(max(1, len(features) // STATES)) if math.gcd(n, period) == 1)
@@ -163,7 +166,7 @@ def fit_critic(
     def loss(net: MLP, data: tuple[Array, Array], rows: Array) -> Array:
         x, y = data[0][rows], data[1][rows]
         out, goal = net((x - critic["mean"]) / critic["scale"]), (y - value[:, 0]) / value[:, 1]
-        return ((out - goal[:, None]) ** 2 if each else (out.mean(-2) - goal) ** 2).mean()
+        return (((out if each else out.mean(-2)) - goal) ** 2).mean()
 
     data = features, targets
     label = "" if quiet else "critic, what states are worth"

@@ -1,0 +1,173 @@
+"""Crossing's data sets: the safety barrier certificates of Wang, Ames and Egerstedt (2017, "Safety barrier certificates
+for collisions-free multirobot systems", IEEE T-RO 33(3)), decentralised as in their section V, around a controller that
+heads for its goal: with room to spare and slowly (`careful`), or at full speed, with none, by somebody who trusts the
+brakes too much and steers with an unsteady hand (`hasty`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import __version__
+from ringfence.data.recipes import COLLECTION
+from ringfence.data.store import EpisodeStore
+from ringfence.envs.crossing import DT, PUSH, RADIUS, Crossing, CrossingState
+from ringfence.errors import UserError
+from ringfence.types import Array, Key
+
+if TYPE_CHECKING:
+    from ringfence.tasks import Task
+
+BATCH = 500  # episodes that are played at once
+ROUNDS = 15  # of Hildreth's method on the programme of a step
+STUBBORN = 0.1  # of full push: what a head-on encounter is broken by
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How somebody drives."""
+
+    speed: float  # m/s, towards the goal
+    brake: float  # m/s² that it believes everybody has
+    room: float  # m between rims that it keeps
+    haste: float  # γ of the certificate: how fast it may be used up
+    unsteady: float  # deviation of its hand
+
+
+DRIVERS = {
+    "careful": Driver(0.6, 1.0, 0.05, 1.0, 0.0),
+    "hasty": Driver(1.0, 1.1, 0.0, 2.0, 0.1),
+    "steady": Driver(1.0, 0.9, 0.1, 2.0, 0.0),  # full speed with the brakes that there are: the reference
+}
+TIERS = ("careful", "hasty", "mixed", "random")
+
+
+def about(task: Task) -> dict:
+    """The simulator, for the card."""
+    told = {"body": task.env.body, "goals": task.env.goals, "spacing": task.env.spacing}
+    return {"simulator": f"ringfence {__version__} crossing", **told}
+
+
+def whole(task: Task, transitions: int) -> int:
+    """Whole episodes, all of one length."""
+    return -(-transitions // task.env.episode_length) * task.env.episode_length
+
+
+def behaviour(tier: str) -> None:
+    """Drivers read the state, so no policy of observations stands for them."""
+
+
+def relabelled(task: Task, store: EpisodeStore) -> None:
+    """There is one definition of danger."""
+
+
+def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+    """The data set of a tier."""
+    env, tier = task.env, task.tier
+    if env.body != "disc" or env.obstacles or env.walls:
+        raise UserError(f"'{task.name}' has bodies, obstacles or walls that the drivers do not know; log it otherwise.")
+    episodes = transitions // env.episode_length
+    key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
+    made: dict[str, np.ndarray] = {}
+    for k in range(0, episodes, BATCH):
+        part = _played(env, tier, jax.random.fold_in(key, k), BATCH)
+        for name, x in part.items():
+            made.setdefault(name, np.empty((episodes, *x.shape[1:]), np.float32))
+            made[name][k : k + BATCH] = np.asarray(x)[: episodes - k]
+    how = {
+        "random": "pushes that change ten times an episode",
+        "mixed": "a driver for each agent and episode, between careful and hasty",
+    }.get(tier, f"safety barrier certificates, {DRIVERS.get(tier)}")
+    names = list(env.observation_names)
+    card = card | {"transitions": transitions, "collected": how, "observation_names": names}
+    arrays = (made[x] for x in ("observations", "actions", "rewards", "costs"))
+    return EpisodeStore.from_episodes(*arrays, state=made["state"], card=card)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 3))
+def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
+    kr, kd, ka = jax.random.split(key, 3)
+    first, length = env.reset(kr, batch), env.episode_length
+    some, other = (jnp.array(numbers(DRIVERS[x])) for x in ("careful", "hasty"))
+    share = jax.random.uniform(kd, (batch, env.n_agents, 1))
+    fixed = jnp.array(numbers(DRIVERS.get(tier, DRIVERS["hasty"])))
+    driver = some + share * (other - some) if tier == "mixed" else jnp.broadcast_to(fixed, (batch, env.n_agents, 5))
+    held = jax.random.uniform(kd, (length // 10 + 1, batch, env.n_agents, 2), minval=-1.0, maxval=1.0)
+
+    def step(state: CrossingState, t: Array):
+        action = held[t // 10] if tier == "random" else drive(env, state, driver, jax.random.fold_in(ka, t))
+        after, out = env.step(state, action)
+        return after, (env.observe(after), env.global_state(after), action, out.reward, out.cost)
+
+    _, kept = jax.lax.scan(step, first, jnp.arange(length))
+    seen, state, actions, rewards, costs = (jnp.moveaxis(x, 0, 1) for x in kept)
+    return {
+        "observations": jnp.concatenate([env.observe(first)[:, None], seen], 1),
+        "state": jnp.concatenate([env.global_state(first)[:, None], state], 1),
+        "actions": actions,
+        "rewards": rewards,
+        "costs": costs,
+    }
+
+
+def numbers(driver: Driver) -> tuple[float, ...]:
+    """As `drive` reads them."""
+    return (driver.speed, driver.brake, driver.room, driver.haste, driver.unsteady)
+
+
+def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
+    """Pushes (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
+    speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
+    kw, kn = jax.random.split(key)
+    ahead = state.goal - state.position
+    far = _length(ahead)
+    wanted = ahead / far[..., None] * jnp.minimum(speed, jnp.sqrt(1.6 * far))[..., None]
+    push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
+    push = push + STUBBORN * jax.random.normal(kw, push.shape)
+    push = certified(env, state, push, brake[..., None], room[..., None], haste[..., None])
+    return jnp.clip(push + unsteady[..., None] * jax.random.normal(kn, push.shape), -1.0, 1.0)
+
+
+def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, room: Array, haste: Array) -> Array:
+    """The pushes nearest to `push` (B, N, 2) of which each agent's half of every pair's certificate holds,
+
+        −Δpᵀu ≤ ½ (γ h³ ‖Δp‖ − (Δvᵀ Δp)² / ‖Δp‖² + ‖Δv‖² + 2a Δvᵀ Δp / √(4a (‖Δp‖ − D)))
+        h = √(4a (‖Δp‖ − D)) + Δpᵀ Δv / ‖Δp‖
+
+    with the nearest `neighbours`: a quadratic programme in the plane, by Hildreth's method."""
+    p, v, n = state.position, state.velocity, env.n_agents
+    apart = p[..., :, None, :] - p[..., None, :, :]
+    many = min(env.neighbours, n - 1)
+    if many < 1:
+        return push
+    _, who = jax.lax.top_k(-((apart**2).sum(-1) + 1e9 * jnp.eye(n)), many)
+    gap = jnp.take_along_axis(apart, who[..., None], -2)
+    speed = v[..., :, None, :] - jnp.take_along_axis(v[..., None, :, :], who[..., None], -2)
+    far = _length(gap)
+    left = jnp.maximum(far - 2 * RADIUS - room, 1e-3)
+    root, closing = jnp.sqrt(4 * brake * left), (gap * speed).sum(-1)
+    h = root + closing / far
+    bound = haste * h**3 * far - (closing / far) ** 2 + (speed**2).sum(-1) + 2 * brake * closing / root
+    normal, bound = -gap / far[..., None], 0.5 * bound / far
+
+    def of_one(price: Array, j: Array) -> tuple[Array, None]:
+        u = push - (price[..., None] * normal).sum(-2)
+        new = price[..., j] + (normal[..., j, :] * u).sum(-1) - bound[..., j]
+        return price.at[..., j].set(jnp.maximum(new, 0.0)), None
+
+    price = jnp.zeros_like(bound)
+    price, _ = jax.lax.scan(of_one, price, jnp.tile(jnp.arange(many), ROUNDS))
+    return _bounded(push - (price[..., None] * normal).sum(-2))
+
+
+def _bounded(push: Array) -> Array:
+    return push / jnp.maximum(_length(push), 1.0)[..., None]
+
+
+def _length(x: Array) -> Array:
+    return jnp.sqrt((x**2).sum(-1) + 1e-12)

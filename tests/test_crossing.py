@@ -1,0 +1,156 @@
+"""The room of discs with momentum, its data, and what a guard foresees in it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import tasks, training, worlds
+from ringfence.data.make import make
+from ringfence.data.recipes import crossing as recipe
+from ringfence.envs import Crossing
+from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
+from ringfence.errors import UserError
+from ringfence.evaluate import evaluate_policy, load, unsafe_starts
+from tests.quick import QUICK_WORLD
+
+
+def lone(velocity, **room) -> tuple[Crossing, CrossingState]:
+    """One disc at the room's centre with its goal to the right."""
+    env = Crossing(n_agents=1, **room)
+    state = env.reset(jax.random.key(0), 1)
+    zero = jnp.zeros((1, 1, 2))
+    return env, state._replace(position=zero, velocity=zero + jnp.asarray(velocity), goal=zero + jnp.array([9.0, 0.0]))
+
+
+def test_full_braking_takes_ten_steps_and_half_a_metre():
+    env, state = lone([1.0, 0.0])
+    for _ in range(10):
+        state, _ = env.step(state, jnp.array([[[-1.0, 0.0]]]))
+    np.testing.assert_allclose(state.velocity, 0.0, atol=1e-6)
+    assert float(state.position[0, 0, 0]) == pytest.approx(0.45)
+    pushed, _ = env.step(state, jnp.array([[[1.0, 1.0]]]))  # the push is bounded in all, not along each axis
+    assert float(jnp.linalg.norm(pushed.velocity)) == pytest.approx(0.1)
+
+
+def test_a_unicycle_moves_along_its_heading():
+    env, state = lone([0.5, 0.0], body="unicycle")
+    state = state._replace(heading=jnp.zeros((1, 1)))
+    state, _ = env.step(state, jnp.array([[[1.0, 1.0]]]))
+    assert float(state.heading[0, 0]) == pytest.approx(0.2)
+    np.testing.assert_allclose(state.velocity[0, 0], 0.6 * np.array([np.cos(0.2), np.sin(0.2)]), rtol=1e-5)
+    still, _ = env.step(state._replace(velocity=jnp.zeros((1, 1, 2))), jnp.array([[[-1.0, 0.0]]]))
+    np.testing.assert_allclose(still.velocity, 0.0)  # it does not back up
+
+
+@pytest.mark.parametrize("room", [{}, {"n_agents": 64}, {"n_agents": 3, "obstacles": 4, "walls": True}])
+def test_everybody_starts_at_rest_and_free_and_the_state_tells_all(room):
+    env = Crossing(**room)
+    state = env.reset(jax.random.key(1), 50)
+    assert float(env.clearance(state).min()) > 0.05 and float(jnp.abs(state.velocity).max()) == 0
+    again = env.from_global_state(env.global_state(state))
+    assert all(jnp.array_equal(a, b) for a, b in zip(state, again))
+    assert env.global_state(state).shape[-1] == len(env.state_names)
+    assert env.observe(state).shape[-1] == len(env.observation_names) == env.observation_dim
+    push = jax.random.uniform(jax.random.key(2), (50, env.n_agents, 2), minval=-1.0, maxval=1.0)
+    (a, told), (b, same) = env.step(state, push), env.step(again, push)
+    assert all(jnp.array_equal(x, y) for x, y in zip((*a, *told), (*b, *same)))  # even where a goal is drawn anew
+
+
+def test_agents_see_the_nearest_others_first():
+    env = Crossing(n_agents=12)
+    state = env.reset(jax.random.key(3), 4)
+    state = state._replace(velocity=jax.random.normal(jax.random.key(4), state.velocity.shape))
+    seen, names = np.asarray(env.observe(state)), env.observation_names
+    p, v = np.asarray(state.position), np.asarray(state.velocity)
+    at = names.index("other0.dx")
+    for b, i in ((0, 0), (2, 7), (3, 11)):
+        order = sorted((j for j in range(12) if j != i), key=lambda j: np.linalg.norm(p[b, j] - p[b, i]))
+        for k, j in enumerate(order[:6]):
+            told = seen[b, i, at + 5 * k : at + 5 * k + 5]
+            if np.linalg.norm(p[b, j] - p[b, i]) < SIGHT:
+                np.testing.assert_allclose(told, [*(p[b, j] - p[b, i]), *(v[b, j] - v[b, i]), 1], rtol=1e-4, atol=1e-5)
+            else:
+                np.testing.assert_array_equal(told, [SIGHT, 0, 0, 0, 0])
+    assert Crossing(n_agents=3).observation_names == names  # a smaller team looks the same
+    few = Crossing(n_agents=3)
+    assert few.observe(few.reset(jax.random.key(0), 2))[..., at + 10 + 4 :: 5].max() == 0
+
+
+def test_costs_are_of_those_who_touch():
+    env = Crossing(n_agents=3)
+    state = env.reset(jax.random.key(0), 1)
+    place = jnp.array([[[0.0, 0.0], [1.9 * RADIUS, 0.0], [2.0, 0.0]]])
+    _, out = env.step(state._replace(position=place), jnp.zeros((1, 3, 2)))
+    np.testing.assert_array_equal(out.cost, [[1, 1, 0]])
+    walled = Crossing(n_agents=1, walls=True)
+    state = walled.reset(jax.random.key(0), 1)
+    state = state._replace(position=jnp.full((1, 1, 2), walled.side / 2 - RADIUS - 0.01), velocity=jnp.ones((1, 1, 2)))
+    after, out = walled.step(state, jnp.zeros((1, 1, 2)))
+    assert out.cost.all() and float(jnp.abs(after.velocity).max()) == 0
+
+
+def test_what_is_foreseen_of_others_who_coast_is_exact():
+    """Everything follows from the agents' own velocities, rows ahead, as long as nobody is pushed."""
+    env = Crossing(n_agents=4)
+    state = env.reset(jax.random.key(0), 20)
+    state = state._replace(velocity=0.3 * jax.random.normal(jax.random.key(1), state.velocity.shape))
+    rows = [env.observe(state)]
+    for _ in range(4):
+        state, _ = env.step(state, jnp.zeros((20, 4, 2)))
+        rows.append(env.observe(state))
+    came = jnp.stack(rows, 1)
+    view = env.feature_map("pruned")
+    plan = jnp.repeat(came[:, :1], 5, 1).at[..., :2].set(came[..., :2])
+    error = np.abs(np.asarray(view.reconcile(plan) - came))
+    # But for who comes to be seen, is another than before, or has a new goal.
+    assert np.quantile(error, 0.9) < 1e-5 and view.own == (0, 1) and view.solitary
+
+
+def test_certificates_keep_apart_who_would_touch():
+    env = Crossing()
+    first = env.reset(jax.random.key(5), 20)
+
+    def contacts(name: str) -> float:
+        driver = jnp.broadcast_to(jnp.array(recipe.numbers(recipe.DRIVERS[name])), (20, 8, 5))
+
+        def step(state, key):
+            after, out = env.step(state, recipe.drive(env, state, driver, key))
+            return after, out.cost
+
+        return float(jax.lax.scan(step, first, jax.random.split(jax.random.key(0), 60))[1].mean())
+
+    assert contacts("careful") < 0.001 < contacts("hasty")
+
+
+@pytest.fixture(scope="module")
+def logs():
+    return make(tasks.get("crossing-hasty"), 2000)[0]
+
+
+def test_logs_tell_whom_they_cost(logs):
+    assert logs.costs.shape == (2000, 8) and logs.card["observation_names"][0] == "own.vx"
+    same = make(tasks.get("crossing-hasty"), 2000, fresh=True)[0]
+    assert same.content == logs.content
+    starts = unsafe_starts(tasks.get("crossing-hasty"), logs.state[::101])
+    assert not starts.any()
+
+
+def test_it_is_learned_guarded_and_played(logs, tmp_path):
+    """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
+    task = tasks.get("crossing-hasty")
+    run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    world = worlds.fit(logs, sight="own", **QUICK_WORLD)
+    assert world.alone and world.values.reward.weights[0].shape[0] == 1
+    policy = load(run, guard="shield", sight="own", world=world)[1]
+    assert policy.proposal.actor.weights[0].shape[0] == 1
+    result, _ = evaluate_policy(policy, task, 2)
+    assert result["episodes"] == 2 and 0 <= result["infeasible"] <= 1
+
+
+@pytest.mark.parametrize(
+    "room, said", [({"body": "car"}, "body='car'"), ({"neighbours": 0}, "at least 1"), ({"spacing": 0.3}, "no way")]
+)
+def test_rooms_that_cannot_be_are_refused(room, said):
+    with pytest.raises(UserError, match=said):
+        Crossing(**room)
