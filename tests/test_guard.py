@@ -88,6 +88,17 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
     assert jnp.abs(better - starts).max() > 0.05
 
 
+def test_the_shield_stays_within_its_bound(small_world, bound, present):
+    """Even where that is not enough, which is counted as always."""
+    guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(shield=10, bound=0.1))
+    plan = jnp.full((64, 3, 3, 2), 0.95)
+    kept = guard.shielded(present, plan, jnp.full(64, 9.0))
+    moved = jnp.abs(kept - plan)
+    assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
+    far = make(small_world, bound, shield=10).shielded(present, plan, jnp.full(64, 9.0))
+    assert jnp.abs(far - plan).max() > 0.2
+
+
 def test_the_best_of_the_safe_ones_is_taken():
     safety, value = jnp.asarray([[0.0, 2.0, 3.0], [0.0, 0.1, 0.2]]), jnp.asarray([[9.0, 5.0, 1.0], [9.0, 5.0, 1.0]])
     np.testing.assert_array_equal(pick(safety, value, 1.0), [1, 2])  # the second has no safe one: the safest

@@ -209,7 +209,7 @@ def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
         robots.pack(env, [tmp_path / "none"], tmp_path)
 
 
-@pytest.mark.parametrize("name", [t for t in tasks.TASKS if not t.startswith("simple_spread")])
+@pytest.mark.parametrize("name", [t.name for t in tasks.TASKS.values() if t.protocol])
 def test_tasks_and_their_limits(name):
     task = tasks.get(name)
     policies = robots.shipped_policies(task.env, task.tier)

@@ -97,9 +97,10 @@ class SafeMuJoCo:
     @property
     def guard(self) -> dict[str, dict]:
         """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what
-        changes, and what climbs far from where the logs were climbs errors: the Ant falls."""
+        changes. An Ant that is pushed or climbs far from where the logs were falls."""
         climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
-        return {"refine": climb, "full": climb}
+        bound = {"bound": 0.5} if self.ant else {}
+        return {"shield": bound, "adapt": bound, "refine": climb, "full": climb | bound}
 
     @property
     def limit(self) -> float:

@@ -41,6 +41,7 @@ class GuardOptions:
     reach: float = 2.0  # how far refining may take an action from its proposal; 2: anywhere
     care: float = 10.0  # weight of danger in what is climbed, in deviations of value per margin
     shield: int = 0  # rounds of correction; 0: none
+    bound: float = 2.0  # how far the shield may take an action from what it was; 2: anywhere
     rows: int = 3  # foreseen rows that are judged
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: float = 0.5  # share of what is left of the distance that one step may use up
@@ -56,8 +57,9 @@ class GuardOptions:
         for name in ("noise", "care", "adapt"):
             if getattr(self, name) < 0:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
-        if not 0 < self.reach <= 2:
-            raise UserError(f"reach={self.reach} must lie in (0, 2]: actions lie in [-1, 1].")
+        for name in ("reach", "bound"):
+            if not 0 < getattr(self, name) <= 2:
+                raise UserError(f"{name}={getattr(self, name)} must lie in (0, 2]: actions lie in [-1, 1].")
         if not 0 < self.rate < 1:
             raise UserError(f"rate={self.rate} must be a share of steps between 0 and 1.")
         if not 0 < self.alpha <= 1:
@@ -220,10 +222,12 @@ class Guard(eqx.Module):
     def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the foreseen rows, and the best found otherwise.
 
-        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within the
-        action bounds. Where nothing is missing the plan is kept as it is.
+        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within `bound`
+        of the plan: where the condition cannot be met, pushing with all there is throws robots over. Where nothing is
+        missing the plan is kept as it is.
         """
-        alone = self.world.alone
+        alone, bound = self.world.alone, self.options.bound
+        low, high = jnp.maximum(plan - bound, -1.0), jnp.minimum(plan + bound, 1.0)
 
         def shortfall(plan: Array) -> Array:
             rows, spread = self.foreseen(present, plan[:, None])
@@ -238,7 +242,7 @@ class Guard(eqx.Module):
             best, least = jnp.where(better, plan, best), jnp.maximum(f, least)
             size = (slope**2).sum((1, 3)) if alone else (slope**2).sum((1, 2, 3))[:, None]
             moved = plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
-            return jnp.clip(moved, -1.0, 1.0), best, least, f, round + 1
+            return jnp.clip(moved, low, high), best, least, f, round + 1
 
         def goes_on(carry):  # until the round after the last in which something was missing
             return (carry[4] < self.options.shield) & (carry[3] < 0).any()
