@@ -8,7 +8,6 @@ from pathlib import Path
 from _rows import write
 
 from ringfence import tasks
-from ringfence.bench.suites import SUITES
 from ringfence.data.audit import disagreement
 from ringfence.data.make import make
 
@@ -30,6 +29,7 @@ def row(name: str) -> dict:
         "return_min": round(float(returns.min()), 2),
         "return_max": round(float(returns.max()), 2),
         "cost_mean": round(float(costs.mean()), 3),
+        "unsafe": round(float((costs > 0).mean()), 4),  # share of episodes with any cost
         "terminated": round(float(store.episode_terminated.mean()), 4),
         "disagreement": round(disagreement(store, task), 4),  # share of steps whose cost is not what the hazard says
         "speed_limit": store.card.get("speed_limit", ""),
@@ -39,7 +39,7 @@ def row(name: str) -> dict:
 
 def main() -> None:
     rows = []
-    for name in (task for suite in SUITES.values() for task in suite.tasks):
+    for name in tasks.TASKS:
         rows.append(row(name))
         print(*(f"{k}={v}" for k, v in rows[-1].items()), flush=True)
     write(OUT, rows)

@@ -12,26 +12,27 @@ import numpy as np
 from readme import put
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
-SPREAD = (
-    ("cloning", "bc", "none", "none", "all"),
-    ("shield, formula", "bc", "shield", "formula", "all"),
-    ("**shield, learned**", "bc", "shield", "learned", "all"),
-    ("**full, learned**", "bc", "full", "learned", "all"),
-    ("no prior (`mpc`), full, learned", "mpc", "full", "learned", "all"),
-)
-ROBOTS = (
-    ("cloning", "bc", "none", "none", "all"),
-    ("adapt, formula", "bc", "adapt", "formula", "all"),
-    ("adapt, learned", "bc", "adapt", "learned", "all"),
-    ("full, formula", "bc", "full", "formula", "all"),
-    ("**full, learned**", "bc", "full", "learned", "all"),
-)
-OWN = (
-    ("cloning", "bc", "none", "none", "all"),
-    ("shield, learned, own sight", "bc", "shield", "learned", "own"),
-    ("full, learned, own sight", "bc", "full", "learned", "own"),
-)
-OWN_ROBOTS = (OWN[0], ("adapt, learned, own sight", "bc", "adapt", "learned", "own"), OWN[2])
+# Columns: their heads, and algorithm, guard, danger and sight of their rows.
+SPREAD = {
+    "cloning": "bc none none all",
+    "shield, formula": "bc shield formula all",
+    "**shield, learned**": "bc shield learned all",
+    "**full, learned**": "bc full learned all",
+    "no prior (`mpc`), full, learned": "mpc full learned all",
+}
+ROBOTS = {
+    "cloning": "bc none none all",
+    "adapt, formula": "bc adapt formula all",
+    "adapt, learned": "bc adapt learned all",
+    "full, formula": "bc full formula all",
+    "**full, learned**": "bc full learned all",
+}
+OWN = {"cloning": "bc none none all", "shield, learned, own sight": "bc shield learned own"}
+OWN_ROBOTS = {
+    "cloning": "bc none none all",
+    "adapt, learned, own sight": "bc adapt learned own",
+    "full, learned, own sight": "bc full learned own",
+}
 
 
 def main() -> None:
@@ -42,18 +43,17 @@ def main() -> None:
     put("docs/guard.md", "barrier", barrier())
 
 
-def table(suite: str, columns: tuple, cell) -> str:
+def table(suite: str, columns: dict[str, str], cell) -> str:
     """A row per task, a column per guard; – where nothing was made."""
     rows = list(csv.DictReader((RESULTS / suite / "table.csv").open()))
     names = dict.fromkeys(r["task"] for r in rows)
-    out = ["| | " + " | ".join(c[0] for c in columns) + " |", "|---" * (1 + len(columns)) + "|"]
+    out = ["| | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in names:
         cells = []
-        for _, *of in columns:
+        for of in columns.values():
             keys = ("algorithm", "guard", "danger", "sight")
-            found = [
-                r for r in rows if r["task"] == task and r["variant"] != "reference" and [r[k] for k in keys] == of
-            ]
+            mine = (r for r in rows if r["task"] == task and r["variant"] != "reference")
+            found = [r for r in mine if [r[k] for k in keys] == of.split()]
             seeds = {r["seed"] for r in found}
             cells.append(cell(found) + (f" ({len(seeds)} seeds)" if len(seeds) > 1 else "") if found else "–")
         if any(c != "–" for c in cells[1:]):

@@ -1,5 +1,7 @@
 """The room of discs with momentum, its data, and what a guard foresees in it."""
 
+from dataclasses import astuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -112,7 +114,7 @@ def test_certificates_keep_apart_who_would_touch():
     first = env.reset(jax.random.key(5), 20)
 
     def contacts(name: str) -> float:
-        driver = jnp.broadcast_to(jnp.array(recipe.numbers(recipe.DRIVERS[name])), (20, 8, 5))
+        driver = jnp.broadcast_to(jnp.array(astuple(recipe.DRIVERS[name])), (20, 8, 5))
 
         def step(state, key):
             after, out = env.step(state, recipe.drive(env, state, driver, key))

@@ -61,11 +61,8 @@ def rollout(
             memory, state = carry
             memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
-            cost = (
-                out.cost if out.cost.ndim == 1 else out.cost.max(-1)
-            )  # of agents with costs of their own, the largest
-            memory = heard(policy, memory, cost)
-            kept = {"reward": out.reward.mean(-1), "cost": cost, "state": env.global_state(after)}
+            memory = heard(policy, memory, out.team_cost)
+            kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
             kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
                 kept |= {k: v[:keep] for k, v in decided.info.items() if k not in COUNTED}
@@ -334,7 +331,7 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
     if not how.guarded:
         return job, policy, at
-    world = worlds.for_guard(run, how.sight, how.world, quiet=False)
+    world = worlds.for_guard(run, how.sight, how.world, read=world, quiet=False)
     guarded = build(policy, world, job.hazard.hazard, how.guard, how.danger, job.task.guard, **how.given)
     return job, guarded, at
 

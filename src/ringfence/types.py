@@ -25,6 +25,11 @@ class Transition(NamedTuple):
     cost: Array  # (B,) shared, or (B, N) of each agent; 0 means nothing dangerous happened
     terminated: Array  # (B,) bool: the task itself ended; the time limit is never a termination
 
+    @property
+    def team_cost(self) -> Array:
+        """(B,): of agents with costs of their own, the largest one."""
+        return self.cost if self.cost.ndim == 1 else self.cost.max(-1)
+
 
 @runtime_checkable
 class Env(Protocol):

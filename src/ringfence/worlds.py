@@ -31,9 +31,17 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     return build_config(Settings, {**told, **changes}, "the World")
 
 
-def fit(store: EpisodeStore, *, seed: int = 0, cached: bool = True, quiet: bool = True, **changes) -> World:
+def fit(
+    store: EpisodeStore,
+    *,
+    seed: int = 0,
+    task: Task | None = None,
+    cached: bool = True,
+    quiet: bool = True,
+    **changes,
+) -> World:
     """The World of a store (T + E rows, N agents); `changes` are fields of Settings. Cached by content: the same data,
-    settings and seed are fitted once.
+    settings and seed are fitted once. `task`: of a simulator that is not in `tasks.TASKS`; else the store's own.
 
     world = ringfence.fit(store); print(world.card)
     """
@@ -41,7 +49,7 @@ def fit(store: EpisodeStore, *, seed: int = 0, cached: bool = True, quiet: bool 
         raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise UserError(f"seed={seed!r} must be a whole number, 0 or more.")
-    task = tasks.from_store(store)
+    task = task or tasks.from_store(store)
     settings = settings_for(store, task, **changes)
     map = task.feature_map(settings.view, store)
     spec = task.spec(map, store)
@@ -57,17 +65,22 @@ def of_run(run: Run, quiet: bool = True) -> World:
     return load(kept) if kept.exists() else _of_data(run, "all", quiet)
 
 
-def for_guard(run: Run, sight: str = "all", world: World | str | Path | None = None, quiet: bool = True) -> World:
+def for_guard(
+    run: Run,
+    sight: str = "all",
+    world: World | str | Path | None = None,
+    read: World | None = None,
+    quiet: bool = True,
+) -> World:
     """The World that guards a run: the one that is given; else that of its task and seed, whatever the run's own
     training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
-    is the one in the run's folder, or has to be given."""
+    is the one in the run's folder, or has to be given. `read`: what training read, if it is loaded already."""
     if world is not None:
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, sight)
         return world
-    kept = run.path / WORLD
-    if sight == "all" and kept.exists():
-        found = load(kept)
+    if sight == "all" and (read is not None or (run.path / WORLD).exists()):
+        found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.
         usual = Settings(**tasks.TASKS[run.config["task"]].world) if _made_here(run) else None
         told = found.card["settings"]

@@ -184,7 +184,7 @@ def collect(
     def chunk(k: int) -> dict[str, Array]:
         return _rollout_policy(env, actors, jnp.float32(noise), jax.random.fold_in(key, k), batch)
 
-    return _gather(chunk, episodes, batch)
+    return gather(chunk, episodes, batch)
 
 
 def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000) -> dict[str, np.ndarray]:
@@ -198,7 +198,7 @@ def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000
         start = jax.tree.map(lambda x: jnp.asarray(x[rows]), initial)
         return _rollout_actions(env, start, jnp.asarray(actions[rows], jnp.float32))
 
-    return _gather(chunk, episodes, batch)
+    return gather(chunk, episodes, batch)
 
 
 def replay_episodes(
@@ -414,15 +414,17 @@ def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch:
             return jax.random.uniform(key, (batch, env.n_agents, env.action_dim), minval=-1.0, maxval=1.0)
         return matd3.noisy(matd3.act(actors, env.observe(state)), noise, key)
 
-    return _rollout(env, env.reset(k_reset, batch), choose, jax.random.split(key, env.episode_length))
+    return rollout(env, env.reset(k_reset, batch), choose, jax.random.split(key, env.episode_length))
 
 
 @partial(jax.jit, static_argnums=0)
 def _rollout_actions(env: Env, first: PyTree, actions: Array) -> dict[str, Array]:
-    return _rollout(env, first, lambda _, action: action, jnp.swapaxes(actions, 0, 1))
+    return rollout(env, first, lambda _, action: action, jnp.swapaxes(actions, 0, 1))
 
 
-def _rollout(env: Env, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
+def rollout(env: Env, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
+    """Arrays (B, L, ...) of episodes from `first`, under actions `choose(state, x)`, x along the first axis of `xs`."""
+
     def step(state, x):
         action = choose(state, x)
         after, transition = env.step(state, action)
@@ -440,7 +442,7 @@ def _rollout(env: Env, first: PyTree, choose: Callable, xs: PyTree) -> dict[str,
     }
 
 
-def _gather(chunk: Callable[[int], dict[str, Array]], episodes: int, batch: int) -> dict[str, np.ndarray]:
+def gather(chunk: Callable[[int], dict[str, Array]], episodes: int, batch: int) -> dict[str, np.ndarray]:
     """Fill preallocated arrays chunk by chunk, so that the peak is the result plus one chunk."""
     if episodes < 1 or batch < 1:
         raise UserError(f"Cannot collect {episodes} episodes in batches of {batch}; both must be at least 1.")

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.features import VIEWS, FeatureMap, coasting
 from ringfence.types import Array, Key, Transition
 
@@ -32,7 +32,7 @@ REACHED = 0.2  # m from a goal: the next one is given
 APART = 2.0  # m at least from one goal to the next, as far as the room allows
 EFFORT = 0.01  # m of progress that a step of full push costs
 OBSTACLE = (0.2, 0.5)  # m, radii of obstacles
-ROOM = 2**24  # numbers that a float32 tells apart
+DRAWS = 2**24  # whole numbers that a float32 tells apart
 
 Body = Literal["disc", "unicycle"]
 Goals = Literal["random", "across"]
@@ -111,7 +111,7 @@ class Crossing:
     def feature_map(self, view: str) -> FeatureMap:
         """s̃_i: what the agent sees. There is no other view, or work would grow with the square of the team."""
         if view not in VIEWS:
-            raise UserError(f"View '{view}' does not exist; choose one of {', '.join(VIEWS)}.")
+            raise unknown("view", view, VIEWS)
         names = self.observation_names
         table = np.tile(np.arange(len(names)), (self.n_agents, 1))
         return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), DT)
@@ -131,7 +131,7 @@ class Crossing:
         )
         room = jnp.maximum(cell / 2 - radius - 0.05, 0.0)[..., None]
         place = corner + cell / 2 + room * jax.random.uniform(kj, (batch, n + m, 2), minval=-1.0, maxval=1.0)
-        draw = jax.random.randint(kd, (batch, n), 0, ROOM).astype(jnp.float32)
+        draw = jax.random.randint(kd, (batch, n), 0, DRAWS).astype(jnp.float32)
         heading = jax.random.uniform(kh, (batch, n), minval=-jnp.pi, maxval=jnp.pi)
         position, obstacle = place[:, :n], jnp.concatenate([place[:, n:], radius[:, n:, None]], -1)
         goal, draw = self._next_goal(position, draw, obstacle)
@@ -148,7 +148,7 @@ class Crossing:
             end = self.side / 2 - RADIUS
             velocity = jnp.where(jnp.abs(position) > end, 0.0, velocity)
             position = jnp.clip(position, -end, end)
-        before, after = (_length(p - state.goal) for p in (state.position, position))
+        before, after = (length(p - state.goal) for p in (state.position, position))
         effort = (action**2).sum(-1) if self.body == "disc" else action[..., 0] ** 2
         there = after < REACHED
         goal, draw = self._next_goal(position, state.draw, state.obstacle)
@@ -162,14 +162,22 @@ class Crossing:
         """(B, N) m from an agent's rim to the nearest thing that it must not touch; negative in contact."""
         p, least = state.position, jnp.full(state.position.shape[:-1], jnp.inf)
         if self.n_agents > 1:
-            apart = _length(p[..., None, :, :] - p[..., :, None, :]) + 1e9 * jnp.eye(self.n_agents)
+            apart = length(p[..., None, :, :] - p[..., :, None, :]) + 1e9 * jnp.eye(self.n_agents)
             least = jnp.minimum(least, apart.min(-1) - 2 * RADIUS)
         if self.obstacles:
             centre, radius = state.obstacle[..., None, :, :2], state.obstacle[..., None, :, 2]
-            least = jnp.minimum(least, (_length(centre - p[..., :, None, :]) - radius).min(-1) - RADIUS)
+            least = jnp.minimum(least, (length(centre - p[..., :, None, :]) - radius).min(-1) - RADIUS)
         if self.walls:  # a disc at the end of its way touches
             least = jnp.minimum(least, (self.side / 2 - 1e-4 - jnp.abs(p)).min(-1) - RADIUS)
         return least
+
+    def nearest(self, state: CrossingState) -> tuple[Array, Array]:
+        """Offsets and relative velocities (B, N, k, 2) of the k = min(neighbours, N - 1) nearest others, in order."""
+        p, v, n = state.position, state.velocity, self.n_agents
+        offset = p[..., None, :, :] - p[..., :, None, :]  # (B, N, N, 2)
+        _, who = jax.lax.top_k(-((offset**2).sum(-1) + 1e9 * jnp.eye(n)), min(self.neighbours, n - 1))
+        offset = jnp.take_along_axis(offset, who[..., None], -2)
+        return offset, jnp.take_along_axis(v[..., None, :, :], who[..., None], -2) - v[..., :, None, :]
 
     def observe(self, state: CrossingState) -> Array:
         """(B, N, O) as `observation_names` says. Others that are not seen stand at the end of sight, `seen` = 0."""
@@ -180,13 +188,10 @@ class Crossing:
         parts.append(state.goal - p)
         many = min(self.neighbours, n - 1)
         if many:
-            offset = p[..., None, :, :] - p[..., :, None, :]  # (B, N, N, 2)
-            far, who = jax.lax.top_k(-((offset**2).sum(-1) + 1e9 * jnp.eye(n)), many)
-            seen = far > -(SIGHT**2)
-            offset = jnp.take_along_axis(offset, who[..., None], -2)
-            theirs = jnp.take_along_axis(v[..., None, :, :], who[..., None], -2) - v[..., :, None, :]
+            offset, theirs = self.nearest(state)
+            seen = (offset**2).sum(-1, keepdims=True) < SIGHT**2
             told = jnp.concatenate([offset, theirs, jnp.ones_like(offset[..., :1])], -1)
-            told = jnp.where(seen[..., None], told, jnp.asarray(_UNSEEN))
+            told = jnp.where(seen, told, jnp.asarray(_UNSEEN))
         else:
             told = jnp.zeros((*p.shape[:-1], 0, 5))
         if many < self.neighbours:
@@ -196,7 +201,7 @@ class Crossing:
         if self.obstacles:
             offset = state.obstacle[..., None, :, :2] - p[..., :, None, :]
             radius = jnp.broadcast_to(state.obstacle[..., None, :, 2], offset.shape[:-1])
-            _, which = jax.lax.top_k(radius - _length(offset), min(2, self.obstacles))
+            _, which = jax.lax.top_k(radius - length(offset), min(2, self.obstacles))
             told = jnp.concatenate([offset, radius[..., None]], -1)
             parts.append(jnp.take_along_axis(told, which[..., None], -2).reshape(*p.shape[:-1], -1))
         if self.walls:
@@ -223,9 +228,9 @@ class Crossing:
     def _moved(self, state: CrossingState, action: Array) -> tuple[Array, Array]:
         """Velocities and headings after a step."""
         if self.body == "disc":
-            push = action * PUSH / jnp.maximum(_length(action), 1.0)[..., None]
+            push = action * PUSH / jnp.maximum(length(action), 1.0)[..., None]
             velocity = state.velocity + DT * push
-            return velocity * (SPEED / jnp.maximum(_length(velocity), SPEED))[..., None], state.heading
+            return velocity * (SPEED / jnp.maximum(length(velocity), SPEED))[..., None], state.heading
         ahead = jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)], -1)
         speed = jnp.clip((state.velocity * ahead).sum(-1) + DT * PUSH * action[..., 0], 0.0, SPEED)
         heading = state.heading + DT * TURN * action[..., 1]
@@ -238,14 +243,14 @@ class Crossing:
         end = self.side / 2 - 2 * RADIUS
         tries = 4
         number = draw.astype(jnp.uint32)[..., None] * jnp.uint32(2 * tries) + jnp.arange(2 * tries, dtype=jnp.uint32)
-        unit = _mixed(number).astype(jnp.float32) / ROOM  # (B, N, 2 tries)
+        unit = _mixed(number).astype(jnp.float32) / DRAWS  # (B, N, 2 tries)
         drawn = (2.0 * unit.reshape(*unit.shape[:-1], tries, 2) - 1.0) * end
         if self.goals == "across":
             drawn = jnp.clip(0.2 * drawn - position[..., None, :], -end, end)
-        away = _length(drawn - position[..., None, :])
+        away = length(drawn - position[..., None, :])
         fine = away >= min(APART, self.side / 2)
         if self.obstacles:
-            gap = _length(drawn[..., None, :] - obstacle[..., None, None, :, :2]) - obstacle[..., None, None, :, 2]
+            gap = length(drawn[..., None, :] - obstacle[..., None, None, :, :2]) - obstacle[..., None, None, :, 2]
             free = (gap > 3 * RADIUS).all(-1)
             fine, away = fine & free, jnp.where(free, away, -1.0)
         which = jnp.where(fine.any(-1), fine.argmax(-1), away.argmax(-1))
@@ -256,7 +261,8 @@ class Crossing:
 _UNSEEN = np.array([SIGHT, 0.0, 0.0, 0.0, 0.0], np.float32)
 
 
-def _length(x: Array) -> Array:
+def length(x: Array) -> Array:
+    """Euclidean, with a slope at 0."""
     return jnp.sqrt((x**2).sum(-1) + 1e-12)
 
 

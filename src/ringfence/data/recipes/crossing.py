@@ -5,18 +5,18 @@ brakes too much and steers with an unsteady hand (`hasty`)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ringfence import __version__
+from ringfence.data.behaviour import gather, rollout
 from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
-from ringfence.envs.crossing import DT, PUSH, RADIUS, Crossing, CrossingState
+from ringfence.envs.crossing import DT, PUSH, RADIUS, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.types import Array, Key
 
@@ -42,7 +42,6 @@ class Driver:
 DRIVERS = {
     "careful": Driver(0.6, 1.0, 0.05, 1.0, 0.0),
     "hasty": Driver(1.0, 1.1, 0.0, 2.0, 0.1),
-    "steady": Driver(1.0, 0.9, 0.1, 2.0, 0.0),  # full speed with the brakes that there are: the reference
 }
 TIERS = ("careful", "hasty", "mixed", "random")
 
@@ -73,12 +72,7 @@ def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore
         raise UserError(f"'{task.name}' has bodies, obstacles or walls that the drivers do not know; log it otherwise.")
     episodes = transitions // env.episode_length
     key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
-    made: dict[str, np.ndarray] = {}
-    for k in range(0, episodes, BATCH):
-        part = _played(env, tier, jax.random.fold_in(key, k), BATCH)
-        for name, x in part.items():
-            made.setdefault(name, np.empty((episodes, *x.shape[1:]), np.float32))
-            made[name][k : k + BATCH] = np.asarray(x)[: episodes - k]
+    made = gather(lambda k: _played(env, tier, jax.random.fold_in(key, k * BATCH), BATCH), episodes, BATCH)
     how = {
         "random": "pushes that change ten times an episode",
         "mixed": "a driver for each agent and episode, between careful and hasty",
@@ -92,32 +86,17 @@ def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore
 @partial(jax.jit, static_argnums=(0, 1, 3))
 def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
     kr, kd, ka = jax.random.split(key, 3)
-    first, length = env.reset(kr, batch), env.episode_length
-    some, other = (jnp.array(numbers(DRIVERS[x])) for x in ("careful", "hasty"))
+    some, other = (jnp.array(astuple(DRIVERS[x])) for x in ("careful", "hasty"))
     share = jax.random.uniform(kd, (batch, env.n_agents, 1))
-    fixed = jnp.array(numbers(DRIVERS.get(tier, DRIVERS["hasty"])))
+    fixed = jnp.array(astuple(DRIVERS.get(tier, DRIVERS["hasty"])))
     driver = some + share * (other - some) if tier == "mixed" else jnp.broadcast_to(fixed, (batch, env.n_agents, 5))
-    held = jax.random.uniform(kd, (length // 10 + 1, batch, env.n_agents, 2), minval=-1.0, maxval=1.0)
+    steps = env.episode_length
+    held = jax.random.uniform(kd, (steps // 10 + 1, batch, env.n_agents, 2), minval=-1.0, maxval=1.0)
 
-    def step(state: CrossingState, t: Array):
-        action = held[t // 10] if tier == "random" else drive(env, state, driver, jax.random.fold_in(ka, t))
-        after, out = env.step(state, action)
-        return after, (env.observe(after), env.global_state(after), action, out.reward, out.cost)
+    def choose(state: CrossingState, t: Array) -> Array:
+        return held[t // 10] if tier == "random" else drive(env, state, driver, jax.random.fold_in(ka, t))
 
-    _, kept = jax.lax.scan(step, first, jnp.arange(length))
-    seen, state, actions, rewards, costs = (jnp.moveaxis(x, 0, 1) for x in kept)
-    return {
-        "observations": jnp.concatenate([env.observe(first)[:, None], seen], 1),
-        "state": jnp.concatenate([env.global_state(first)[:, None], state], 1),
-        "actions": actions,
-        "rewards": rewards,
-        "costs": costs,
-    }
-
-
-def numbers(driver: Driver) -> tuple[float, ...]:
-    """As `drive` reads them."""
-    return (driver.speed, driver.brake, driver.room, driver.haste, driver.unsteady)
+    return rollout(env, env.reset(kr, batch), choose, jnp.arange(steps))
 
 
 def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
@@ -125,7 +104,7 @@ def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array
     speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
     kw, kn = jax.random.split(key)
     ahead = state.goal - state.position
-    far = _length(ahead)
+    far = length(ahead)
     wanted = ahead / far[..., None] * jnp.minimum(speed, jnp.sqrt(1.6 * far))[..., None]
     push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
     push = push + STUBBORN * jax.random.normal(kw, push.shape)
@@ -140,15 +119,11 @@ def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, ro
         h = √(4a (‖Δp‖ − D)) + Δpᵀ Δv / ‖Δp‖
 
     with the nearest `neighbours`: a quadratic programme in the plane, by Hildreth's method."""
-    p, v, n = state.position, state.velocity, env.n_agents
-    apart = p[..., :, None, :] - p[..., None, :, :]
-    many = min(env.neighbours, n - 1)
-    if many < 1:
+    if env.n_agents == 1:
         return push
-    _, who = jax.lax.top_k(-((apart**2).sum(-1) + 1e9 * jnp.eye(n)), many)
-    gap = jnp.take_along_axis(apart, who[..., None], -2)
-    speed = v[..., :, None, :] - jnp.take_along_axis(v[..., None, :, :], who[..., None], -2)
-    far = _length(gap)
+    offset, theirs = env.nearest(state)
+    gap, speed = -offset, -theirs
+    far = length(gap)
     left = jnp.maximum(far - 2 * RADIUS - room, 1e-3)
     root, closing = jnp.sqrt(4 * brake * left), (gap * speed).sum(-1)
     h = root + closing / far
@@ -161,13 +136,9 @@ def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, ro
         return price.at[..., j].set(jnp.maximum(new, 0.0)), None
 
     price = jnp.zeros_like(bound)
-    price, _ = jax.lax.scan(of_one, price, jnp.tile(jnp.arange(many), ROUNDS))
+    price, _ = jax.lax.scan(of_one, price, jnp.tile(jnp.arange(bound.shape[-1]), ROUNDS))
     return _bounded(push - (price[..., None] * normal).sum(-2))
 
 
 def _bounded(push: Array) -> Array:
-    return push / jnp.maximum(_length(push), 1.0)[..., None]
-
-
-def _length(x: Array) -> Array:
-    return jnp.sqrt((x**2).sum(-1) + 1e-12)
+    return push / jnp.maximum(length(push), 1.0)[..., None]
