@@ -1,5 +1,6 @@
 """The room of discs with momentum, its data, and what a guard foresees in it."""
 
+import dataclasses
 from dataclasses import astuple
 
 import jax
@@ -13,7 +14,9 @@ from ringfence.data.recipes import crossing as recipe
 from ringfence.envs import Crossing
 from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
 from ringfence.errors import UserError
-from ringfence.evaluate import evaluate_policy, load, unsafe_starts
+from ringfence.evaluate import Controller, evaluate, unsafe_starts
+from ringfence.guards import guard
+from ringfence.world.fitting import held_out
 from tests.quick import QUICK_WORLD
 
 
@@ -138,16 +141,45 @@ def test_logs_tell_whom_they_cost(logs):
     assert not starts.any()
 
 
-def test_it_is_learned_guarded_and_played(logs, tmp_path):
+def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path):
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
-    task = tasks.get("crossing-hasty")
     run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
-    world = worlds.fit(logs, sight="own", **QUICK_WORLD)
-    assert world.alone and world.values.reward.weights[0].shape[0] == 1
-    policy = load(run, guard="shield", sight="own", world=world)[1]
-    assert policy.proposal.actor.weights[0].shape[0] == 1
-    result, _ = evaluate_policy(policy, task, 2)
-    assert result["episodes"] == 2 and 0 <= result["infeasible"] <= 1
+    world = worlds.fit(logs, **QUICK_WORLD)
+    assert world.alone and world.spec.n_agents == 1 and world.card["data"]["episodes"] == 20
+    for agents in (None, 3, 20):
+        result = evaluate(run, episodes=2, guard="shield", world=world, agents=agents)
+        assert result["agents"] == (agents or 8) and result["sight"] == "own" and 0 <= result["infeasible"] <= 1
+        assert result["variant"] == "default+shield-learned" + (f"+agents{agents}" if agents else "")
+    pilot = Controller(run, guard="shield", world=world, agents=5)
+    env = Crossing(n_agents=5)
+    seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1))[0])
+    acted = pilot.act(seen)
+    assert acted.shape == (5, 2)
+    order = np.array([3, 1, 4, 0, 2])  # who is asked first changes nothing
+    pilot.reset()
+    np.testing.assert_allclose(pilot.act(seen[order]), acted[order], atol=1e-6)
+    mine = guard(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
+    action, info = mine.act(seen)
+    assert action.shape == (5, 2) and info["infeasible"].shape == ()
+    with pytest.raises(UserError, match="no sight='all'"):
+        evaluate(run, episodes=2, guard="shield", world=world, sight="all")
+    with pytest.raises(UserError, match="say with agents="):
+        guard(lambda seen, state: np.zeros((len(seen), 2)), world)
+
+
+def test_logs_are_taken_apart(logs):
+    each = logs.apart()
+    assert each.n_agents == 1 and each.episodes == 160 and each.state is None
+    i, e = 5, 7  # agent, episode
+    mine = each.episode_ends[i * 20 + e - 1] + np.arange(100)
+    theirs = logs.episode_ends[e - 1] + np.arange(100)
+    np.testing.assert_array_equal(each.actions[mine, 0], logs.actions[theirs, i])
+    np.testing.assert_array_equal(each.costs[mine], logs.costs[theirs, i])
+    np.testing.assert_array_equal(each.observations[mine + i * 20 + e, 0], logs.observations[theirs + e, i])
+    out = held_out(each, 0).reshape(8, 20)
+    assert (out == out[0]).all() and out[0].sum() == 2  # who were together are held out together
+    with pytest.raises(UserError, match="costs are the team's"):
+        dataclasses.replace(logs, costs=logs.costs.max(1)).apart()
 
 
 @pytest.mark.parametrize(

@@ -214,7 +214,7 @@ def train(
 def fit(
     data: Positional[str],
     seed: int = 0,
-    sight: Literal["all", "own"] = "all",
+    sight: Literal["all", "own"] | None = None,
     set: Assignments = [],  # noqa: B006
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
 ) -> None:
@@ -225,7 +225,8 @@ def fit(
     Args:
         data: a task (its data set is regenerated if need be) or a store's file.
         seed: of the fit, and of which episodes are held out.
-        sight: all for guards that see the team, own for agents that each guard their own action by their own view.
+        sight: all for guards that see the team (default), own for agents that each guard their own action by their
+            own view (always so of agents who are alike).
         set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
         out_file: keep the World in a file, too, for `ringfence eval --world`.
     """
@@ -245,7 +246,8 @@ def evaluate(
     step: int | None = None,
     guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
     danger: Literal["learned", "formula", "both"] | None = None,
-    sight: Literal["all", "own"] = "all",
+    sight: Literal["all", "own"] | None = None,
+    agents: int | None = None,
     world: Path | None = None,
     planner: Literal["plain", "climbing", "steady"] = "plain",
     plans: int | None = None,
@@ -273,6 +275,7 @@ def evaluate(
             (correct them until danger keeps its distance), adapt the shield's margin to what happens; full does all.
         danger: how the guard knows it: learned from the logs (default), by the task's formula, or the worse of both.
         sight: all: one guard sees the team; own: every agent guards its own action by its own view.
+        agents: who play, where they are alike (Crossing); as many as in the logs by default.
         world: a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed.
         planner: how diffusion planners draw plans: plain, climbing (value steers them), steady (for robots).
         plans: asked for by the guard.
@@ -305,7 +308,7 @@ def evaluate(
             check(load_job(run).task)
         record = record or 1
     told = dict(episodes=episodes, split=split, planner=planner, guard=guard, sight=sight, record=record, step=step)
-    told |= {"quiet": False, "danger": danger, "world": world}
+    told |= {"quiet": False, "danger": danger, "world": world, "agents": agents}
     refused: dict[str, list] = {}  # what several runs are refused for is said once
     for run in found:
         try:
@@ -347,7 +350,7 @@ def _options(assigned: dict[str, str], given: dict) -> dict[str, str]:
     from ringfence.runs import parse_as
 
     for name, value in assigned.items():
-        if name in ("episodes", "split", "record", "step", "planner", "guard", "danger", "sight", "world"):
+        if name in ("episodes", "split", "record", "step", "planner", "guard", "danger", "sight", "world", "agents"):
             raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
         if name in given:
             raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")

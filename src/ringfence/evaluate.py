@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import algos, features, hazards, stats, tasks, training, worlds
+from ringfence.each import Each, look
 from ringfence.errors import UserError, unknown
 from ringfence.files import whole
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
@@ -61,7 +62,7 @@ def rollout(
             memory, state = carry
             memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
-            memory = heard(policy, memory, out.team_cost)
+            memory = heard(policy, memory, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
             kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
@@ -141,7 +142,7 @@ def _rollout_native(
 
 
 def heard(policy: Policy, memory: PyTree, cost: Array) -> PyTree:
-    """The memory of a policy that wants to know what its last step cost (B,)."""
+    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N)."""
     return policy.hear(memory, cost) if hasattr(policy, "hear") else memory
 
 
@@ -223,8 +224,8 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
     view = task.feature_map("pruned")
     bound = hazards.bind(task.hazard, view.names, view.plus.shape[0])
     seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(jnp.asarray(states)))
-    unsafe, _ = bound.labels(jnp.asarray(view(seen, states)))
-    return np.asarray(unsafe.any(-1))
+    unsafe, _ = bound.labels(jnp.asarray(look(view, task.alike, seen, states)))
+    return np.asarray(unsafe.reshape(len(states), -1).any(-1))
 
 
 def evaluate_policy(
@@ -258,12 +259,18 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
 
     `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards
     (guard.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
-    agent guards its own action by its own view ("own"), `world` the World it reads (default: that of the run's data
-    and seed). Other options are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile
-    it with jax.jit, or use a `Controller`.
+    agent guards its own action by its own view ("own", the only one of agents who are alike), `world` the World it
+    reads (default: that of the run's data and seed), `agents` how many play, where they are alike. Other options are
+    fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
+    `Controller`.
     """
     job, policy, _ = _loaded(run, step, asked(planner, **options))
-    return job, policy
+    return job, of_team(job, policy)
+
+
+def of_team(job: training.Job, policy: Policy) -> Policy:
+    """A job's policy as its whole team plays it."""
+    return Each(policy, job.team) if job.task.alike else policy
 
 
 @dataclasses.dataclass(frozen=True)
@@ -273,8 +280,9 @@ class Asked:
     planner: str
     guard: str
     danger: str
-    sight: str
+    sight: str | None
     world: World | str | Path | None
+    agents: int | None  # who play, where they are alike; None: as many as in the logs
     plan: dict  # options of the planner
     given: dict  # options of the guard
 
@@ -287,15 +295,16 @@ def asked(
     planner: str = "plain",
     guard: str = "none",
     danger: str | None = None,
-    sight: str = "all",
+    sight: str | None = None,
     world: World | str | Path | None = None,
+    agents: int | None = None,
     **options,
 ) -> Asked:
     """Names and options sorted to whom they belong; unknown ones are refused."""
     for kind, name, known in (
         ("planner", planner, PLANNERS),
         ("guard", guard, GUARDS),
-        ("sight", sight, ("all", "own")),
+        ("sight", sight or "all", ("all", "own")),
     ):
         if name not in known:
             raise unknown(kind, str(name), known)
@@ -307,17 +316,19 @@ def asked(
     for name in plan:
         if name not in (names := {f.name for f in dataclasses.fields(PlanOptions)}):
             raise unknown("option of planner or guard", name, names | fields)
-    found = Asked(planner, guard, danger or "learned", sight, world, plan, given)
-    if not found.guarded and (danger is not None or sight != "all" or world is not None):
-        told = next(k for k, v in (("danger", danger), ("sight", sight != "all"), ("world", world)) if v)
+    if agents is not None and (isinstance(agents, bool) or not isinstance(agents, int | np.integer) or agents < 1):
+        raise UserError(f"agents={agents!r} must be a whole number, at least 1.")
+    found = Asked(planner, guard, danger or "learned", sight, world, agents, plan, given)
+    if not found.guarded and (danger is not None or sight == "own" or world is not None):
+        told = next(k for k, v in (("danger", danger), ("sight", sight == "own"), ("world", world)) if v)
         raise UserError(f"{told} is read by nothing without a guard; name one with guard=, e.g. shield.")
     return found
 
 
 def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job, Policy, int]:
-    """`load`, and the step of the checkpoint."""
+    """(job, policy, step of the checkpoint); of agents who are alike, the policy of each."""
     run = Run.of(run)
-    job = load_job(run)
+    job = load_job(run, how.agents)
     world = worlds.of_run(run) if job.algorithm.needs is not None else None
     told = {} if world is None else {"world": world}
 
@@ -329,11 +340,11 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     if world is not None:
         state |= {"world": job.algorithm.of_world(world, job.config)}
     policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
-    if not how.guarded:
-        return job, policy, at
-    world = worlds.for_guard(run, how.sight, how.world, read=world, quiet=False)
-    guarded = build(policy, world, job.hazard.hazard, how.guard, how.danger, job.task.guard, **how.given)
-    return job, guarded, at
+    if how.guarded:
+        sight = worlds.sight_of(job.task, how.sight)
+        world = worlds.for_guard(run, sight, how.world, read=world, quiet=False)
+        policy = build(policy, world, job.hazard.hazard, how.guard, how.danger, job.task.guard, **how.given)
+    return job, policy, at
 
 
 class Controller:
@@ -363,7 +374,7 @@ class Controller:
         follows. Arrays of another shape than the run's are refused, and so is what is not finite: indices beyond an
         array's end would be clipped in silence, and noise would follow NaN."""
         width, state_width = self.job.widths
-        seen = given_as("observations", observations, (self.job.spec.n_agents, width))
+        seen = given_as("observations", observations, (self.job.team, width))
         if state is not None and state_width == 0:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."
@@ -415,8 +426,9 @@ def given_as(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> 
     return array
 
 
-def load_job(run: Run) -> training.Job:
-    """The job that a run folder holds, rebuilt from its config.json."""
+def load_job(run: Run, agents: int | None = None) -> training.Job:
+    """The job that a run folder holds, rebuilt from its config.json; played by another number of `agents` where they
+    are alike."""
     told = run.config
     lacking = [name for name in ("spec", "feature_map") if name not in told]
     if lacking:
@@ -429,7 +441,7 @@ def load_job(run: Run) -> training.Job:
         task = tasks.simulated(told["task"], hazards.from_dict(told["hazard"]))
         if task is None:
             raise unknown("task", told["task"], tasks.TASKS)
-        feature_map = task.feature_map(config.view)
+        feature_map, team = task.feature_map(config.view), task.env.n_agents
         widths = training.widths_of(task)
     else:
         card = told["data"]
@@ -440,12 +452,15 @@ def load_job(run: Run) -> training.Job:
             cost_limit=float(card.get("cost_limit", 1.0)),
             action_low=card["action_low"],
             action_high=card["action_high"],
+            alike=spec.alike,
         )
-        feature_map = features.from_dict(told["feature_map"])
+        feature_map, team = features.from_dict(told["feature_map"]), told.get("team", spec.n_agents)
         named = (card.get("observation_names"), card.get("state_names"))
         widths = tuple(told.get("widths") or (len(names) if names else None for names in named))
+    if agents not in (None, team):
+        task, team = tasks.of_team(task, agents), agents
     hazard: BoundHazard = hazards.bind(hazards.from_dict(told["hazard"]), spec.feature_names, spec.n_agents)
-    return training.Job(algorithm, told["preset"], config, task, spec, feature_map, hazard, widths)
+    return training.Job(algorithm, told["preset"], config, task, spec, feature_map, hazard, widths, team=team)
 
 
 def make_policy(job: training.Job, state, options: dict) -> Policy:
@@ -462,12 +477,14 @@ def variant_name(job: training.Job, policy: Policy, how: Asked, split: str) -> s
     if plans and how.planner != "plain":
         name += f"+{how.planner}"
     if isinstance(policy, Guarded):
-        name += f"+{how.guard}-{how.danger}" + ("-own" if how.sight == "own" else "")
+        own = how.sight == "own" and not job.task.alike
+        name += f"+{how.guard}-{how.danger}" + ("-own" if own else "")
     for options, given in ((inner.options if plans else None, how.plan), (_guard_of(policy), how.given)):
         for field in dataclasses.fields(options) if options is not None else ():
             if field.name in given:
                 value = getattr(options, field.name)
                 name += f"+{field.name}{float(value) if isinstance(field.default, float) else value}"
+    name += "" if how.agents is None else f"+agents{how.agents}"
     return name if split == "test" else f"{name}@{split}"
 
 
@@ -503,7 +520,7 @@ def evaluate(
     variant += "" if step is None else f"@step{step}"
     seed = told["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
-    result, played = evaluate_policy(policy, job.task, episodes, split, seed, record, label, quiet)
+    result, played = evaluate_policy(of_team(job, policy), job.task, episodes, split, seed, record, label, quiet)
     result |= {
         "algorithm": job.algorithm.name,
         "variant": variant,
@@ -513,7 +530,8 @@ def evaluate(
         "options": dataclasses.asdict(inner.options) if plans else {},
         "guard": how.guard if guards else "none",
         "danger": how.danger if guards else "none",
-        "sight": how.sight,
+        "sight": worlds.sight_of(job.task, how.sight),
+        "agents": job.team,
         "guard_options": dataclasses.asdict(guards) if guards else {},
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),

@@ -127,11 +127,12 @@ def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> Bound
 
 
 def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
-    if n_agents < 2:
+    nearest = "other0.seen" in names
+    if n_agents < 2 and not nearest:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
     # `other0.seen` says that others come by their distance, the nearest first, and not all of them are told.
-    told = sum(name.endswith(".seen") for name in names) if "other0.seen" in names else n_agents - 1
-    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(min(n_agents - 1, told))]
+    told = sum(name.endswith(".seen") for name in names) if nearest else n_agents - 1
+    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(told)]
     if all(a in names and b in names for a, b in relative):
         index = np.array([[names.index(a), names.index(b)] for a, b in relative])  # (N-1, 2)
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from ringfence import evaluate
+from ringfence.each import look
 from ringfence.errors import UserError
 from ringfence.progress import Progress
 from ringfence.runs import Run
@@ -58,7 +59,12 @@ def play(
             "new one at every call, or pass at_once=1."
         )
     act, key, begun = jax.jit(evaluate.act_with), jax.random.key(seed), time.perf_counter()
-    label = jax.jit(lambda seen, state: job.hazard.labels(job.feature_map(seen, state))[0].any(-1))
+
+    @jax.jit
+    def label(seen, state):
+        unsafe, _ = job.hazard.labels(look(job.feature_map, job.task.alike, seen, state))
+        return unsafe.reshape(len(seen), -1).any(-1)
+
     played: list[_Episode] = []
     formula = job.hazard.has_formula
     with Progress(f"{job.algorithm.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
@@ -107,10 +113,9 @@ class _Episode:
                 f"make_env() made a {type(env).__name__} without {lacking[0]}; give a PettingZoo ParallelEnv."
             )
         self.env, self.job, self.agents = env, job, list(env.possible_agents)
-        if len(self.agents) != job.spec.n_agents:
-            raise UserError(
-                f"{type(env).__name__} has {len(self.agents)} agents, the run was trained with {job.spec.n_agents}."
-            )
+        if len(self.agents) != job.team:
+            remedy = f"; pass agents={len(self.agents)}" if job.task.alike else ""
+            raise UserError(f"{type(env).__name__} has {len(self.agents)} agents, the run is for {job.team}{remedy}.")
         if job.widths[1] and not hasattr(env, "state"):
             raise UserError(
                 f"The run reads a global state, which {type(env).__name__} lacks; give it a state() method."
@@ -176,7 +181,7 @@ class _Episode:
             )
 
     def _look(self, seen: dict) -> None:
-        n, (width, state_width) = self.job.spec.n_agents, self.job.widths
+        n, (width, state_width) = self.job.team, self.job.widths
         self._all_in("observations", seen, len(self.rewards))
         there = [seen[a] for a in self.agents]
         self.seen = evaluate.given_as("observations", there, (n, width))

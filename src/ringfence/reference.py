@@ -10,6 +10,7 @@ import numpy as np
 from ringfence import hazards
 from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
+from ringfence.each import Each
 from ringfence.evaluate import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
 from ringfence.runs import read_json, write_json
@@ -83,6 +84,8 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
             return known
     spec = task.spec(task.feature_map("pruned"))
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
+    if task.alike:
+        policies = {name: Each(policy, task.env.n_agents) for name, policy in policies.items()}
     if task.recipe is not None and (behaved := task.recipe.behaviour(task.tier)) is not None:
         policies["behaviour policy"] = Behaviour(behaved)
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}

@@ -36,6 +36,7 @@ class Task:
     action_low: float = -1.0
     action_high: float = 1.0
     recipe: ModuleType | None = None  # how its data sets are regenerated (data/recipes); None: they cannot be
+    alike: bool = False  # its agents are alike and see for themselves (each.py)
 
     @property
     def world(self) -> dict:
@@ -52,6 +53,10 @@ class Task:
 
     def normalised_cost(self, c):
         return (c + self.cost_offset) / (self.cost_limit + self.cost_offset)
+
+    def logs(self, store: EpisodeStore) -> EpisodeStore:
+        """What is learned from: the store, or every agent's own part of it."""
+        return store.apart() if self.alike and store.n_agents > 1 else store
 
     def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
         """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
@@ -74,8 +79,8 @@ class Task:
             n, a, length = store.n_agents, store.actions.shape[2], int(store.lengths.max())
         else:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
-        alike = getattr(env, "interchangeable", False)
-        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length, alike)
+        n = 1 if self.alike else n
+        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length, self.alike)
 
 
 # OMAR's constants (Pan et al. 2022, as printed by MADIFF): a random and an expert policy's return.
@@ -162,6 +167,7 @@ def _crossing(tier: str) -> Task:
         return_max=4.2,
         transitions=125_000,
         recipe=crossing,
+        alike=True,
     )
 
 
@@ -184,6 +190,16 @@ def get(name: str) -> Task:
     if name not in TASKS:
         raise unknown("task", name, TASKS)
     return TASKS[name]
+
+
+def of_team(task: Task, agents: int) -> Task:
+    """The task with another number of agents, at the same density; refused where they are not alike."""
+    if not task.alike:
+        raise UserError(
+            f"'{task.name}' has agents of its own kinds, each with weights of its own, so agents={agents} cannot play; "
+            "leave it out."
+        )
+    return task if task.env is None else replace(task, env=replace(task.env, n_agents=agents))
 
 
 def twin(name: str) -> str | None:
@@ -256,6 +272,7 @@ def from_store(store: EpisodeStore) -> Task:
         presets=("mujoco",) if robot else (),
         action_low=float(card["action_low"]),
         action_high=float(card["action_high"]),
+        alike=card.get("alike") is True,
     )
 
 

@@ -48,6 +48,7 @@ class Job:
     hazard: hazards.BoundHazard
     widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
     world: dict | None = None  # settings of the World that training reads, if it reads one
+    team: int = 1  # agents who play; more than the spec's one of those who are alike
 
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
@@ -62,6 +63,7 @@ class Job:
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "widths": None if self.task.env is not None else list(self.widths),
             "world": self.world,
+            "team": self.team,
             "seed": seed,
             "data": card,
         }
@@ -76,7 +78,8 @@ def make_job(
     world: dict | None = None,
 ) -> Job:
     """Resolve names to values; every bad name or value is refused here, before work starts. Without a preset, that of
-    the task's data tier is taken where there is one. `world`: changes to the settings of the World."""
+    the task's data tier is taken where there is one. `store`: the task's `logs`; `world`: changes to the settings of
+    the World."""
     a = algos.get(algorithm)
     preset = preset or a.preset_for(task.presets)
     if preset not in a.presets:
@@ -94,7 +97,9 @@ def make_job(
         told = dataclasses.asdict(worlds.settings_for(store, task, **{**a.needs(config), **(world or {})}))
     elif world:
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
-    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), told)
+    team = spec.n_agents if store is None else store.card.get("team", store.n_agents)
+    team = team if task.env is None else task.env.n_agents
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), told, team)
 
 
 def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:
@@ -183,14 +188,15 @@ def train(
             raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
     if tensorboard:
         _summary_writer()
-    job = make_job(algorithm, tasks.from_store(data), preset, changes or {}, data, world)
+    task = tasks.from_store(data)
+    job = make_job(algorithm, task, preset, changes or {}, logs := task.logs(data), world)
+    lessons = _Lessons(job, logs, quiet)
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
-    lessons = _Lessons(job, data, quiet)
     if together and left:
         _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
@@ -228,7 +234,7 @@ class _Lessons:
             self.last = None  # there may be no room for two
             world = None
             if self.job.world is not None:
-                world = worlds.fit(self.store, seed=seed, quiet=self.quiet, **self.job.world)
+                world = worlds.fit(self.store, task=self.job.task, seed=seed, quiet=self.quiet, **self.job.world)
             self.last = (seed, world, windows_of(self.job, self.store, world))
         return self.last[1:]
 
@@ -401,7 +407,8 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
     card = data.card if regenerated(data.card) else data.card | {"content": data.content}
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
-        there = {"revision": 1, "widths": mine["widths"], "world": None} | run.config  # older runs tell none of these
+        older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team")}  # that older runs do not tell
+        there = older | run.config
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

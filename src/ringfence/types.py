@@ -68,12 +68,7 @@ class Spec:
     action_low: float
     action_high: float
     episode_length: int
-    alike: bool = False  # agents are of one kind: they share weights, and so one checkpoint plays any number of them
-
-    @property
-    def groups(self) -> int:
-        """Sets of weights."""
-        return 1 if self.alike else self.n_agents
+    alike: bool = False  # of agents who are alike and see for themselves: of a team of one (each.py)
 
     @property
     def feature_dim(self) -> int:

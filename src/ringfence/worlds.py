@@ -23,12 +23,28 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     """The settings of a World of this data: the task's own where it has some, and labels from its costs if they tell
     safe steps from unsafe ones, else from its formula; without either, no barrier."""
     task = task or tasks.from_store(store)
-    told = {"view": "decentralized" if changes.get("sight") == "own" else "pruned", **task.world}
+    sight = sight_of(task, changes.pop("sight", None))
+    told = {**_usual(task, sight), "sight": sight}
     costs = store.costs > 0
     if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
         formula = not isinstance(task.hazard, hazards.CostColumn)
         told |= {"labels": "formula"} if formula else {"barrier": False}
     return build_config(Settings, {**told, **changes}, "the World")
+
+
+def sight_of(task: Task, wanted: str | None = None) -> str:
+    """Whether guards see the team ("all") or every agent guards itself ("own"): as wanted; by default the team, but
+    agents who are alike know nothing but what each of them sees."""
+    if task.alike and wanted == "all":
+        raise UserError(
+            f"The agents of '{task.name}' are alike and see for themselves, so there is no sight='all'; leave it out."
+        )
+    return wanted or ("own" if task.alike else "all")
+
+
+def _usual(task: Task, sight: str) -> dict:
+    """What a task asks of its World, unless told otherwise."""
+    return {"view": "decentralized" if sight == "own" else "pruned", **task.world}
 
 
 def fit(
@@ -50,7 +66,7 @@ def fit(
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
         raise UserError(f"seed={seed!r} must be a whole number, 0 or more.")
     task = task or tasks.from_store(store)
-    settings = settings_for(store, task, **changes)
+    settings, store = settings_for(store, task, **changes), task.logs(store)
     map = task.feature_map(settings.view, store)
     spec = task.spec(map, store)
     needed = settings.labels == "formula" and settings.barrier
@@ -62,12 +78,12 @@ def fit(
 def of_run(run: Run, quiet: bool = True) -> World:
     """The World that a run's training read, in its folder; of runs that read none, that of their data (`for_guard`)."""
     kept = run.path / WORLD
-    return load(kept) if kept.exists() else _of_data(run, "all", quiet)
+    return load(kept) if kept.exists() else _of_data(run, None, quiet)
 
 
 def for_guard(
     run: Run,
-    sight: str = "all",
+    sight: str | None = None,
     world: World | str | Path | None = None,
     read: World | None = None,
     quiet: bool = True,
@@ -75,16 +91,19 @@ def for_guard(
     """The World that guards a run: the one that is given; else that of its task and seed, whatever the run's own
     training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
     is the one in the run's folder, or has to be given. `read`: what training read, if it is loaded already."""
+    alike = run.config["spec"].get("alike", False)
+    sight = sight or ("own" if alike else "all")
     if world is not None:
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, sight)
         return world
-    if sight == "all" and (read is not None or (run.path / WORLD).exists()):
+    if read is not None or (run.path / WORLD).exists():
         found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.
-        usual = Settings(**tasks.TASKS[run.config["task"]].world) if _made_here(run) else None
+        usual = Settings(**_usual(tasks.TASKS[run.config["task"]], sight)) if _made_here(run) else None
         told = found.card["settings"]
-        if usual is None or (usual.view, usual.discount) == (told["view"], told["discount"]):
+        same = usual is None or (usual.view, usual.discount) == (told["view"], told["discount"])
+        if same and found.alone == (sight == "own"):
             return found
     return _of_data(run, sight, quiet)
 
@@ -94,7 +113,7 @@ def _made_here(run: Run) -> bool:
     return regenerated(run.config["data"]) and run.config["task"] in tasks.TASKS
 
 
-def _of_data(run: Run, sight: str, quiet: bool) -> World:
+def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
     """The World of a run's data and seed, where that is regenerated."""
     told = run.config
     if not _made_here(run):

@@ -51,7 +51,7 @@ def init(
 
     def networks() -> dict:
         sizes = (spec.feature_dim, *[config.width] * config.depth, spec.action_dim)
-        params = {"actor": MLP(ka, sizes, groups=spec.groups, final_scale=0.1)}
+        params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
         return fresh(_optimiser(config), params, "ema")
 
     return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}

@@ -8,6 +8,7 @@ import numpy as np
 
 from ringfence import hazards, tasks
 from ringfence.data.store import EpisodeStore
+from ringfence.each import look
 from ringfence.errors import UserError
 
 APART = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
@@ -98,13 +99,13 @@ def _labels(store: EpisodeStore, task: tasks.Task, rows: np.ndarray) -> np.ndarr
     """(K,) whether the hazard's formula calls these rows unsafe for anyone; None where it has none."""
     try:
         view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
-        bound = hazards.bind(task.hazard, view.names, store.n_agents)
+        bound = hazards.bind(task.hazard, view.names, view.plus.shape[0])
     except UserError:
         return None
     if not bound.has_formula:
         return None
-    state = None if store.state is None else store.state[rows]
-    return np.asarray(bound.labels(view(store.observations[rows], state))[0]).any(-1)
+    state, seen = None if store.state is None else store.state[rows], store.observations[rows]
+    return np.asarray(bound.labels(look(view, task.alike, seen, state))[0]).reshape(len(rows), -1).any(-1)
 
 
 def disagreement(store: EpisodeStore, task: tasks.Task) -> float | None:

@@ -138,6 +138,30 @@ class EpisodeStore:
             None if self.speed is None else self.speed[steps],
         )
 
+    def apart(self) -> EpisodeStore:
+        """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
+        `team` of the card tells how many they were. The global state is nobody's own, so it is left out."""
+        n = self.n_agents
+        if self.costs.ndim == 1 and n > 1:
+            raise StoreError(
+                f"The agents of '{self.card['task']}' are alike and learn from what each of them meets, but its costs "
+                "are the team's; give costs (T, N)."
+            )
+
+        def own(x: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(np.moveaxis(x, 1, 0)).reshape(-1, 1, *x.shape[2:])
+
+        return EpisodeStore(
+            own(self.observations),
+            own(self.actions),
+            own(self.rewards),
+            self.costs if self.costs.ndim == 1 else self.costs.T.reshape(-1),
+            np.tile(self.terminated, n),
+            np.tile(self.truncated, n),
+            np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),
+            card={**self.card, "state_names": None, "agents": None, "team": n, "content": self.content},
+        )
+
     # --- making ---
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):

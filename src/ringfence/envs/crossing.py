@@ -65,7 +65,7 @@ class Crossing:
     spacing: float = SPACING
     action_dim: ClassVar[int] = 2  # push along x and y; of a unicycle push along its heading, and turn
     terminates: ClassVar[bool] = False
-    interchangeable: ClassVar[bool] = True  # all agents are of one kind, and what is learned of some holds for all
+    dt: ClassVar[float] = DT
 
     def __post_init__(self):
         for field, options in (("body", ("disc", "unicycle")), ("goals", ("random", "across"))):
@@ -113,8 +113,14 @@ class Crossing:
         if view not in VIEWS:
             raise unknown("view", view, VIEWS)
         names = self.observation_names
-        table = np.tile(np.arange(len(names)), (self.n_agents, 1))
+        table = np.arange(len(names))[None]  # of a team of one
         return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), DT)
+
+    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
+        """Pictures of an episode (discs.py)."""
+        from ringfence.envs import discs
+
+        return discs.frames(self, states, moments)
 
     def reset(self, key: Key, batch: int) -> CrossingState:
         """At rest, each in a cell of a grid of its own, so that nobody touches anything and everybody can stay away;

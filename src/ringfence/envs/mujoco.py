@@ -189,6 +189,8 @@ class SafeMuJoCo:
         """s̃_i in a view (features.py)."""
         return views(view, self)
 
+    opengl: ClassVar[bool] = True  # its films need it
+
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
         """Pictures of an episode (film.py)."""
         from ringfence.envs import film

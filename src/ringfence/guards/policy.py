@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence import hazards, normalise
+from ringfence.each import Each, apart, look, together
 from ringfence.errors import UserError, unknown
 from ringfence.features import translation
 from ringfence.guards.danger import Danger
@@ -43,9 +44,10 @@ class Guarded(eqx.Module):
         }
 
     def hear(self, memory: PyTree, cost: Array) -> PyTree:
-        """The memory with the cost (B,) that the last step had: what an adapting margin follows. Where none is told, it
-        follows its own judgement of the step."""
-        return {**memory, "cost": jnp.asarray(cost, jnp.float32)}
+        """The memory with the cost that the last step had, (B,) or (B, N): what an adapting margin follows. Where none
+        is told, it follows its own judgement of the step."""
+        cost = jnp.asarray(cost, jnp.float32)
+        return {**memory, "cost": cost if cost.ndim == 1 else cost.max(-1)}
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         kp, kd = jax.random.split(key)
@@ -123,8 +125,8 @@ class Callback:
     JAX.
     """
 
-    def __init__(self, function: Callable, guarded: Guarded, seed: int = 0):
-        self.function, self.guarded = function, guarded
+    def __init__(self, function: Callable, guarded: Guarded, seed: int = 0, agents: int = 1):
+        self.function, self.guarded, self.agents = function, guarded, agents
         self._key = jax.random.key(seed)
         self._decide = jax.jit(lambda g, memory, present, action, key: g.decided(memory, present, action, key))
         self.reset()
@@ -132,11 +134,16 @@ class Callback:
     def reset(self) -> None:
         self._memory = self.start(1)
 
+    @property
+    def _team(self) -> Guarded | Each:
+        """Who hears of costs: one guard, or that of each agent."""
+        return Each(self.guarded, self.agents) if self.guarded.guard.world.spec.alike else self.guarded
+
     def start(self, batch: int) -> PyTree:
-        return self.guarded.start(batch)
+        return self._team.start(batch)
 
     def hear(self, memory: PyTree, cost) -> PyTree:
-        return self.guarded.hear(memory, cost)
+        return self._team.hear(memory, jnp.asarray(cost, jnp.float32))
 
     def act(self, *given, cost: float | None = None):
         """(observations, state=None) -> (action (N, A), info), or a policy's (memory, observations, state, key)."""
@@ -160,7 +167,7 @@ class Callback:
             wanted = np.asarray(wanted, np.float32)
         except (TypeError, ValueError):
             raise UserError("The policy under guard returned no array of numbers; return actions (N, A).") from None
-        expected = (batch, spec.n_agents, spec.action_dim)
+        expected = (batch, self.agents, spec.action_dim)
         if wanted.shape != expected:
             raise UserError(
                 f"The policy under guard returned actions of shape {wanted.shape[1:]}; this World takes {expected[1:]}."
@@ -168,9 +175,11 @@ class Callback:
         if not np.isfinite(wanted).all():
             raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
         action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
-        present = world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
-        plan = held(action, self.guarded.guard.options.rows)
-        return self._decide(self.guarded, memory, present, plan, key)
+        given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
+        present = look(world.map, spec.alike, *given)
+        plan = held(apart(action) if spec.alike else action, self.guarded.guard.options.rows)
+        memory, step = self._decide(self.guarded, memory, present, plan, key)
+        return memory, together(step, (batch, self.agents)) if spec.alike else step
 
 
 class Nothing(eqx.Module):
@@ -219,21 +228,30 @@ def guard(
     danger: str = "learned",
     hazard: hazards.Hazard | None = None,
     seed: int = 0,
+    agents: int | None = None,
     **options,
 ):
     """Any policy under guard.
 
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Callback`. `guard` is a name in GUARDS, `danger` formula, learned or both, `options` fields of
-    GuardOptions; `hazard` is the formula's definition, where one is to be used.
+    which gives a `Callback`, for a team of `agents` where the World is of agents who are alike. `guard` is a name in
+    GUARDS, `danger` formula, learned or both, `options` fields of GuardOptions; `hazard` is the formula's definition,
+    where one is to be used.
     """
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
+    if isinstance(policy, Each):
+        return Each(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
     if hasattr(policy, "start") and hasattr(policy, "act"):
         return build(policy, world, hazard, guard, danger, **options)
     if not callable(policy):
         raise UserError(
             f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
         )
-    return Callback(policy, build(Nothing(), world, hazard, guard, danger, **options), seed)
+    spec = world.spec
+    if agents is None and spec.alike:
+        raise UserError("The World is of agents who are alike; say with agents= how many of them there are.")
+    if agents not in (None, spec.n_agents) and not spec.alike:
+        raise UserError(f"The World is of {spec.n_agents} agents who are not alike; leave agents={agents} out.")
+    return Callback(policy, build(Nothing(), world, hazard, guard, danger, **options), seed, agents or spec.n_agents)

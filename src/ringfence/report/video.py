@@ -1,6 +1,6 @@
 """Episodes as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
 
-A simulator that has `frames` draws them (envs/film.py). MuJoCo decides how to draw when it is imported, so drawing
+A simulator that has `frames` draws them (envs/film.py, envs/discs.py). MuJoCo decides how to draw when it is imported, so drawing
 happens in a process of its own.
 """
 
@@ -50,7 +50,12 @@ def check(task: Task) -> None:
     """`UserError` where no film of a task's episodes can be made."""
     if not hasattr(task.env, "frames"):
         raise UserError(f"The simulator of '{task.name}' draws no films; `ringfence report` animates its episodes.")
-    backend()
+    if _opengl(task.env):
+        backend()
+
+
+def _opengl(env: Env) -> bool:
+    return getattr(env, "opengl", False)
 
 
 def film(run: Run, variant: str) -> Path:
@@ -70,12 +75,12 @@ def recorded(run: Run, variant: str) -> dict[str, np.ndarray]:
 
 
 def animate(env: Env, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
-    """Write an animated GIF of one episode: states (T+1, S), costs (T,). The speed and its limit are drawn in.
-    The film ends with a fall, after which the last state is repeated.
+    """Write an animated GIF of one episode: states (T+1, S), costs (T,), drawn by its simulator. The film ends with a
+    fall, after which the last state is repeated.
 
     `UserError` where nothing can draw.
     """
-    out, name = Path(out), backend()
+    out, name = Path(out), backend() if _opengl(env) else ""
     moved = np.flatnonzero((states[1:] != states[:-1]).any(1))
     steps = int(moved[-1]) + 1 if len(moved) else len(costs)
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
@@ -95,7 +100,7 @@ def animate(env: Env, states: np.ndarray, costs: np.ndarray, out: str | Path) ->
 
 
 def _run(command: list[str], name: str) -> subprocess.CompletedProcess:
-    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": name})
+    return subprocess.run(command, capture_output=True, text=True, env={**os.environ, "MUJOCO_GL": name or "egl"})
 
 
 def stride(steps: int) -> int:

@@ -177,8 +177,8 @@ def _fitted(
         "format": FORMAT,
         "data": {
             "task": store.card["task"],
-            "content": store.content,
-            "episodes": store.episodes,
+            "content": store.card.get("content", store.content),
+            "episodes": store.episodes // store.card.get("team", 1),
             "hazard": store.card["hazard"],
         },
         "settings": dataclasses.asdict(s),
@@ -259,10 +259,12 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
             f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
             "or more: cut long recordings into episodes."
         )
-    out = np.zeros(store.episodes, bool)
-    count = max(1, round(HELD_OUT * store.episodes))
-    out[np.random.default_rng([seed, 77]).choice(store.episodes, count, replace=False)] = True
-    return out
+    team = store.card.get("team", 1)  # who were together are held out together
+    episodes = store.episodes // team
+    out = np.zeros(episodes, bool)
+    count = max(1, round(HELD_OUT * episodes))
+    out[np.random.default_rng([seed, 77]).choice(episodes, count, replace=False)] = True
+    return np.tile(out, team)
 
 
 def labels_of(

@@ -1,0 +1,65 @@
+"""Crossing as pictures: discs with their tails, what each of them heads for, and who touches."""
+
+from __future__ import annotations
+
+import colorsys
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ringfence.envs.film import BLUE, DARK, EMPTY, PAPER, RED
+
+if TYPE_CHECKING:
+    from ringfence.envs.crossing import Crossing
+
+SIZE, FINE = 480, 2  # pixels of a side, drawn so many times larger
+TAIL = 12  # steps
+HUES = 8
+
+
+def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
+    """Pictures of an episode, states (T+1, S), at `moments`: (step, whether somebody touched since the one before)."""
+    import jax.numpy as jnp
+    from PIL import Image, ImageDraw
+
+    from ringfence.envs.crossing import DT, RADIUS
+
+    told = env.from_global_state(jnp.asarray(states))
+    place, goal, touching = (np.asarray(x) for x in (told.position, told.goal, env.clearance(told) < 0))
+    reach = max(env.side / 2 if env.walls else 0.0, float(np.abs(place).max()) + 2 * RADIUS)
+    scale = SIZE * FINE / (2 * reach)
+    hues = [tuple(int(255 * c) for c in colorsys.hsv_to_rgb(0.5 + 0.35 * k / HUES, 0.55, 0.85)) for k in range(HUES)]
+
+    def at(p: np.ndarray) -> tuple[float, float]:
+        return (p[0] + reach) * scale, (reach - p[1]) * scale
+
+    def disc(draw, p: np.ndarray, radius: float, **how) -> None:
+        (x, y), r = at(p), radius * scale
+        draw.ellipse((x - r, y - r, x + r, y + r), **how)
+
+    touches = 0
+    before = 0
+    for t, _ in moments:
+        picture = Image.new("RGB", (SIZE * FINE, SIZE * FINE), PAPER)
+        draw = ImageDraw.Draw(picture)
+        for obstacle in np.asarray(told.obstacle[t]):
+            disc(draw, obstacle[:2], obstacle[2], fill=EMPTY)
+        for i in range(env.n_agents):
+            colour = RED if touching[t, i] else hues[i % HUES]
+            pale = tuple((c + 2 * 255) // 3 for c in hues[i % HUES])
+            tail = [at(p) for p in place[max(0, t - TAIL) : t + 1, i]]
+            draw.line([at(place[t, i]), at(goal[t, i])], fill=EMPTY, width=FINE)
+            if len(tail) > 1:
+                draw.line(tail, fill=pale, width=max(FINE, int(0.5 * RADIUS * scale)))
+            disc(draw, goal[t, i], 0.3 * RADIUS, fill=pale)
+            disc(draw, place[t, i], RADIUS, fill=colour, outline=DARK)
+        touches += int(touching[before + 1 : t + 1].any(1).sum())
+        before = t
+        picture = picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
+        draw = ImageDraw.Draw(picture)
+        draw.rectangle((0, 0, SIZE, 16), fill=PAPER)
+        text = f"{t * DT:4.1f} s   {env.n_agents} agents   " + (
+            f"{touches} steps of contact" if touches else "no contact"
+        )
+        draw.text((10, 3), text, fill=RED if touches else BLUE)
+        yield picture
