@@ -47,8 +47,9 @@ def rollout(
     quiet: bool = True,
 ) -> dict[str, np.ndarray]:
     """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
-    whether the task itself `terminated` (E,) it; the first `record` episodes also keep what the planner drew (`plans`,
-    `chosen`). `seed` moves the policy's noise, never the resets."""
+    whether the task itself `terminated` (E,) it, and who was `touched` (E, L, N) where agents have costs of their own;
+    the first `record` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise,
+    never the resets."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
@@ -64,6 +65,8 @@ def rollout(
             after, out = env.step(state, decided.action)
             memory = heard(policy, memory, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
+            if out.cost.ndim == 2:
+                kept["touched"] = out.cost > 0
             kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
                 kept |= {k: v[:keep] for k, v in decided.info.items() if k not in COUNTED}
@@ -90,7 +93,7 @@ def rollout(
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
-    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state", *COUNTED) if k in out}
+    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state", "touched", *COUNTED) if k in out}
     lost = ~(np.isfinite(out["reward"]) & np.isfinite(out["state"][:, 1:]).all(-1))
     if lost.any():  # nothing collides with what is nowhere, so it would pass for safe
         episode, step = np.argwhere(lost)[0]
@@ -187,6 +190,8 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "violation_interval": stats.clopper_pearson(int(violated.sum()), n),
         "violation_upper": stats.upper_bound(int(violated.sum()), n),
         **{k: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
+        # Share of (agent, episode) with a cost of the agent's own.
+        **({"agent_violation_rate": float(played["touched"].any(1).mean())} if "touched" in played else {}),
         "unsafe_starts": int(hazard_at_start.sum()),
         "avoidable_cost": float(avoidable.mean()),
         "avoidable_interval": stats.bootstrap_mean(avoidable),

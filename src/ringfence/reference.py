@@ -4,33 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import equinox as eqx
 import numpy as np
 
 from ringfence import hazards
-from ringfence.data import behaviour
 from ringfence.data.store import EpisodeStore
 from ringfence.each import Each
 from ringfence.evaluate import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
 from ringfence.runs import read_json, write_json
 from ringfence.tasks import Task
-from ringfence.types import Array, Key, PolicyStep, PyTree
 
 FILE = "reference.json"
 SAFE = "data within the limit"
-
-
-class Behaviour(eqx.Module):
-    """A shipped behaviour policy, played with the noise that it collected data with."""
-
-    policy: behaviour.BehaviourPolicy
-
-    def start(self, batch: int) -> PyTree:
-        return {}
-
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
-        return memory, PolicyStep(self.policy.act(observations, key), {})
 
 
 def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict:
@@ -86,8 +71,7 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
     policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
     if task.alike:
         policies = {name: Each(policy, task.env.n_agents) for name, policy in policies.items()}
-    if task.recipe is not None and (behaved := task.recipe.behaviour(task.tier)) is not None:
-        policies["behaviour policy"] = Behaviour(behaved)
+    policies |= task.recipe.references(task) if task.recipe is not None else {}
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)

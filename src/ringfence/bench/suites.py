@@ -20,6 +20,13 @@ EVALUATIONS: dict[str, dict] = {
         f"steady+adapt-{danger}": {"planner": "steady", "guard": "adapt", "danger": danger}
         for danger in ("learned", "formula")
     },
+    # Where danger is decided long before: by what is dangerous now alone, and by what will be.
+    **{
+        f"shield-{danger}+rows{rows}+futureFalse": {"guard": "shield", "danger": danger, "rows": rows, "future": False}
+        for danger, rows in (("learned", 1), ("learned", 3), ("learned", 7), ("learned", 15), ("formula", 15))
+    },
+    "shield-learned+rows1": {"guard": "shield", "danger": "learned", "rows": 1},
+    **{f"shield-learned+agents{n}": {"guard": "shield", "danger": "learned", "agents": n} for n in (4, 16, 64, 256)},
     **{
         f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"}
         for guard in ("shield", "adapt", "full")
@@ -66,6 +73,7 @@ class Suite:
     episodes: int = 200  # per run, unless told otherwise
 
 
+_CROSSING = tuple(f"crossing-{tier}" for tier in ("hasty", "mixed", "careful", "random"))
 _SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random"))
 # Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
 _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
@@ -119,6 +127,36 @@ SUITES = {
             Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
         ),
         episodes=20,
+    ),
+    # Agents who are alike, each by itself; danger that is decided ten steps ahead.
+    "crossing": Suite(
+        _CROSSING,
+        (
+            Entry("bc", evaluations=("plain", "shield-learned", "full-learned")),
+            Entry("mpc", evaluations=("full-learned",)),
+            Entry("icbf", evaluations=("plain", "shield-learned")),
+        ),
+        episodes=1000,
+    ),
+    "crossing-rows": Suite(
+        _CROSSING[:1],
+        (
+            Entry(
+                "bc",
+                evaluations=(
+                    "plain",
+                    "shield-learned",
+                    "shield-learned+rows1",
+                    *(f"shield-learned+rows{k}+futureFalse" for k in (1, 3, 7, 15)),
+                    "shield-formula+rows15+futureFalse",
+                ),
+            ),
+        ),
+    ),
+    "crossing-teams": Suite(
+        _CROSSING[:1],
+        (Entry("bc", evaluations=("shield-learned", *(f"shield-learned+agents{n}" for n in (4, 16, 64, 256)))),),
+        episodes=50,
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
     "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=("plain", "shield-learned-own", "full-learned-own")),)),

@@ -16,10 +16,10 @@ from ringfence.files import whole
 from ringfence.runs import Run, read_json
 
 COLUMNS = (
-    "task, algorithm, variant, guard, danger, sight, seed, episodes, return_mean, return_std, return_norm, "
-    "cost_mean, cost_norm, avoidable_cost, violation_rate, violation_upper, unsafe_starts, cost_cvar10, cost_rate, "
-    "steps_mean, termination_rate, infeasible, strange, train_seconds, eval_seconds, plan_ms_p50, plan_ms_p99, "
-    "parameters, run"
+    "task, algorithm, variant, guard, danger, sight, agents, seed, episodes, return_mean, return_std, return_norm, "
+    "cost_mean, cost_norm, avoidable_cost, violation_rate, violation_upper, agent_violation_rate, unsafe_starts, "
+    "cost_cvar10, cost_rate, steps_mean, termination_rate, infeasible, strange, train_seconds, eval_seconds, "
+    "plan_ms_p50, plan_ms_p99, parameters, run"
 ).split(", ")
 
 

@@ -66,6 +66,9 @@ class Crossing:
     action_dim: ClassVar[int] = 2  # push along x and y; of a unicycle push along its heading, and turn
     terminates: ClassVar[bool] = False
     dt: ClassVar[float] = DT
+    world: ClassVar[dict] = {"dynamics_width": 32}  # all that a push moves is one's own velocity
+    # Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row.
+    guard: ClassVar[dict] = {name: {"rows": 3, "future": True} for name in ("shield", "adapt", "full")}
 
     def __post_init__(self):
         for field, options in (("body", ("disc", "unicycle")), ("goals", ("random", "across"))):

@@ -45,10 +45,11 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
         for obstacle in np.asarray(told.obstacle[t]):
             disc(draw, obstacle[:2], obstacle[2], fill=EMPTY)
         for i in range(env.n_agents):
+            draw.line([at(place[t, i]), at(goal[t, i])], fill=EMPTY, width=FINE)
+        for i in range(env.n_agents):
             colour = RED if touching[t, i] else hues[i % HUES]
             pale = tuple((c + 2 * 255) // 3 for c in hues[i % HUES])
             tail = [at(p) for p in place[max(0, t - TAIL) : t + 1, i]]
-            draw.line([at(place[t, i]), at(goal[t, i])], fill=EMPTY, width=FINE)
             if len(tail) > 1:
                 draw.line(tail, fill=pale, width=max(FINE, int(0.5 * RADIUS * scale)))
             disc(draw, goal[t, i], 0.3 * RADIUS, fill=pale)

@@ -26,6 +26,7 @@ from ringfence.world.dynamics import Dynamics
 
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
+TOGETHER = 32  # teams whose plans are corrected at once
 CONDITIONS = ("margin", "retain")
 
 
@@ -224,15 +225,37 @@ class Guard(eqx.Module):
 
         Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within `bound`
         of the plan: where the condition cannot be met, pushing with all there is throws robots over. Where nothing is
-        missing the plan is kept as it is.
+        missing the plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and corrected
+        a few teams at a time as long as there is something to correct.
         """
+        batch = plan.shape[0]
+        if batch <= TOGETHER:
+            return self._corrected(present, plan, margin)
+        padded = -batch % TOGETHER
+        order = jnp.argsort((self._shortfall(present, plan, margin) < 0).any(1), descending=True)
+        order = jnp.concatenate([order, jnp.repeat(order[-1:], padded)])
+        given = [x[order].reshape(-1, TOGETHER, *x.shape[1:]) for x in (present, plan, margin)]
+
+        def some(given) -> Array:
+            short = (self._shortfall(*given) < 0).any()
+            return jax.lax.cond(short, lambda: self._corrected(*given), lambda: given[1])
+
+        done = jax.lax.map(some, tuple(given)).reshape(-1, *plan.shape[1:])
+        return plan.at[order].set(done)
+
+    def _shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
+        """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
+        rows, spread = self.foreseen(present, plan[:, None])
+        short = self.missing(present, self.danger.along(rows, spread)[:, 0], margin)
+        return short.sum(1) if self.world.alone else short.sum((1, 2))[:, None]
+
+    def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
+        """`shielded`, of all teams at once."""
         alone, bound = self.world.alone, self.options.bound
         low, high = jnp.maximum(plan - bound, -1.0), jnp.minimum(plan + bound, 1.0)
 
         def shortfall(plan: Array) -> Array:
-            rows, spread = self.foreseen(present, plan[:, None])
-            short = self.missing(present, self.danger.along(rows, spread)[:, 0], margin)
-            return short.sum(1) if alone else short.sum((1, 2))[:, None]  # (B, N) or (B, 1)
+            return self._shortfall(present, plan, margin)
 
         def correct(carry):
             plan, best, least, _, round = carry

@@ -1,7 +1,7 @@
 """Episodes as small animated pictures, drawn without a display: EGL or OSMesa on Linux, what the system has elsewhere.
 
-A simulator that has `frames` draws them (envs/film.py, envs/discs.py). MuJoCo decides how to draw when it is imported, so drawing
-happens in a process of its own.
+A simulator that has `frames` draws them (envs/film.py, envs/discs.py). MuJoCo decides how to draw when it is imported,
+so drawing happens in a process of its own.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def _opengl(env: Env) -> bool:
 
 def film(run: Run, variant: str) -> Path:
     """Make the GIF of the first episode that an evaluation recorded, beside its recording."""
-    task = load_job(run).task
+    task = load_job(run, run.results.get(variant, {}).get("agents")).task
     check(task)
     kept = recorded(run, variant)
     return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")

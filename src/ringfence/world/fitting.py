@@ -36,6 +36,7 @@ from ringfence.world.world import Card, World
 FORMAT = 3  # of what is fitted: what is cached of another is made again
 HELD_OUT = 0.1  # of the episodes, whole ones
 FEWEST = 5  # episodes that can be divided
+CLOSE = 20  # steps before danger that its value is learned from most
 STRANGE = 0.95  # of held-out episodes stay below the ensemble's threshold throughout
 
 
@@ -59,9 +60,9 @@ class Settings:
     both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
     barrier_width: int = 64  # units of each of 3 hidden layers
     barrier_updates: int = 6000  # of the labels
-    future_updates: int = 3000  # of the value of danger
-    future_discount: float = 0.95  # how far ahead danger is seen: 1 / (1 − it) steps
-    expectile: float = 0.9  # of what the logs did, how near to the best
+    future_updates: int = 4000  # of the value of danger
+    future_discount: float = 0.97  # how far ahead danger is seen: 1 / (1 − it) steps
+    expectile: float = 0.7  # of what the logs did, how near to the best
     missed: float = 0.001  # share of unsafe steps that may be foreseen at the default margin or above
 
 
@@ -162,6 +163,7 @@ def _fitted(
                 now,
                 arrays,
                 fitted,
+                fitted[told.close[fitted]],
                 key,
                 discount=s.future_discount,
                 expectile=s.expectile,
@@ -245,6 +247,15 @@ class _Told:
             before = self.arrays["features"][self.arrays["row"][i : i + size]]
             parts.append(step(acts, before, self.arrays["actions"][i : i + size]))
         return jnp.concatenate(parts)
+
+    @property
+    def close(self) -> np.ndarray:
+        """(T,) bool: within CLOSE steps before danger, or in it."""
+        unsafe = self.label if self.label.ndim == 1 else self.label.any(1)
+        found, episode = unsafe.copy(), self.store.episode_of_step
+        for k in range(1, min(CLOSE, len(unsafe))):
+            found[:-k] |= unsafe[k:] & (episode[k:] == episode[:-k])
+        return found
 
     def togo(self, discount: float, each: bool = False) -> jax.Array:
         """(T,) return-to-go of the team, or (T, N) of each agent."""

@@ -5,7 +5,8 @@ module with
                                                                made again
     whole(task, transitions) -> int                            the size that is made where so many steps are asked for
     collect(task, transitions, seed, card) -> EpisodeStore     whose card is `card` and more
-    behaviour(tier) -> BehaviourPolicy | None                  the policy that collected a tier's data, if it was one
+    references(task) -> dict[str, Policy]                      for rows beside the table: the policy that collected the
+                                                               data, if it was one, and what else is known to be good
     relabelled(task, store) -> (costs (T,), dict) | None       the costs of kept steps under this task's danger and what
                                                                the card says then, where they can be told
 """

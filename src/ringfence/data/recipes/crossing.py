@@ -9,6 +9,7 @@ from dataclasses import astuple, dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
@@ -18,7 +19,7 @@ from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
 from ringfence.envs.crossing import DT, PUSH, RADIUS, Crossing, CrossingState, length
 from ringfence.errors import UserError
-from ringfence.types import Array, Key
+from ringfence.types import Array, Key, PolicyStep, PyTree
 
 if TYPE_CHECKING:
     from ringfence.tasks import Task
@@ -43,6 +44,7 @@ DRIVERS = {
     "careful": Driver(0.6, 1.0, 0.05, 1.0, 0.0),
     "hasty": Driver(1.0, 1.1, 0.0, 2.0, 0.1),
 }
+STEADY = Driver(1.0, 0.9, 0.1, 2.0, 0.0)
 TIERS = ("careful", "hasty", "mixed", "random")
 
 
@@ -57,8 +59,25 @@ def whole(task: Task, transitions: int) -> int:
     return -(-transitions // task.env.episode_length) * task.env.episode_length
 
 
-def behaviour(tier: str) -> None:
-    """Drivers read the state, so no policy of observations stands for them."""
+class Driven(eqx.Module):
+    """A driver as a policy: it reads the state, which tells where everybody is."""
+
+    env: Crossing = eqx.field(static=True)
+    driver: Driver = eqx.field(static=True)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        now = self.env.from_global_state(state)
+        driver = jnp.broadcast_to(jnp.array(astuple(self.driver)), (*observations.shape[:2], 5))
+        return memory, PolicyStep(drive(self.env, now, driver, key), {})
+
+
+def references(task: Task) -> dict[str, Driven]:
+    """The tier's driver, and the certificates at their best: full speed, with the brakes that there are."""
+    known = {"behaviour policy": DRIVERS[task.tier]} if task.tier in DRIVERS else {}
+    return {name: Driven(task.env, driver) for name, driver in (known | {"certificates": STEADY}).items()}
 
 
 def relabelled(task: Task, store: EpisodeStore) -> None:

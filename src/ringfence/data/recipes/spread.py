@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax
 
 from ringfence import __version__
 from ringfence.data import behaviour as policies
 from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
+from ringfence.types import Array, Key, PolicyStep, PyTree
 
 if TYPE_CHECKING:
     from ringfence.tasks import Task
@@ -26,9 +28,21 @@ def whole(task: Task, transitions: int) -> int:
     return -(-transitions // task.env.episode_length) * task.env.episode_length
 
 
-def behaviour(tier: str) -> policies.BehaviourPolicy | None:
+class Behaviour(eqx.Module):
+    """A shipped behaviour policy, played with the noise that it collected data with."""
+
+    policy: policies.BehaviourPolicy
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        return memory, PolicyStep(self.policy.act(observations, key), {})
+
+
+def references(task: Task) -> dict[str, Behaviour]:
     """The policy of `medium` and `expert`."""
-    return policies.shipped_policy(tier) if tier in policies.TARGETS else None
+    return {"behaviour policy": Behaviour(policies.shipped_policy(task.tier))} if task.tier in policies.TARGETS else {}
 
 
 def relabelled(task: Task, store: EpisodeStore) -> None:
@@ -43,7 +57,7 @@ def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore
         played = policies.replay_episodes(env, episodes, seed)
         how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
     else:
-        policy = behaviour(tier) or "random"
+        policy = policies.shipped_policy(tier) if tier in policies.TARGETS else "random"
         played = policies.collect(env, policy, episodes, jax.random.fold_in(jax.random.key(COLLECTION), seed))
         how = "uniform actions" if policy == "random" else f"MATD3 policy, Gaussian action noise {policy.noise:g}"
     arrays = (played[k] for k in ("observations", "actions", "rewards", "costs"))
