@@ -62,7 +62,13 @@ def test_everybody_starts_at_rest_and_free_and_the_state_tells_all(room):
     assert all(jnp.array_equal(x, y) for x, y in zip((*a, *told), (*b, *same)))  # even where a goal is drawn anew
 
 
-def test_agents_see_the_nearest_others_first():
+def comes_within(offset, speed) -> float:
+    """m, in the next second; out of sight: far."""
+    near = min(np.linalg.norm(offset + t * speed) for t in np.linspace(0, 1, 2001))
+    return near if np.linalg.norm(offset) < SIGHT else 1e3
+
+
+def test_agents_see_first_who_comes_near():
     env = Crossing(n_agents=12)
     state = env.reset(jax.random.key(3), 4)
     state = state._replace(velocity=jax.random.normal(jax.random.key(4), state.velocity.shape))
@@ -70,7 +76,9 @@ def test_agents_see_the_nearest_others_first():
     p, v = np.asarray(state.position), np.asarray(state.velocity)
     at = names.index("other0.dx")
     for b, i in ((0, 0), (2, 7), (3, 11)):
-        order = sorted((j for j in range(12) if j != i), key=lambda j: np.linalg.norm(p[b, j] - p[b, i]))
+        order = sorted(
+            (j for j in range(12) if j != i), key=lambda j: comes_within(p[b, j] - p[b, i], v[b, j] - v[b, i])
+        )
         for k, j in enumerate(order[:6]):
             told = seen[b, i, at + 5 * k : at + 5 * k + 5]
             if np.linalg.norm(p[b, j] - p[b, i]) < SIGHT:
@@ -188,3 +196,18 @@ def test_logs_are_taken_apart(logs):
 def test_rooms_that_cannot_be_are_refused(room, said):
     with pytest.raises(UserError, match=said):
         Crossing(**room)
+
+
+def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
+    """The card says so, and what was learned of eight plays five."""
+    card = {k: logs.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
+    mine = dataclasses.replace(logs, state=None, card=card)
+    run = training.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    world = worlds.fit(mine, **QUICK_WORLD)
+    seen = np.asarray(logs.observations[40, :5])
+    pilot = Controller(run, guard="shield", world=world, agents=5)
+    assert pilot.act(seen).shape == (5, 2)
+    pilot.reset()
+    assert Controller(run).act(logs.observations[40]).shape == (8, 2)
+    with pytest.raises(UserError, match=r"\(5, 34\)"):
+        pilot.act(logs.observations[40])

@@ -130,7 +130,7 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
     nearest = "other0.seen" in names
     if n_agents < 2 and not nearest:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
-    # `other0.seen` says that others come by their distance, the nearest first, and not all of them are told.
+    # `other0.seen` says that not all others are told, but those who come nearest.
     told = sum(name.endswith(".seen") for name in names) if nearest else n_agents - 1
     relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(told)]
     if all(a in names and b in names for a, b in relative):

@@ -131,14 +131,10 @@ SUITES = {
     # Agents who are alike, each by itself; danger that is decided ten steps ahead.
     "crossing": Suite(
         _CROSSING,
-        (
-            Entry("bc", evaluations=("plain", "shield-learned", "full-learned")),
-            Entry("mpc", evaluations=("full-learned",)),
-            Entry("icbf", evaluations=("plain", "shield-learned")),
-        ),
+        (Entry("bc", evaluations=("plain", "shield-learned")),),
         episodes=1000,
     ),
-    "crossing-rows": Suite(
+    "crossing-guards": Suite(
         _CROSSING[:1],
         (
             Entry(
@@ -149,8 +145,11 @@ SUITES = {
                     "shield-learned+rows1",
                     *(f"shield-learned+rows{k}+futureFalse" for k in (1, 3, 7, 15)),
                     "shield-formula+rows15+futureFalse",
+                    "full-learned",
                 ),
             ),
+            Entry("mpc", evaluations=("full-learned",)),
+            Entry("icbf", evaluations=("plain", "shield-learned")),
         ),
     ),
     "crossing-teams": Suite(

@@ -4,8 +4,8 @@ A disc of radius 0.15 m is pushed by at most 1 m/s² and moves at most 1 m/s, so
 half a metre: whether two of them touch is decided long before they do. Contact costs, and changes nothing else: what
 would follow it is no part of the task.
 
-Every agent sees itself, its goal, and the nearest of the others within sight, so observations have the same entries
-for any number of agents; the room grows with them, as crowded as before.
+Every agent sees itself, its goal, and those of the others within sight who come nearest, so observations have the same
+entries for any number of agents; the room grows with them, as crowded as before.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ PUSH = 1.0  # m/s² at most
 TURN = 2.0  # rad/s at most, of a unicycle
 SPACING = 1.5  # m: the room's side is that times √N
 SIGHT = 3.0  # m; who is farther away is not seen
+SOON = 1.0  # s, of full braking
 REACHED = 0.2  # m from a goal: the next one is given
 APART = 2.0  # m at least from one goal to the next, as far as the room allows
 EFFORT = 0.01  # m of progress that a step of full push costs
@@ -181,12 +182,17 @@ class Crossing:
         return least
 
     def nearest(self, state: CrossingState) -> tuple[Array, Array]:
-        """Offsets and relative velocities (B, N, k, 2) of the k = min(neighbours, N - 1) nearest others, in order."""
+        """Offsets and relative velocities (B, N, k, 2) of the k = min(neighbours, N - 1) others who come nearest within
+        `SOON` if everybody goes on as now, in that order; those in sight first. Who is nearest now would hide, in a
+        crowd, who comes at full speed."""
         p, v, n = state.position, state.velocity, self.n_agents
         offset = p[..., None, :, :] - p[..., :, None, :]  # (B, N, N, 2)
-        _, who = jax.lax.top_k(-((offset**2).sum(-1) + 1e9 * jnp.eye(n)), min(self.neighbours, n - 1))
-        offset = jnp.take_along_axis(offset, who[..., None], -2)
-        return offset, jnp.take_along_axis(v[..., None, :, :], who[..., None], -2) - v[..., :, None, :]
+        speed = v[..., None, :, :] - v[..., :, None, :]
+        when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, SOON)
+        least = ((offset + when[..., None] * speed) ** 2).sum(-1)
+        least = jnp.where((offset**2).sum(-1) < SIGHT**2, least, 1e6) + 1e9 * jnp.eye(n)
+        _, who = jax.lax.top_k(-least, min(self.neighbours, n - 1))
+        return tuple(jnp.take_along_axis(x, who[..., None], -2) for x in (offset, speed))
 
     def observe(self, state: CrossingState) -> Array:
         """(B, N, O) as `observation_names` says. Others that are not seen stand at the end of sight, `seen` = 0."""

@@ -17,7 +17,7 @@ from ringfence import __version__
 from ringfence.data.behaviour import gather, rollout
 from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
-from ringfence.envs.crossing import DT, PUSH, RADIUS, Crossing, CrossingState, length
+from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
@@ -50,8 +50,11 @@ TIERS = ("careful", "hasty", "mixed", "random")
 
 def about(task: Task) -> dict:
     """The simulator, for the card."""
-    told = {"body": task.env.body, "goals": task.env.goals, "spacing": task.env.spacing}
-    return {"simulator": f"ringfence {__version__} crossing", **told}
+    env = task.env
+    room = f"{env.body}, goals {env.goals}, {env.spacing:g} m apart"
+    return {
+        "simulator": f"ringfence {__version__} crossing, {room}, {env.neighbours} seen who come nearest in {SOON:g} s"
+    }
 
 
 def whole(task: Task, transitions: int) -> int:
@@ -137,7 +140,7 @@ def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, ro
         −Δpᵀu ≤ ½ (γ h³ ‖Δp‖ − (Δvᵀ Δp)² / ‖Δp‖² + ‖Δv‖² + 2a Δvᵀ Δp / √(4a (‖Δp‖ − D)))
         h = √(4a (‖Δp‖ − D)) + Δpᵀ Δv / ‖Δp‖
 
-    with the nearest `neighbours`: a quadratic programme in the plane, by Hildreth's method."""
+    with the `neighbours` that one sees: a quadratic programme in the plane, by Hildreth's method."""
     if env.n_agents == 1:
         return push
     offset, theirs = env.nearest(state)
