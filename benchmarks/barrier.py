@@ -40,12 +40,16 @@ GUARDS: dict[str, dict] = {
     "retain": {"condition": "retain"},
     "future": {"future": True},
 }
+SHORT = {"3 rows": {"rows": 3}, "future, 3 rows": {"future": True, "rows": 3}}  # where 7 are usual
+
 FIELDS = ("task", "way", "guard", "seed", "fit_seconds", "unsafe_share", "recall", "auroc", "margin")
 FIELDS += ("foreseen_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible")
 
 
 class Simulated:
     """A task of the library: its data, cloning, and how that is guarded and played."""
+
+    guards = GUARDS
 
     def __init__(self, name: str, seed: int, folder: str, episodes: int):
         self.task, self.seed = tasks.get(name), seed
@@ -56,12 +60,14 @@ class Simulated:
         self.episodes = max(1, episodes // 20) if body else episodes
 
     def play(self, world, **options) -> dict:
-        policy = load(self.run, world=world, **self.guard, **options)[1]
+        policy = load(self.run, world=world, **{**self.guard, **options})[1]
         return evaluate_policy(policy, self.task, self.episodes, "validation", self.seed)[0]
 
 
 class Yard:
     """examples/yard.py likewise."""
+
+    guards = GUARDS | SHORT
 
     def __init__(self, name: str, seed: int, folder: str, episodes: int):
         sys.path.insert(0, str(HERE.parent / "examples"))
@@ -73,7 +79,7 @@ class Yard:
 
     def play(self, world, **options) -> dict:
         kw = dict(episodes=self.episodes, at_once=self.episodes, split="validation", world=world)
-        return ringfence.play(self.run, self.env, **kw, **self.guard, **options)
+        return ringfence.play(self.run, self.env, **kw, **{**self.guard, **options})
 
 
 def main() -> None:
@@ -92,12 +98,13 @@ def main() -> None:
         if not there:
             writer.writeheader()
         for name in a.tasks:
-            wanted = [(w, g) for w in a.ways for g in (GUARDS if w == "default" else ("margin",))]
+            kind = Yard if name == "yard" else Simulated
+            wanted = [(w, g) for w in a.ways for g in (kind.guards if w == "default" else ("margin",))]
             wanted = [x for x in wanted if (name, *x, a.seed) not in done]
             if not wanted:
                 continue
             with tempfile.TemporaryDirectory() as folder:
-                subject = (Yard if name == "yard" else Simulated)(name, a.seed, folder, a.episodes)
+                subject = kind(name, a.seed, folder, a.episodes)
                 for way, guard in wanted:
                     writer.writerow(measured(name, subject, way, guard, a.seed))
                     file.flush()
@@ -111,7 +118,7 @@ def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
     begun = time.perf_counter()
     world = worlds.fit(subject.store, seed=seed, **changes)
     took, told = time.perf_counter() - begun, world.card["barrier"]
-    played = subject.play(world, **GUARDS[guard])
+    played = subject.play(world, **subject.guards[guard])
     low, high = played["cost_interval"]
     row = {
         "task": name,

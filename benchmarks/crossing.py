@@ -23,6 +23,12 @@ from ringfence.evaluate import load
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "crossing.json"
 TEAMS = (8, 64, 256)
 BATCH = 500
+GUARDS = {
+    "none": {},
+    "shield": {"guard": "shield"},
+    "shield by ℓ alone along 15 rows": {"guard": "shield", "rows": 15, "future": False},
+    "full": {"guard": "full"},
+}
 
 
 def simulated(repeats: int = 5) -> float:
@@ -47,10 +53,9 @@ def simulated(repeats: int = 5) -> float:
     return median(rates)
 
 
-def acting(run, world, agents: int, guard: str, steps: int = 200) -> np.ndarray:
+def acting(run, world, agents: int, options: dict, steps: int = 200) -> np.ndarray:
     """(steps,) milliseconds of joint actions along two episodes, where agents meet."""
-    how = {} if guard == "none" else {"guard": guard, "world": world}
-    job, policy = load(run, agents=agents, **how)
+    job, policy = load(run, agents=agents, **options, **({"world": world} if options else {}))
     env = job.task.env
     act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, seen, None, key))
     move, look = jax.jit(env.step), jax.jit(env.observe)
@@ -75,9 +80,9 @@ def main() -> None:
     row("Crossing: fitting a World", time.perf_counter() - begun, "s")
     with tempfile.TemporaryDirectory() as folder:
         (run,) = training.train("bc", store, out=folder, quiet=True)
-        for guard in ("none", "shield", "full"):
+        for guard, options in GUARDS.items():
             for agents in TEAMS:
-                took = acting(run, world, agents, guard)
+                took = acting(run, world, agents, options)
                 for name, share in (("p50", 50), ("p99", 99)):
                     value = float(np.percentile(took, share))
                     row(f"Crossing: one joint action, guard {guard}, {agents} agents, {name}", value, "ms")

@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from readme import put
 
+from ringfence.stats import upper_bound
+
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 # Columns: their heads, and algorithm, guard, danger and sight of their rows.
 SPREAD = {
@@ -27,7 +29,30 @@ ROBOTS = {
     "full, formula": "bc full formula all",
     "**full, learned**": "bc full learned all",
 }
-OWN = {"cloning": "bc none none all", "shield, learned, own sight": "bc shield learned own"}
+OWN = {
+    "cloning": "bc none none all",
+    "shield, learned, own sight": "bc shield learned own",
+    "full, learned, own sight": "bc full learned own",
+}
+# Crossing's rows: algorithm and variant, and their words.
+BESIDE = {
+    "behaviour data reference": "the logs",
+    "certificates reference": "certificates (true state and brakes)",
+}
+TIERS = BESIDE | {"bc default": "cloning", "bc default+shield-learned": "**cloning, shield, learned**"}
+WAYS = BESIDE | {
+    "bc default": "cloning",
+    **{f"bc default+shield-learned+rows{k}+futureFalse": f"shield, ℓ along {k} rows" for k in (1, 3, 7, 15)},
+    "bc default+shield-learned+rows1": "shield, ℓ and V, 1 row",
+    "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
+    "bc default+shield-formula+rows15+futureFalse": "shield, formula along 15 rows",
+    "bc default+full-learned": "**full**",
+    "mpc default+full-learned": "no prior (`mpc`), full",
+    "icbf default": "`icbf`",
+    "icbf default+shield-learned": "`icbf`, shield",
+}
+TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
+TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
 OWN_ROBOTS = {
     "cloning": "bc none none all",
     "adapt, learned, own sight": "bc adapt learned own",
@@ -41,6 +66,9 @@ def main() -> None:
     put("docs/guard.md", "own", table("own-sight", OWN, short))
     put("docs/guard.md", "own-robots", table("own-sight-mujoco", OWN_ROBOTS, long))
     put("docs/guard.md", "barrier", barrier())
+    put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
+    put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
+    put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
 
 
 def table(suite: str, columns: dict[str, str], cell) -> str:
@@ -75,6 +103,40 @@ def long(rows: list[dict]) -> str:
     return told + (f" ({100 * fell:.0f} % fall)" if fell else "")
 
 
+def crossing(suite: str, named: dict[str, str]) -> str:
+    """A row per task and variant. Seeds share their resets, so the bound is of resets: those in which any seed touched,
+    at most."""
+    head = (
+        "who",
+        "return",
+        "steps with contact",
+        "episodes with contact (bound)",
+        "agent-episodes",
+        "not met",
+        "made of",
+    )
+    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    rows = list(csv.DictReader((RESULTS / suite / "table.csv").open()))
+    for task in dict.fromkeys(r["task"] for r in rows):
+        several = len({r["task"] for r in rows}) > 1
+        for key, words in named.items():
+            found = [r for r in rows if r["task"] == task and f"{r['algorithm']} {r['variant']}" == key]
+            if not found:
+                continue
+            episodes = int(found[0]["episodes"])
+            touched = round(sum(float(r["violation_rate"]) for r in found) * episodes)
+            own = [r for r in found if r["agent_violation_rate"]]
+            part = [f"`{task}`, {words}" if several else words, f"{mean(found, 'return_mean'):.2f}"]
+            part += [f"{mean(found, 'cost_mean'):.3g}", f"{100 * mean(found, 'violation_rate'):.3g} %"]
+            if key.split()[0] != "behaviour" or "policy" in key:
+                part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.2g} %)"
+            part += [f"{100 * mean(own, 'agent_violation_rate'):.2g} %" if own else ""]
+            part += [f"{100 * mean(found, 'infeasible'):.2g} %" if found[0]["infeasible"] else ""]
+            part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]
+            out.append("| " + " | ".join(part) + " |")
+    return "\n".join(out)
+
+
 def barrier() -> str:
     """Ways of fitting a barrier, by what the guard makes of them."""
     head = ("way", "unsafe steps found", "margin", "return", "cost", "95 % interval", "infeasible")
@@ -84,8 +146,10 @@ def barrier() -> str:
         out += [f"`{task}`:", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         for r in (r for r in rows if r["task"] == task):
             way = r["way"] if r["guard"] == "margin" else f"{r['way']}, condition `{r['guard']}`"
-            if r["guard"] == "future":
-                way = f"{r['way']}, last row judged by V"
+            if "future" in r["guard"]:
+                way = f"{r['way']}, last row judged by V" + r["guard"].removeprefix("future")
+            elif r["guard"] == "3 rows":
+                way = f"{r['way']}, 3 rows"
             part = [way, f"{100 * float(r['recall']):.1f} %", f"{float(r['margin']):.1f}", f"{float(r['return']):.4g}"]
             part += [f"{float(r['cost']):.3g}", f"{float(r['cost_low']):.3g} to {float(r['cost_high']):.3g}"]
             part += [f"{100 * float(r['infeasible'] or 0):.1f} %"]

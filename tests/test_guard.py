@@ -61,6 +61,18 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
     assert (missing(guard.shielded(present, plan, margin)) >= missing(plan) - 1e-5).all()
 
 
+def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
+    """Those who need it, a few at a time; their number is no multiple of anything."""
+    guard = make(small_world, bound, shield=4)
+    plan = jax.random.uniform(jax.random.key(6), (45, 3, 3, 2), minval=-1, maxval=1)
+    margin = jnp.linspace(-1.0, 3.0, 45)
+    several = guard.shielded(present[:45], plan, margin)
+    each = [guard.shielded(present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
+    np.testing.assert_allclose(several, jnp.concatenate(each), atol=1e-4)
+    moved = (several != plan).any((1, 2, 3))
+    assert 0 < moved.sum() < 45
+
+
 def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, refine=10, starts=4, care=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))

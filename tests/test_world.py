@@ -144,9 +144,10 @@ def test_danger_is_seen_ahead():
     every = np.arange(len(row))
     fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **told)
     arrays = {"features": data[0], "row": data[2], "terminated": jnp.zeros(len(row), bool)}
-    ahead = cbf.fit_future(
-        fitted, arrays, every, jax.random.key(1), discount=0.9, expectile=0.9, updates=2000, rate=0.02
-    )
+    told = dict(discount=0.9, expectile=0.9)
+    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), updates=1, **told)
+    np.testing.assert_allclose(start.ahead(data[0]), fitted.of_steps(data[0], data[0]), atol=1.0)  # it begins as ℓ
+    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), updates=1000, **told)
     doomed, fine = jnp.asarray([[[0.4, 0.9]]]), jnp.asarray([[[0.4, -0.9]]])
     assert fitted.of_steps(doomed, doomed) > 0 and fitted.of_steps(fine, fine) > 0
     assert ahead.ahead(doomed) < 0 < ahead.ahead(fine)

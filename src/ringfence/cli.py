@@ -460,7 +460,8 @@ def bench(
     `bench paper-table`.
 
     Args:
-        suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites.
+        suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites. Under
+            guard: guards, guards-mujoco, own-sight, own-sight-mujoco, crossing, crossing-guards, crossing-teams.
         seeds: per algorithm and task.
         episodes: test episodes per run; the suite's number by default.
         out_dir: folder of results, results/SUITE by default; of paper, the folder that holds both, results.
