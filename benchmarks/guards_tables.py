@@ -21,6 +21,9 @@ SPREAD = {
     "**shield, learned**": "bc shield learned all",
     "**full, learned**": "bc full learned all",
     "no prior (`mpc`), full, learned": "mpc full learned all",
+    "`icbf`": "icbf none none all",
+    "`icbf`, full, learned": "icbf full learned all",
+    "`icbf`, full, formula": "icbf full formula all",
 }
 ROBOTS = {
     "cloning": "bc none none all",
@@ -129,7 +132,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
             part = [f"`{task}`, {words}" if several else words, f"{mean(found, 'return_mean'):.2f}"]
             part += [f"{mean(found, 'cost_mean'):.3g}", f"{100 * mean(found, 'violation_rate'):.3g} %"]
             if key.split()[0] != "behaviour" or "policy" in key:
-                part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.2g} %)"
+                part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.3g} %)"
             part += [f"{100 * mean(own, 'agent_violation_rate'):.2g} %" if own else ""]
             part += [f"{100 * mean(found, 'infeasible'):.2g} %" if found[0]["infeasible"] else ""]
             part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]

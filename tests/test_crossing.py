@@ -13,6 +13,7 @@ from ringfence.data.make import make
 from ringfence.data.recipes import crossing as recipe
 from ringfence.envs import Crossing
 from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
+from ringfence.envs.film import RED
 from ringfence.errors import UserError
 from ringfence.evaluate import Controller, evaluate, unsafe_starts
 from ringfence.guards import guard
@@ -157,6 +158,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path):
     for agents in (None, 3, 20):
         result = evaluate(run, episodes=2, guard="shield", world=world, agents=agents)
         assert result["agents"] == (agents or 8) and result["sight"] == "own" and 0 <= result["infeasible"] <= 1
+        assert 0 <= result["agent_violation_rate"] <= result["violation_rate"]
         assert result["variant"] == "default+shield-learned" + (f"+agents{agents}" if agents else "")
     pilot = Controller(run, guard="shield", world=world, agents=5)
     env = Crossing(n_agents=5)
@@ -173,6 +175,17 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path):
         evaluate(run, episodes=2, guard="shield", world=world, sight="all")
     with pytest.raises(UserError, match="say with agents="):
         guard(lambda seen, state: np.zeros((len(seen), 2)), world)
+
+
+def test_episodes_are_drawn():
+    env = Crossing(n_agents=3, obstacles=1)
+    state = env.reset(jax.random.key(0), 1)
+    touching = state._replace(position=state.position.at[:, 1].set(state.position[:, 0] + 0.1))
+    states = np.concatenate([env.global_state(state), env.global_state(touching)])
+    fine, bad = env.frames(states, [(0, False), (1, True)])
+    assert fine.size == bad.size == (480, 480)
+    red = [(np.abs(np.asarray(x).astype(int) - RED).sum(-1) < 20).sum() for x in (fine, bad)]
+    assert red[0] == 0 < red[1]  # who touches is red
 
 
 def test_logs_are_taken_apart(logs):
