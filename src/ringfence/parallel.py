@@ -115,7 +115,9 @@ class _Episode:
         self.env, self.job, self.agents = env, job, list(env.possible_agents)
         if len(self.agents) != job.team:
             remedy = f"; pass agents={len(self.agents)}" if job.task.alike else ""
-            raise UserError(f"{type(env).__name__} has {len(self.agents)} agents, the run is for {job.team}{remedy}.")
+            raise UserError(
+                f"{type(env).__name__} has {len(self.agents)} agents, the run was trained with {job.team}{remedy}."
+            )
         if job.widths[1] and not hasattr(env, "state"):
             raise UserError(
                 f"The run reads a global state, which {type(env).__name__} lacks; give it a state() method."
