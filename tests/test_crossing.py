@@ -14,9 +14,11 @@ from ringfence.data.recipes import crossing as recipe
 from ringfence.envs import Crossing
 from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
 from ringfence.envs.film import RED
+from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import UserError
 from ringfence.evaluate import Controller, evaluate, unsafe_starts
 from ringfence.guards import guard
+from ringfence.parallel import play
 from ringfence.world.fitting import held_out
 from tests.quick import QUICK_WORLD
 
@@ -186,6 +188,19 @@ def test_episodes_are_drawn():
     assert fine.size == bad.size == (480, 480)
     red = [(np.abs(np.asarray(x).astype(int) - RED).sum(-1) < 20).sum() for x in (fine, bad)]
     assert red[0] == 0 < red[1]  # who touches is red
+
+
+def test_it_keeps_pettingzoos_api(logs, tmp_path):
+    from pettingzoo.test import parallel_api_test
+
+    env = CrossingParallel(n_agents=3, render_mode="rgb_array")
+    parallel_api_test(env, num_cycles=20)
+    seen, _ = env.reset(seed=1)
+    assert env.render().shape == (480, 480, 3) and seen["agent_0"].shape == (env.core.observation_dim,)
+    run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    assert play(run, lambda: CrossingParallel(n_agents=3), episodes=1, agents=3)["episodes"] == 1
+    with pytest.raises(UserError, match="has 3 agents, the run was trained with 8; pass agents=3"):
+        play(run, lambda: CrossingParallel(n_agents=3), episodes=1)
 
 
 def test_logs_are_taken_apart(logs):

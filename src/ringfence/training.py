@@ -103,9 +103,10 @@ def make_job(
 
 
 def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:
-    """How many entries an observation and the global state have (0: there is none): the simulator's, or the data's."""
+    """How many entries an observation and the global state have (0: there is none, or nobody reads it): the
+    simulator's, or the data's."""
     if task.env is not None:
-        return task.env.observation_dim, len(task.env.state_names)
+        return task.env.observation_dim, 0 if task.alike else len(task.env.state_names)
     if store is None:
         return None, None
     return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]

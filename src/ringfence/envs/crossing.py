@@ -120,6 +120,8 @@ class Crossing:
         table = np.arange(len(names))[None]  # of a team of one
         return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), DT)
 
+    film_shows: ClassVar[str] = "Lines lead to goals, red touches."
+
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
         """Pictures of an episode (discs.py)."""
         from ringfence.envs import discs

@@ -190,6 +190,7 @@ class SafeMuJoCo:
         return views(view, self)
 
     opengl: ClassVar[bool] = True  # its films need it
+    film_shows: ClassVar[str] = "The bar is the speed, the stroke its limit, red is above it."
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
         """Pictures of an episode (film.py)."""

@@ -13,8 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from pettingzoo import ParallelEnv
 
+from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
-from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread, SpreadState
+from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread
 from ringfence.errors import UserError
 
 LANDMARK_RADIUS = 0.05
@@ -49,27 +50,22 @@ class _Parallel(ParallelEnv):
         """Nothing to release."""
 
 
-class SimpleSpreadParallel(_Parallel):
-    """Simple Spread as `agent_0` .. `agent_{N-1}`.
+class _Plane(_Parallel):
+    """A pure simulator `core` of agents who push themselves about in the plane. Observations are float32 (O,), actions
+    (2,) in [-1, 1] (clipped), rewards floats. Every agent's info carries `cost` and `clearance` (m). Episodes are
+    truncated at `episode_length` and never terminate."""
 
-    Observations are float32 (O,), actions force directions in [-1, 1]^2 (clipped), rewards floats. Every agent's info
-    carries `cost` (shared by the team) and `clearance` (own smallest centre distance to another agent minus 0.30;
-    infinite for a single agent). Episodes are truncated at `episode_length` and never terminate.
-    """
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
 
-    metadata = {"render_modes": ["rgb_array"], "name": "ringfence_simple_spread", "render_fps": 10}
-
-    def __init__(self, render_mode: str | None = None, **options: Any):
+    def __init__(self, core: Any, render_mode: str | None):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise UserError(f"There is no render_mode='{render_mode}'; use 'rgb_array', or None to draw nothing.")
-        self.core = SimpleSpread(**options)
-        sizes = self.core.n_agents, self.core.observation_dim, 2, len(self.core.state_names)
-        super().__init__(*sizes, np.float32)
+        self.core = core
+        super().__init__(core.n_agents, core.observation_dim, 2, len(core.state_names), np.float32)
         self.render_mode = render_mode
         self._key: jax.Array | None = None
-        self._state: SpreadState | None = None
+        self._state: Any = None
         self._steps = 0
-        core = self.core
         self._reset = jax.jit(lambda key: core.reset(key, 1))
         self._step = jax.jit(core.step)
         self._observe = jax.jit(core.observe)
@@ -82,15 +78,13 @@ class SimpleSpreadParallel(_Parallel):
             self._key = jax.random.key(int(entropy))
         self._key, key = jax.random.split(self._key)
         self._state, self._steps, self.agents = self._reset(key), 0, self.possible_agents[:]
-        return self._observations(), self._infos(cost=0.0)
+        return self._observations(), self._infos(np.zeros(1))
 
     def step(self, actions: dict[str, Any]) -> Dicts:
         """Advance by 0.1 s with one action (2,) per agent."""
         joint = _joint(self.agents, actions)
         if joint.shape[2:] != (2,) or not np.isfinite(joint).all():
-            raise UserError(
-                f"step() got actions {dict(actions)}; give every agent two finite numbers, its force along x and y."
-            )
+            raise UserError(f"step() got actions {dict(actions)}; give every agent two finite numbers, its push.")
         self._state, transition = self._step(self._state, joint)
         self._steps += 1
         agents, over = self.agents, self._steps >= self.core.episode_length
@@ -100,17 +94,41 @@ class SimpleSpreadParallel(_Parallel):
             {a: float(r) for a, r in zip(agents, reward)},
             dict.fromkeys(agents, False),
             dict.fromkeys(agents, over),
-            self._infos(cost=float(transition.cost[0])),
+            self._infos(np.asarray(transition.cost[0])),
         )
         if over:
             self.agents = []
         return result
 
     def state(self) -> np.ndarray:
-        """(6N,) float32: positions, velocities, landmarks; see `SimpleSpread.state_names`."""
+        """(S,) float32; see the simulator's `state_names`."""
         if self._state is None:
             raise UserError("There is no state before the first episode; call reset() first.")
         return np.asarray(self.core.global_state(self._state)[0], np.float32)
+
+    def _observations(self) -> dict[str, np.ndarray]:
+        observations = np.asarray(self._observe(self._state)[0], np.float32)
+        return dict(zip(self.possible_agents, observations))
+
+    def _infos(self, cost: np.ndarray) -> dict[str, dict[str, float]]:
+        """Costs () of the team, or (N,) of each agent."""
+        costs = np.broadcast_to(cost, len(self.possible_agents))
+        told = zip(self.possible_agents, costs, self._clearance())
+        return {a: {"cost": float(k), "clearance": float(c)} for a, k, c in told}
+
+    def _clearance(self) -> np.ndarray:
+        """(N,) m to what an agent must not touch."""
+        raise NotImplementedError
+
+
+class SimpleSpreadParallel(_Plane):
+    """Simple Spread as `agent_0` .. `agent_{N-1}`: actions are force directions, `cost` is shared by the team,
+    `clearance` the own smallest centre distance to another agent minus 0.30 (infinite for a single agent)."""
+
+    metadata = {**_Plane.metadata, "name": "ringfence_simple_spread"}
+
+    def __init__(self, render_mode: str | None = None, **options: Any):
+        super().__init__(SimpleSpread(**options), render_mode)
 
     def render(self) -> np.ndarray | None:
         """(480, 480, 3) uint8 for render_mode "rgb_array": agents blue, in contact red, landmarks grey."""
@@ -131,19 +149,32 @@ class SimpleSpreadParallel(_Parallel):
             frame[inside] = (0.25 * frame[inside] + 0.75 * colour).astype(np.uint8)  # landmarks show through
         return frame
 
-    def _observations(self) -> dict[str, np.ndarray]:
-        observations = np.asarray(self._observe(self._state)[0], np.float32)
-        return dict(zip(self.possible_agents, observations))
-
-    def _infos(self, cost: float) -> dict[str, dict[str, float]]:
-        return {a: {"cost": cost, "clearance": float(c)} for a, c in zip(self.possible_agents, self._clearance())}
-
     def _clearance(self) -> np.ndarray:
         """(N,) smallest centre distance to another agent minus 0.30."""
         position = np.asarray(self._state.position[0])
         distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
         np.fill_diagonal(distance, np.inf)
         return distance.min(1) - CONTACT_DISTANCE
+
+
+class CrossingParallel(_Plane):
+    """Crossing as `agent_0` .. `agent_{N-1}`: `cost` is each agent's own, `clearance` the distance from its rim to
+    what it must not touch."""
+
+    metadata = {**_Plane.metadata, "name": "ringfence_crossing"}
+
+    def __init__(self, render_mode: str | None = None, **options: Any):
+        super().__init__(Crossing(**options), render_mode)
+
+    def render(self) -> np.ndarray | None:
+        """(480, 480, 3) uint8 for render_mode "rgb_array"; who touches is red."""
+        if self.render_mode is None or self._state is None:
+            return None
+        now = np.asarray(self.core.global_state(self._state))
+        return np.asarray(next(self.core.frames(now, [(0, False)])))
+
+    def _clearance(self) -> np.ndarray:
+        return np.asarray(self.core.clearance(self._state)[0])
 
 
 class SafeMuJoCoParallel(_Parallel):

@@ -11,7 +11,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from ringfence import __version__, algos, tasks
+from ringfence import __version__, algos, hazards, tasks
 from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
@@ -72,6 +72,12 @@ def _write(path: Path, text: str) -> Path:
     return path
 
 
+def _film_shows(section: Section) -> str:
+    """What films of a task show, in words; empty where its simulator draws none."""
+    task = tasks.simulated(section.task, hazards.from_dict(section.hazard)) if section.hazard else None
+    return "" if task is None else getattr(task.env, "film_shows", "")
+
+
 def _section(section: Section, k: int, out: Path) -> dict:
     unit, event = WORDS.get(section.hazard.get("kind"), ("cost", "a violation"))
     test = section.tables.get("test", [])
@@ -96,7 +102,7 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "fields": _fields(section, k),
         "players": recorded,
         "films": animation.films(section),
-        "hazard_kind": section.hazard.get("kind"),
+        "film_shows": _film_shows(section),
         "players_json": Markup(json.dumps(recorded).replace("<", "\\u003c")),
         "commands": commands(section, out),
         "differences": differences(section),
