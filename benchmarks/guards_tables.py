@@ -45,10 +45,10 @@ BESIDE = {
 TIERS = BESIDE | {"bc default": "cloning", "bc default+shield-learned": "**cloning, shield, learned**"}
 WAYS = BESIDE | {
     "bc default": "cloning",
-    **{f"bc default+shield-learned+rows{k}+futureFalse": f"shield, ℓ along {k} rows" for k in (1, 3, 7, 15)},
+    **{f"bc default+shield-learned+rows{k}+futureFalse": f"shield, ℓ, {k} row{'s' * (k > 1)}" for k in (1, 3, 7, 15)},
     "bc default+shield-learned+rows1": "shield, ℓ and V, 1 row",
     "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
-    "bc default+shield-formula+rows15+futureFalse": "shield, formula along 15 rows",
+    "bc default+shield-formula+rows15+futureFalse": "shield, formula, 15 rows",
     "bc default+full-learned": "**full**",
     "mpc default+full-learned": "no prior (`mpc`), full",
     "icbf default": "`icbf`",
