@@ -72,6 +72,7 @@ def main() -> None:
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
+    put("docs/crossing.md", "other", other_simulator())
 
 
 def table(suite: str, columns: dict[str, str], cell) -> str:
@@ -137,6 +138,19 @@ def crossing(suite: str, named: dict[str, str]) -> str:
             part += [f"{100 * mean(found, 'infeasible'):.2g} %" if found[0]["infeasible"] else ""]
             part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]
             out.append("| " + " | ".join(part) + " |")
+    return "\n".join(out)
+
+
+def other_simulator() -> str:
+    """Rows of benchmarks/other_simulator.py."""
+    rows = list(csv.DictReader((RESULTS / "other_simulator.csv").open()))
+    head = ("learned from", "agents", "guard", "return", "steps with contact", "episodes with contact", "made of")
+    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for r in rows:
+        part = [r[k] for k in ("learned from", "agents", "guard", "return", "steps with contact")]
+        part.append(f"{100 * float(r['episodes with contact']):.3g} %")
+        part[-1] += f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
+        out.append("| " + " | ".join([*part, f"{r['episodes']} episodes"]) + " |")
     return "\n".join(out)
 
 

@@ -19,6 +19,7 @@ from ringfence.errors import UserError
 from ringfence.evaluate import Controller, evaluate, unsafe_starts
 from ringfence.guards import guard
 from ringfence.parallel import play
+from ringfence.world import save
 from ringfence.world.fitting import held_out
 from tests.quick import QUICK_WORLD
 
@@ -232,6 +233,10 @@ def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     mine = dataclasses.replace(logs, state=None, card=card)
     run = training.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(mine, **QUICK_WORLD)
+    assert world.map.solitary and world.map.dt == pytest.approx(0.1)  # as names and steps tell
+    assert world.map.own == Crossing().feature_map("pruned").own
+    world = worlds.load(save(world, tmp_path / "fleet.world"))
+    assert world.map.solitary
     seen = np.asarray(logs.observations[40, :5])
     pilot = Controller(run, guard="shield", world=world, agents=5)
     assert pilot.act(seen).shape == (5, 2)

@@ -41,6 +41,7 @@ class FeatureMap:
     body: bool = False  # the agents are limbs of one body: its danger is everybody's
     joint: bool = False  # what comes next depends on everybody's action, which is known
     solitary: bool = False  # what follows does so from the agent's own movement alone
+    dt: float | None = None  # s, of a solitary map: the step that velocities are foreseen by
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
 
@@ -132,6 +133,7 @@ def coasting(map: FeatureMap, dt: float) -> FeatureMap:
         own=own,
         follows=follows,
         solitary=True,
+        dt=dt,
         reconcile=_reconcile_coasting(np.array(rules), np.array(sorted(stays), int), dt),
     )
 
@@ -198,6 +200,7 @@ def from_data(
     state_names: tuple[str, ...],
     first_rows: np.ndarray | None = None,
     keep: Iterable[str] = (),
+    alike: bool = False,
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
     so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
@@ -237,6 +240,8 @@ def from_data(
     plain = kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
     if view == "centralized":
         return plain
+    if alike and (dt := _step_of(plain, observations, first_rows)) is not None:
+        return coasting(plain, dt)
     return following(plain, _confirmed(plain, observations, state, first_rows))
 
 
@@ -258,6 +263,32 @@ def _confirmed(map: FeatureMap, observations, state, first_rows, steps: int = 40
         if error <= 0.05 * change + 1e-5:
             good[d] = rule
     return good
+
+
+def _step_of(map: FeatureMap, observations, first_rows, steps: int = 4000) -> float | None:
+    """s between rows, of agents who know velocities and not places: what stands still (`goal.dx`) moves by −dt of
+    `own.vx`. None where no entry tells, or nine logged steps in ten do not agree to a twentieth of their change."""
+    names = {name: d for d, name in enumerate(map.names)}
+    if any(f"own.{c}" in names for c in "xyz") or len(observations) < 3:
+        return None
+    before = np.unique(np.linspace(0, len(observations) - 2, steps).astype(int))
+    if first_rows is not None:
+        before = before[~np.isin(before + 1, first_rows)]
+    now, then = (np.asarray(map(observations[k], None), np.float64) for k in (before, before + 1))
+    found = []
+    for name, d in names.items():
+        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
+        if match is None or f"own.v{match[2]}" not in names or f"{match[1]}.dv{match[2]}" in names:
+            continue
+        moved, speed = (then - now)[..., d].ravel(), then[..., names[f"own.v{match[2]}"]].ravel()
+        fast = np.abs(speed) > np.quantile(np.abs(speed), 0.5)
+        if not fast.any() or not np.abs(speed[fast]).min() > 0:
+            continue
+        dt = float(np.median(-moved[fast] / speed[fast]))
+        error, change = (np.quantile(np.abs(x), 0.9) for x in (moved + dt * speed, moved))
+        if dt > 0 and error <= 0.05 * change + 1e-5:
+            found.append(dt)
+    return float(np.round(np.median(found), 6)) if found else None
 
 
 def _told_twice(observations, state, keep: set[str], names, rows: int = 4000) -> set[int]:
@@ -306,6 +337,8 @@ def from_dict(data: dict) -> FeatureMap:
     """The map that a run's config.json describes."""
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(data["plus"]), np.array(data["minus"]))
+    if data.get("dt") is not None:
+        return coasting(map, data["dt"])
     kept = set(data.get("follows", ()))
     return following(map, {d: rule for d, rule in derived(map.names, map.plus.shape[0]).items() if d in kept})
 
@@ -320,4 +353,5 @@ def to_dict(map: FeatureMap) -> dict:
         "minus": map.minus.tolist(),
         "joint": isinstance(map, _Joint),
         "follows": list(map.follows),
+        **({} if map.dt is None else {"dt": map.dt}),
     }

@@ -69,7 +69,8 @@ class Task:
         state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
         firsts = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
         keep = hazards.reads(self.hazard, store.n_agents, tuple(names))
-        return features.from_data(view, store.observations, store.state, tuple(names), tuple(state_names), firsts, keep)
+        told = store.observations, store.state, tuple(names), tuple(state_names), firsts, keep
+        return features.from_data(view, *told, alike=self.alike)
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
         env = self.env
