@@ -86,9 +86,6 @@ def main() -> None:
                 for name, share in (("p50", 50), ("p99", 99)):
                     value = float(np.percentile(took, share))
                     row(f"Crossing: one joint action, guard {guard}, {agents} agents, {name}", value, "ms")
-                row(
-                    f"Crossing: the same per agent, p50, {agents}, guard {guard}", float(np.median(took)) / agents, "ms"
-                )
     record(OUT, row)
 
 

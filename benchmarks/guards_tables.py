@@ -115,7 +115,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
         "return",
         "steps with contact",
         "episodes with contact (bound)",
-        "agent-episodes",
+        "agents who touch",
         "not met",
         "made of",
     )
