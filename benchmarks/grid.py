@@ -23,7 +23,7 @@ from pathlib import Path
 
 from _common import record
 
-from ringfence.bench import make_grid
+from ringfence.bench import make_grid, unpack
 
 ROOT = Path(__file__).resolve().parent.parent / "results"
 WORK = {"tasks": ["simple_spread-expert"], "algorithms": ["bc", "ma-td3bc"], "seeds": 3, "episodes": 200}
@@ -47,6 +47,7 @@ def prepared(folder: str, **what):
     """A grid in a folder whose reference rows exist, so that all that is left is cells."""
     grid = grid_of(Path(folder) / "grid", **what)
     grid.open()
+    unpack(ROOT / "simple_spread")
     shutil.copytree(ROOT / "simple_spread" / "reference", grid.out / "reference")
     return grid
 

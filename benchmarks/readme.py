@@ -15,7 +15,7 @@ import matplotlib
 import numpy as np
 
 from ringfence import algos, tasks
-from ringfence.bench import paper
+from ringfence.bench import paper, unpack
 from ringfence.report import board, export
 from ringfence.runs import build_config
 
@@ -182,6 +182,7 @@ def spent(folder: Path) -> str:
 
     Cells that took over what another had learned from the same data cost their playing alone: lines of their own."""
     seconds = defaultdict(list)
+    unpack(folder)
     for file in sorted((folder / "cells").glob("*/*/*/status.json")):
         told, name = json.loads(file.read_text()), file.parent.parent.name
         if told["state"] != "done":

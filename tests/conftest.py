@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import tempfile
 
 # The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give.
@@ -10,11 +11,15 @@ import tempfile
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 # Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", tempfile.mkdtemp(prefix="ringfence-tests-"))
+_MADE = []
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    _MADE.append(tempfile.mkdtemp(prefix="ringfence-tests-"))
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _MADE[0]
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 # Worlds that tests fit are not the user's.
-os.environ["RINGFENCE_HOME"] = tempfile.mkdtemp(prefix="ringfence-home-")
+_MADE.append(tempfile.mkdtemp(prefix="ringfence-home-"))
+os.environ["RINGFENCE_HOME"] = _MADE[-1]
 
 import jax
 import numpy as np
@@ -24,6 +29,12 @@ from ringfence import hazards
 from ringfence.data.behaviour import collect
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
+
+
+def pytest_unconfigure():
+    """Leave nothing in the folder for temporary files."""
+    for folder in _MADE:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

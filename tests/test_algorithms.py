@@ -12,6 +12,7 @@ import pytest
 
 from ringfence import algos, evaluate, tasks, training
 from ringfence.algos import icbf
+from ringfence.data.store import EpisodeStore
 from ringfence.errors import CheckpointError, UserError
 from ringfence.runs import Run, build_config
 from ringfence.types import PolicyStep
@@ -25,6 +26,8 @@ TINY = {
     "mpc": dict(steps=12),
     "bc": dict(steps=12, batch=32, width=16, depth=1),
     "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
+    "bc-best": dict(steps=12, batch=32, width=16, depth=1),
+    "bc-return": dict(steps=12, batch=32, width=16, depth=1, condition="advantage"),
     "ma-td3bc": dict(steps=12, batch=32, width=16, centralised_critic=True, delay=2, target_noise=0.2),
     "ma-td3bc-lag": dict(steps=12, batch=32, width=16),
     "omar": dict(steps=12, batch=32, width=16),
@@ -36,7 +39,9 @@ QUICK = {"episodes": 4, "steps": 2}
 
 def job_of(name):
     """What training of an algorithm is told: tiny settings, and a World that is fitted quickly where it reads one."""
-    return {"changes": TINY[name], "quiet": True} | ({"world": QUICK_WORLD} if algos.get(name).needs else {})
+    algorithm = algos.get(name)
+    reads_world = algorithm.needs(build_config(algorithm.Config, TINY[name], name)) is not None
+    return {"changes": TINY[name], "quiet": True} | ({"world": QUICK_WORLD} if reads_world else {})
 
 
 @pytest.fixture(scope="session")
@@ -577,3 +582,32 @@ def test_trained_config_round_trip(trained):
     job = evaluate.load_job(trained["icbf"])
     told = trained["icbf"].config["config"]
     assert {k: v for k, v in dataclasses.asdict(job.config).items()} == told
+
+
+def _asked_for(steps=400):
+    """Episodes of one step, in which a reward is the first entry of the action."""
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (steps, 1, 3, 2)).astype(np.float32)
+    reward = np.repeat(actions[..., 0].mean(-1)[..., None], 3, -1)
+    seen = rng.normal(size=(steps, 2, 3, 4)).astype(np.float32)
+    card = {"task": "asked", "action_low": -1.0, "action_high": 1.0, "episode_length": 1}
+    return EpisodeStore.from_episodes(seen, actions, reward, np.zeros((steps, 1)), card=card)
+
+
+def test_cloning_that_reads_returns_does_what_it_is_asked_for(tmp_path):
+    """An actor that is told a high return earns more than one that is told a low one, and so does cloning the best."""
+    store, earned = _asked_for(), {}
+    for name, changes in {
+        "high": {"target": 1.5},
+        "low": {"target": -1.5},
+        "best": {"best": 0.05},
+        "all": {"best": 1.0},
+    }.items():
+        algorithm = "bc-return" if "target" in changes else "bc-best"
+        changes |= {"view": "decentralized", "steps": 300, "width": 32}
+        run = training.train(algorithm, store, out=tmp_path / name, changes=changes, quiet=True)[0]
+        policy = evaluate.load(run)[1]
+        acted = policy.act(policy.start(64), jnp.asarray(store.observations[:64]), None, jax.random.key(0))[1].action
+        earned[name] = float(acted[..., 0].mean())
+    assert earned["high"] > 0.2 and earned["low"] < -0.2
+    assert earned["best"] > 0.2 and abs(earned["all"]) < 0.2

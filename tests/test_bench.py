@@ -1,6 +1,7 @@
 """The grid: cells are made once, survive whatever happens to the runner, and make one honest table."""
 
 import dataclasses
+import io
 import json
 import os
 import queue
@@ -8,6 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tarfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,7 +19,7 @@ import pytest
 
 from ringfence import evaluate, files, reference, tasks, training
 from ringfence.bench import cells as grid
-from ringfence.bench import cluster, local, make_grid, paper, rows, run_local, suites, write_csv
+from ringfence.bench import cluster, local, make_grid, pack, packed, paper, rows, run_local, suites, write_csv
 from ringfence.cli import _runs, main
 from ringfence.errors import UserError
 from ringfence.guards import GUARDS, GuardOptions
@@ -503,3 +505,51 @@ def test_the_table_of_the_paper_keeps_others_data_apart(made, tmp_path):
     assert len(text) == 2 + 13 and "[2]" in next(line for line in text if "spread-random" in line)
     lines = paper.write(table, tmp_path / "paper.csv").read_text().splitlines()
     assert len(lines) == 1 + 13 * 3
+
+
+def test_a_packed_folder_says_what_the_loose_one_said(made, tmp_path):
+    """Two archives stand for all files of the cells but checkpoints; the same contents give the same bytes."""
+    out = shutil.copytree(made.out, tmp_path / "there")
+    before, archives = rows(out), pack(out)
+    assert [a.name for a in archives] == list(packed.ARCHIVES)
+    first = [a.read_bytes() for a in archives]
+    assert [a.read_bytes() for a in pack(out)] == first
+    bare = tmp_path / "bare"
+    bare.mkdir()
+    for name in ("bench.json", *packed.ARCHIVES):
+        shutil.copyfile(out / name, bare / name)
+    assert rows(bare) == before
+    there = dataclasses.replace(made, out=bare)
+    assert there.count() == {"done": 4, "failed": 0, "to do": 0} and not there.references()
+    assert Run(made.cells[0].folder(bare)).metrics == Run(made.cells[0].folder(out)).metrics
+
+
+def test_unpacking_overwrites_nothing_and_brings_back_nothing(made, tmp_path):
+    out = shutil.copytree(made.out, tmp_path / "there")
+    pack(out)
+    kept, gone = (c.folder(out) for c in made.cells[:2])
+    Run(kept).add_result("mine", {"episodes": 1})
+    shutil.rmtree(gone)
+    packed.unpack(out)
+    assert "mine" in Run(kept).results and not gone.exists()
+    shutil.rmtree(out / "cells")  # all loose files: what is packed comes back
+    packed.unpack(out)
+    assert "mine" not in Run(kept).results and (gone / "results.json").exists()
+    Run(kept).add_result("mine", {"episodes": 1})
+    (out / packed.MARK).unlink()  # as if other archives had come: theirs and ours
+    packed.unpack(out)
+    assert {"mine", "default"} <= set(Run(kept).results)
+
+
+@pytest.mark.parametrize("name", ["../../outside/results.json", "cells/a/b/c/evil.sh", "/cells/a/b/c/results.json"])
+def test_an_archive_writes_cells_and_nothing_else(made, tmp_path, name):
+    out = shutil.copytree(made.out, tmp_path / "there")
+    with tarfile.open(out / "runs.tar.xz", "w:xz") as tar:
+        member = tarfile.TarInfo(name)
+        member.size = 2
+        tar.addfile(member, io.BytesIO(b"{}"))
+    with pytest.raises(UserError, match="which is no file of a cell"):
+        rows(out)
+    (out / "runs.tar.xz").write_bytes(b"no archive")
+    with pytest.raises(UserError, match="truncated or damaged"):
+        rows(out)

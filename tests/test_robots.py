@@ -16,6 +16,7 @@ import pytest
 
 import ringfence.envs.mujoco as simulator
 from ringfence import evaluate, features, hazards, tasks
+from ringfence.bench import unpack
 from ringfence.data import matd3, robots
 from ringfence.data.make import make
 from ringfence.data.matd3 import MATD3Config
@@ -219,7 +220,9 @@ def test_tasks_and_their_limits(name):
     assert earned == pytest.approx(task.published_return[0], rel=rel), "the levels of the public sets"
     assert task.hazard.limit == task.env.limit
     if task.protocol == "quantile":
-        measured = Path(__file__).parent.parent / "results" / "mujoco" / "reference" / name / "reference.json"
+        results = Path(__file__).parent.parent / "results" / "mujoco"
+        unpack(results)
+        measured = results / "reference" / name / "reference.json"
         card = json.loads(measured.read_text())["behaviour data"]["data"]  # of the full data set
         assert task.env.limit == round(card["speed_quantiles"]["0.6"], 3)
 

@@ -474,7 +474,7 @@ def bench(
         memory: GiB that a local process may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
-    from ringfence.bench import make_grid, paper
+    from ringfence.bench import make_grid, pack, paper
 
     only_tasks, only = sum(tasks, []), sum(algorithms, [])
     if steps is not None and out_dir is None:
@@ -492,7 +492,10 @@ def bench(
     complete, idle = True, True
     for grid in grids:
         idle = idle and not grid.groups()
-        counts = _run_grid(grid, engine, workers, threads, memory, address)
+        try:
+            counts = _run_grid(grid, engine, workers, threads, memory, address)
+        finally:
+            pack(grid.out)
         out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
         if counts["done"] and suite != "paper":
             bench_results(grid.out)

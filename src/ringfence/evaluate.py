@@ -334,7 +334,7 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     """(job, policy, step of the checkpoint); of agents who are alike, the policy of each."""
     run = Run.of(run)
     job = load_job(run, how.agents)
-    world = worlds.of_run(run) if job.algorithm.needs is not None else None
+    world = worlds.of_run(run) if job.reads_world else None
     told = {} if world is None else {"world": world}
 
     def blank():

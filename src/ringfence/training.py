@@ -50,6 +50,11 @@ class Job:
     world: dict | None = None  # settings of the World that training reads, if it reads one
     team: int = 1  # agents who play; more than the spec's one of those who are alike
 
+    @property
+    def reads_world(self) -> bool:
+        """Whether training reads a World."""
+        return self.algorithm.needs(self.config) is not None
+
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
         return {
@@ -92,9 +97,9 @@ def make_job(
     a.check(config, hazard)
     if store is not None and reads != "nothing" and not store.costs.any():
         _refuse_blank_costs(a.name, task, store, reads)
-    told = None
-    if a.needs is not None and store is not None:
-        told = dataclasses.asdict(worlds.settings_for(store, task, **{**a.needs(config), **(world or {})}))
+    told, wanted = None, a.needs(config)
+    if wanted is not None and store is not None:
+        told = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
     elif world:
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
     team = spec.n_agents if store is None else store.card.get("team", store.n_agents)

@@ -127,7 +127,8 @@ class Algorithm:
     prepare: Callable[..., Any] | None = (
         None  # (store, config, feature_map, world) -> WindowData, if not all of the store
     )
-    needs: Callable[[Any], dict[str, Any]] | None = None  # config -> settings of the World that training reads, if any
+    # config -> settings of the World that training reads, if it reads one
+    needs: Callable[[Any], dict[str, Any] | None] = lambda config: None
     of_world: Callable[[Any, Any], dict[str, PyTree]] | None = None  # (world, config) -> state["world"]
     revision: int = 1  # raised when the same settings come to train another policy; config.json tells it
 

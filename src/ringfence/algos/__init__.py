@@ -7,11 +7,13 @@ from ringfence.algos.fisor import FISOR
 from ringfence.algos.icbf import ICBF, MADIFF
 from ringfence.algos.mpc import MPC
 from ringfence.algos.omar import MA_CQL, OMAR
+from ringfence.algos.returns import BC_BEST, BC_RETURN
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
 from ringfence.errors import unknown
 from ringfence.types import Algorithm
 
-ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, BC, BC_SAFE, MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)}
+_CLONING, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, *_CLONING, *_CRITICS)}
 
 
 def get(name: str) -> Algorithm:

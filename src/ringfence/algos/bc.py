@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -14,9 +15,10 @@ from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
 from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
+from ringfence.normalise import Normaliser
 from ringfence.optim import Optimiser, average, fresh
 from ringfence.policies import Direct
-from ringfence.types import Algorithm, Batch, Key, Metrics, PyTree, Spec
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.windows import WindowData
 
 
@@ -47,10 +49,15 @@ def init(
     hazard: BoundHazard,
 ) -> PyTree:
     """Parameters, their averages, optimiser state, the normaliser; without data, zeros stand for its statistics."""
+    return start(key, spec, config, data, spec.feature_dim)
+
+
+def start(key: Key, spec: Spec, config: Config, data: WindowData | None, inputs: int) -> PyTree:
+    """The state of a run whose actors read `inputs` entries."""
     ka, kw = jax.random.split(key)
 
     def networks() -> dict:
-        sizes = (spec.feature_dim, *[config.width] * config.depth, spec.action_dim)
+        sizes = (inputs, *[config.width] * config.depth, spec.action_dim)
         params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
         return fresh(_optimiser(config), params, "ema")
 
@@ -77,10 +84,15 @@ def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMa
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
+    return clone(config, lambda normaliser, batch: normaliser.state(batch.features[:, 0]))
+
+
+def clone(config: Config, see: Callable[[Normaliser, Batch], Array]):
+    """update(state, batch, key) of actors that read `see(normaliser, batch)` (B, N, inputs)."""
     opt = _optimiser(config)
 
     def loss(params: PyTree, frozen: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
-        action = ac.act(params["actor"], frozen["normaliser"].state(batch.features[:, 0]))
+        action = ac.act(params["actor"], see(frozen["normaliser"], batch))
         value = ((action - batch.actions[:, 0]) ** 2).sum(-1).mean()
         return value, {"loss/cloning": value}
 
@@ -109,7 +121,13 @@ BC = Algorithm(
     make_update,
     ac.no_diagnosis,
     make_policy,
-    {"default": {}, "mujoco": {"steps": 8_000}},
+    # `joint`: with all that a planner sees
+    {
+        "default": {},
+        "mujoco": {"steps": 8_000},
+        "joint": {"view": "pruned"},
+        "mujoco-joint": {"view": "pruned", "steps": 8_000},
+    },
     reads=reads,
     prepare=prepare,
 )

@@ -117,9 +117,11 @@ _MUJOCO = {
 }
 PRESETS: dict[str, dict] = {
     "split": {},
+    "split-0": {"barrier_weight": 0.0},  # the twin of `split` that follows no barrier
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "mujoco": _MUJOCO,
     "paper": _PAPER,
+    **{f"paper-{weight}": _PAPER | {"barrier_weight": float(weight)} for weight in (1, 3, 10)},
     "mujoco-paper": _MUJOCO | _PAPER,
     # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
     "madiff-unet": {

@@ -2,7 +2,8 @@
 
 from ringfence.bench.cells import Cell, Grid, make_grid
 from ringfence.bench.local import run_local
+from ringfence.bench.packed import pack, unpack
 from ringfence.bench.suites import SUITES, Entry, Suite
 from ringfence.bench.table import rows, write_csv
 
-__all__ = ["SUITES", "Cell", "Entry", "Grid", "Suite", "make_grid", "rows", "run_local", "write_csv"]
+__all__ = ["SUITES", "Cell", "Entry", "Grid", "Suite", "make_grid", "pack", "rows", "run_local", "unpack", "write_csv"]

@@ -3,6 +3,7 @@
 DIR/bench.json                                      suite, protocol and the number of episodes
 DIR/reference/<task>/reference.json                 do-nothing, random actions, the data and its safe part
 DIR/cells/<task>/<algorithm>[-<preset>]/seed-<k>-<id>/   a run folder (runs.py), and status.json
+DIR/{runs,curves}.tar.xz                            the last two without checkpoints and recordings (packed.py)
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
+from ringfence.bench.packed import unpack
 from ringfence.bench.suites import EVALUATIONS, SUITES
 from ringfence.data.make import make
 from ringfence.data.origin import other_data
@@ -170,6 +172,7 @@ class Grid:
                 raise UserError(f"'{self.out}' holds something else; give --out an empty or a results folder.")
             return
         there = read_about(self.out)
+        unpack(self.out)
         wrong = [k for k in mine if there.get(k) != mine[k]]
         if wrong:
             raise UserError(
@@ -196,6 +199,7 @@ def statuses(out: str | Path) -> list[dict]:
     """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way, and
     one that failed early has nothing else."""
     read_about(Path(out))
+    unpack(out)
     found = []
     begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):

@@ -13,7 +13,7 @@ EVALUATIONS: dict[str, dict] = {
     "steady": {"planner": "steady"},
     **{
         f"{guard}-{danger}": {"guard": guard, "danger": danger}
-        for guard in ("shield", "adapt", "full")
+        for guard in ("select", "shield", "adapt", "refine", "full")
         for danger in ("learned", "formula")
     },
     **{
@@ -78,6 +78,9 @@ _SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium
 # Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
 _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
 
+# How a proposal is played for its own sake, and under the cheapest guard.
+_ALONE, _ADAPTED = ("plain", "shield-learned"), ("plain", "adapt-learned")
+
 SUITES = {
     "simple_spread": Suite(
         _SPREAD,
@@ -117,7 +120,18 @@ SUITES = {
         (
             Entry("bc", evaluations=("plain", "shield-learned", "shield-formula", "full-learned")),
             Entry("mpc", evaluations=("full-learned",)),
-            Entry("icbf", "split", ("plain", "shield-learned", "full-learned", "full-formula")),
+            Entry("icbf", "split", ("plain", "select-learned", "shield-learned", "full-learned")),
+            Entry("icbf", "split-0", ("plain", "select-learned", "shield-learned")),
+            Entry("madiff", "default", _ALONE),
+            Entry("bc", "joint", _ALONE),
+            Entry("bc-best", evaluations=_ALONE),
+            Entry("bc-return", "default", _ALONE),
+            Entry("bc-return", "advantage", _ALONE),
+            Entry("bc-safe", evaluations=_ALONE),
+            Entry("ma-td3bc", evaluations=_ALONE),
+            Entry("ma-td3bc-lag", evaluations=_ALONE),
+            Entry("omar", evaluations=_ALONE),
+            *(Entry("icbf", f"paper{weight}", _ALONE) for weight in ("", "-1", "-3", "-10")),
         ),
     ),
     "guards-mujoco": Suite(
@@ -125,6 +139,14 @@ SUITES = {
         (
             Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
             Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
+            Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
+            Entry("bc-best", evaluations=_ADAPTED),
+            Entry("bc-return", evaluations=_ADAPTED),
+            Entry("bc-safe", evaluations=_ADAPTED),
+            Entry("ma-td3bc", evaluations=_ADAPTED),
+            Entry("ma-td3bc-lag", evaluations=_ADAPTED),
+            Entry("omar", evaluations=_ADAPTED),
+            Entry("mpc", evaluations=("full-learned",)),
         ),
         episodes=20,
     ),

@@ -10,6 +10,7 @@ import io
 from pathlib import Path
 
 from ringfence.bench.cells import read_about
+from ringfence.bench.packed import unpack
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
@@ -27,6 +28,7 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
     """Every evaluation of every cell, and the reference rows; mixed protocols are refused, naming the files."""
     out = Path(out)
     about = read_about(out)
+    unpack(out)
     found, constants, seen = [], {}, {}
     for file in sorted((out / "reference").glob("*/reference.json")):
         for name, r in read_json(file, "is damaged; delete it").items():

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ringfence import tasks
 from ringfence.bench import suites
+from ringfence.bench.packed import unpack
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
@@ -117,6 +118,7 @@ def read(folder: str | Path) -> Board:
     """The results folder as rows. `UserError` names the files that disagree where numbers must not be mixed."""
     folder = Path(folder)
     told = _declared(folder)
+    unpack(folder)
     cells = [(path, *_place_of(path)) for path in sorted((folder / "cells").glob("*/*/*/")) if CELL.match(path.name)]
     finished, missing, partial = [], [], []
     for path, task, job, seed in cells:

@@ -275,7 +275,7 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
     job, policy = evaluate.load(run)
     networks, names = getattr(policy, "networks", {}), job.spec.feature_names
     n, radius = job.spec.n_agents, getattr(job.hazard.hazard, "radius", None)
-    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.algorithm.needs else None
+    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
     if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
         return None
     agent, other = 0, 1

@@ -1,0 +1,127 @@
+"""The cheapest rivals of a planner that is told what return to reach: cloning the best episodes (`bc-best`), and an
+actor that reads the return it is to reach (`bc-return`; Emmons et al. 2022, "RvS", whose outcomes are ours: scores.py).
+
+`bc-return` sees what the planner sees and is told what the planner is told, at the same discount and target: what
+differs is that it answers with one action and no plan.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence import features, scores
+from ringfence.algos import actor_critic as ac
+from ringfence.algos import bc
+from ringfence.data.store import EpisodeStore
+from ringfence.hazards import BoundHazard
+from ringfence.policies import Direct
+from ringfence.types import Algorithm, Array, Key, PyTree, Spec
+from ringfence.windows import WindowData
+from ringfence.world import World
+
+
+@dataclass(frozen=True)
+class BestConfig(bc.Config):
+    """Behaviour cloning on the share `best` of the episodes that earned most (10 % BC of Chen et al. 2021)."""
+
+    best: float = 0.1  # share of the episodes, by the team's return; at least one
+
+
+def best_of(store: EpisodeStore, config: BestConfig, feature_map: features.FeatureMap, world: None) -> WindowData:
+    """The episodes that earned most."""
+    earned = store.returns
+    chosen = np.zeros(len(earned), bool)
+    chosen[np.argsort(-earned, kind="stable")[: max(1, round(config.best * len(earned)))]] = True
+    return WindowData(store.select(chosen), feature_map)
+
+
+@dataclass(frozen=True)
+class Config(bc.Config):
+    """L = E ‖a_i − π_i(s̃_i, y)‖² with y the score of what followed; played with y = `target`."""
+
+    view: features.View = "pruned"  # the planner's
+    condition: scores.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
+    discount: float = 0.9  # of what y scores
+    ahead: int = 8  # rows, of the advantage
+    target: float = 1.5  # y when it acts, as a normal score: the best 7 %
+
+
+class Asking(eqx.Module):
+    """An actor with y as one more input."""
+
+    net: Any
+    target: float = eqx.field(static=True)
+
+    def __call__(self, x: Array) -> Array:
+        return self.net(with_score(x, self.target))
+
+
+def with_score(x: Array, y: Array | float) -> Array:
+    """(..., N, D) and y (...) -> (..., N, D + 1)."""
+    y = jnp.broadcast_to(jnp.asarray(y, x.dtype)[..., None, None], (*x.shape[:-1], 1))
+    return jnp.concatenate([x, y], -1)
+
+
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+    world: World | None = None,
+) -> PyTree:
+    """As `bc`, with actors that read one entry more."""
+    return bc.start(key, spec, config, data, spec.feature_dim + 1)
+
+
+def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None) -> WindowData:
+    """Windows with their scores."""
+    seen, values = None, None
+    if config.condition == "advantage":
+        seen, values = jnp.asarray(feature_map(store.observations, store.state), jnp.float32), world.values
+    y = scores.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
+    return WindowData(store, feature_map, y)
+
+
+def needs(config: Config) -> dict | None:
+    """Values alone score an advantage."""
+    return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
+
+
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
+    return bc.clone(config, lambda normaliser, batch: with_score(normaliser.state(batch.features[:, 0]), batch.score))
+
+
+def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options=None) -> Direct:
+    actor = Asking(state["ema"]["actor"], config.target)
+    return Direct(actor, state["frozen"]["normaliser"], spec, feature_map)
+
+
+BC_BEST = replace(
+    bc.BC,
+    name="bc-best",
+    Config=BestConfig,
+    prepare=best_of,
+    reads=lambda config: "nothing",
+    presets={"default": {}, "mujoco": {"steps": 20_000}},
+)
+BC_RETURN = Algorithm(
+    "bc-return",
+    Config,
+    bc.check,
+    init,
+    make_update,
+    ac.no_diagnosis,
+    make_policy,
+    {"default": {}, "mujoco": {"steps": 8_000}, "advantage": {"condition": "advantage"}},
+    reads=lambda config: "nothing",
+    prepare=prepare,
+    needs=needs,
+    of_world=lambda world, config: {},
+)

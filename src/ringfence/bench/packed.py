@@ -1,0 +1,87 @@
+"""A results folder as a repository keeps it: two archives in place of thousands of small files.
+
+DIR/runs.tar.xz      config, environment, status and results of every cell, and the reference rows
+DIR/curves.tar.xz    the training metrics of every cell
+
+What reads a results folder calls `unpack` first; who has made cells calls `pack`. The loose files (`cells/`,
+`reference/`) stand beside the archives, with checkpoints where the cells were made here, and may be deleted.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+from pathlib import Path, PurePosixPath
+
+from ringfence.errors import UserError
+from ringfence.files import whole
+from ringfence.runs import read_json, write_json
+
+PLACES = ("cells", "reference")
+ARCHIVES = {
+    "runs.tar.xz": ("config.json", "env.json", "status.json", "results.json", "reference.json"),
+    "curves.tar.xz": ("metrics.jsonl",),
+}
+MARK = Path("cells", ".unpacked.json")  # digests of the archives whose files are loose
+
+
+def unpack(out: str | Path) -> None:
+    """Write what the archives of `out` hold and its loose files lack; what was made here since then stays.
+
+    An archive is unpacked once: a cell that is deleted afterwards stays deleted, and the next `pack` forgets it.
+    """
+    out = Path(out)
+    archives = [out / name for name in ARCHIVES if (out / name).exists()]
+    if not archives:
+        return
+    digests = {a.name: hashlib.sha256(a.read_bytes()).hexdigest() for a in archives}
+    if (out / MARK).exists() and read_json(out / MARK, "is damaged; delete that file") == digests:
+        return
+    for archive in archives:
+        try:
+            with tarfile.open(archive) as tar:
+                for member in tar:
+                    _place(out, archive, member, tar)
+        except (tarfile.TarError, EOFError, OSError) as error:
+            if isinstance(error, PermissionError):
+                raise UserError(
+                    f"'{out}' cannot be written, so its archives cannot be unpacked there; copy it."
+                ) from error
+            raise UserError(f"'{archive}' is truncated or damaged ({error}); restore that file.") from error
+    write_json(out / MARK, digests)
+
+
+def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFile) -> None:
+    """One file of an archive, where there is none yet; results join those that are there."""
+    parts = PurePosixPath(member.name).parts
+    known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
+    if not (known and member.isfile()):
+        raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
+    file, content = out.joinpath(*parts), tar.extractfile(member).read()
+    if file.exists():
+        if parts[-1] != "results.json":
+            return
+        content = json.dumps({**json.loads(content), **read_json(file, "is damaged; delete it")}, indent=1).encode()
+    with whole(file) as temporary:
+        temporary.write_bytes(content)
+
+
+def pack(out: str | Path) -> list[Path]:
+    """Write the archives of what is loose in `out`: the same bytes for the same contents."""
+    out = Path(out)
+    unpack(out)
+    found, written = [f for p in PLACES for f in sorted((out / p).rglob("*.json*"))], []
+    for name, kinds in ARCHIVES.items():
+        chosen = [f for f in found if f.name in kinds and not f.parent.name.startswith(".")]
+        if not chosen:
+            continue
+        with whole(out / name) as temporary, tarfile.open(temporary, "w:xz", format=tarfile.PAX_FORMAT) as tar:
+            for file in chosen:
+                member, content = tarfile.TarInfo(str(file.relative_to(out))), file.read_bytes()
+                member.size = len(content)
+                tar.addfile(member, io.BytesIO(content))
+        written.append(out / name)
+    write_json(out / MARK, {a.name: hashlib.sha256(a.read_bytes()).hexdigest() for a in written})
+    return written
