@@ -178,9 +178,9 @@ def test_seeds_are_pooled(runs):
     assert high - low > abs(returns[0].mean() - returns[1].mean())  # two seeds know little of a third
     assert plain.cost == pytest.approx(costs.mean()) and plain.avoidable == 0.0
     assert plain.violations == int(costs.sum())
-    assert plain.violation_upper == stats.upper_bound(plain.violations, 40)
+    assert plain.violation_upper == stats.upper_bound(int((costs > 0).any(0).sum()), 20)  # resets, not episodes
     assert plain.returns_norm == pytest.approx((returns.mean() - 159.8) / 357.0)
-    assert chosen.violation_upper == pytest.approx(1 - 0.05 ** (1 / 40)) and chosen.plan_ms == 7.25
+    assert chosen.violation_upper == pytest.approx(1 - 0.05 ** (1 / 20)) and chosen.plan_ms == 7.25
     assert chosen.safe and not bc.safe
     assert [r.name for r in section.references] == ["behaviour data", "do-nothing"]
     assert [r.variant for r in section.tables["validation"]] == ["split"]
@@ -188,7 +188,7 @@ def test_seeds_are_pooled(runs):
 
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
-    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes \(2 seeds\), at most 7\.2 %"
+    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
     assert re.search(f'class="headline">{said}', text)
 
 

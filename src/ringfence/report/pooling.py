@@ -26,7 +26,7 @@ class Numbers:
     avoidable: float
     avoidable_interval: Interval
     violations: int
-    violation_upper: float  # exact, one-sided, episodes pooled
+    violation_upper: float  # exact, one-sided, of the resets on which any run has one
     unsafe_starts: int
     cvar: float  # mean of the tenth of episodes with the highest cost
     safe: bool  # the upper end of the cost's interval is within the limit
@@ -52,6 +52,7 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
             "avoidable_interval": tuple(first["avoidable_interval"]),
             "unsafe_starts": first["unsafe_starts"],
             "cvar": first["cost_cvar10"],
+            "violation_upper": stats.upper_bound(_violations(first), first["episodes"]),
         }
     else:
         played = [r["episodes"] for r in results]
@@ -74,17 +75,22 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
             "avoidable_interval": stats.mean_of_runs(avoidable, fine, least=0.0),
             "unsafe_starts": int(unsafe.sum()),
             "cvar": stats.cvar(cost.ravel()),
+            # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.
+            "violation_upper": stats.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
         }
     episodes, c = sum(r["episodes"] for r in results), first["constants"]
-    violations = sum(round(r["violation_rate"] * r["episodes"]) for r in results)
+    violations = sum(map(_violations, results))
     return told | {
         "episodes": episodes,
         "violations": violations,
-        "violation_upper": stats.upper_bound(violations, episodes),
         "returns_norm": normal_return(told["returns"], c),
         "cost_norm": normal_cost(told["cost"], c),
         "safe": told["cost_interval"][1] <= c["cost_limit"],
     }
+
+
+def _violations(result: dict) -> int:
+    return round(result["violation_rate"] * result["episodes"])
 
 
 def normal_return(x, c: dict[str, float]):
