@@ -16,7 +16,7 @@ import numpy as np
 
 from ringfence import algos, tasks
 from ringfence.bench import paper, unpack
-from ringfence.report import board, export
+from ringfence.report import board, export, standings
 from ringfence.runs import build_config
 
 matplotlib.use("Agg")
@@ -72,8 +72,8 @@ ROBOT_ROWS = (
     ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
 )
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
-# Columns of the README's table.
-IN_README = (
+# Columns of the short table.
+SHORT = (
     ("behaviour data", "reference", "data"),
     ("data within the limit", "reference", "data within the limit"),
     ("bc", "mujoco", "BC"),
@@ -92,8 +92,9 @@ PUBLISHED = {
 
 
 def main() -> None:
+    put("README.md", "front", front())
     groups = grouped("simple_spread")
-    put("README.md", "table", spread(groups))
+    put("docs/tables.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
     put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv", "simple_spread-medium"))
     put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
@@ -101,7 +102,7 @@ def main() -> None:
     measured = grouped("mujoco")
     for protocol, ending in (("native", ""), ("quantile", "-quantile")):
         put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
-        put("README.md", f"robots-{protocol}", robots_short(measured, ending))
+        put("docs/tables.md", f"robots-{protocol}", robots_short(measured, ending))
     robots_searched = searched(RESULTS / "tuning" / "robots.csv", "halfcheetah_2x3-medium-quantile")
     put("docs/benchmark.md", "robots-search", robots_searched)
     put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
@@ -117,6 +118,93 @@ def main() -> None:
     put("docs/performance.md", "performance", "\n".join(lines))
 
 
+# The README's rows: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
+FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
+    "cloning": (("simple_spread", "bc", ""), ("mujoco", "bc", ""), ("crossing", "bc", "default")),
+    "MA-TD3+BC with a Lagrange multiplier": (
+        ("simple_spread", "ma-td3bc-lag", ""),
+        ("mujoco", "ma-td3bc-lag", ""),
+        None,
+    ),
+    "our MADIFF": (("simple_spread", "madiff", "default"), ("mujoco", "madiff", ""), None),
+    "ICBF-Diffuser, losses as printed": (("simple_spread", "icbf", "paper"), ("mujoco", "icbf", "mujoco-paper"), None),
+    "cloning + guard, *formula*": (
+        ("guards", "bc", "+shield-formula"),
+        ("guards-mujoco", "bc", "+adapt-formula"),
+        None,
+    ),
+    "**cloning + guard**": (
+        ("guards", "bc", "+shield-learned"),
+        ("guards-mujoco", "bc", "+adapt-learned"),
+        ("crossing", "bc", "default+shield-learned"),
+    ),
+    "**cloning + guard that also climbs values** (`full`)": (
+        ("guards", "bc", "+full-learned"),
+        ("guards-mujoco", "bc", "+full-learned"),
+        ("crossing-guards", "bc", "default+full-learned"),
+    ),
+}
+
+
+def front() -> str:
+    """One line per method: all tiers, all robots and Crossing in a cell each."""
+    data = {s: grouped(s) for s in ("simple_spread", "guards", "crossing", "crossing-guards")}
+    robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
+    logs = [data["simple_spread"][f"simple_spread-{t}", "behaviour data", "reference"][0] for t in TIERS]
+    logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
+    lines = ["| who acts | Simple Spread | robots | Crossing |", "|---|---|---|---|"]
+    lines.append(f"| *the logs* | {_spread_cell(logs)} | | {_crossing_cell(logged)} |")
+    for words, places in FRONT.items():
+        cells = []
+        for place, kind in zip(places, ("spread", "robots", "crossing")):
+            if place is None:
+                cells.append("–")
+                continue
+            suite, algorithm, variant = place
+            if kind == "robots":
+                cells.append(_robots_cell(robots[suite], algorithm, variant))
+            elif kind == "spread":
+                found = [r for tier in TIERS for r in ending_in(data[suite], tier, algorithm, variant)]
+                cells.append(_spread_cell(found))
+            else:
+                cells.append(_crossing_cell(data[suite].get(("crossing-hasty", algorithm, variant), [])))
+        lines.append(f"| {words} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def ending_in(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:
+    """Rows of a variant, or of one whose preset may be named after the tier."""
+    if not variant.startswith("+"):
+        return of(groups, tier, algorithm, variant)
+    task = f"simple_spread-{tier}"
+    return next((r for (t, a, v), r in groups.items() if (t, a) == (task, algorithm) and v.endswith(variant)), [])
+
+
+def _spread_cell(rows: list[dict]) -> str:
+    seeds = len({r["seed"] for r in rows if r["variant"] != "reference"})
+    return f"{mean(rows, 'return_norm'):.2f} / {mean(rows, 'avoidable_cost'):.3f}" + _seeds(seeds)
+
+
+def _robots_cell(shown: dict, algorithm: str, variant: str) -> str:
+    wanted = f"default{variant}" if variant.startswith("+") else variant or "default"
+    found = [
+        r for rows in shown.values() for r in rows if (r.method.algorithm, r.method.variant) == (algorithm, wanted)
+    ]
+    kept, seeds = sum(r.safe for r in found), max(len(r.seeds) for r in found)
+    return f"{kept} of {len(found)}, {np.mean([r.returns_norm for r in found]):.2f}" + _seeds(seeds)
+
+
+def _crossing_cell(rows: list[dict]) -> str:
+    if not rows:
+        return "–"
+    seeds = len({r["seed"] for r in rows if r["variant"] != "reference"})
+    return f"{mean(rows, 'return_mean'):.2f} m / {100 * mean(rows, 'violation_rate'):.3g} %" + _seeds(seeds)
+
+
+def _seeds(count: int) -> str:
+    return f" [{count}]" if 0 < count < SEEDS else ""
+
+
 def grouped(suite: str) -> dict:
     """Rows of a suite's table by (task, algorithm, variant)."""
     groups = defaultdict(list)
@@ -130,14 +218,14 @@ def grouped(suite: str) -> dict:
 def robots_short(groups: dict, ending: str) -> str:
     """One line per task, one column per method: return / cost, and how many seeds they are of where that is not the
     usual number."""
-    lines = ["| | " + " | ".join(label for *_, label in IN_README) + " |", "|---|" + "---|" * len(IN_README)]
+    lines = ["| | " + " | ".join(label for *_, label in SHORT) + " |", "|---|" + "---|" * len(SHORT)]
     names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
-    found = {(n, a, v): groups.get((n, a, v), []) for n in names for a, v, _ in IN_README}
+    found = {(n, a, v): groups.get((n, a, v), []) for n in names for a, v, _ in SHORT}
     counts = [len(rows) for (_, _, variant), rows in found.items() if rows and variant != "reference"]
     usual = max(set(counts), key=counts.count)
     for name in names:
         cells = []
-        for algorithm, variant, _ in IN_README:
+        for algorithm, variant, _ in SHORT:
             rows = found[name, algorithm, variant]
             numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else absent(variant)
             unusual = rows and variant != "reference" and len(rows) != usual

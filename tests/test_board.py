@@ -571,7 +571,8 @@ def test_latex_by_hand(folder):
     text = board_latex(read(folder))
     assert text.count(r"\begin{tabular}") == text.count(r"\end{tabular}") == text.count(r"\bottomrule") == 2
     assert (
-        r"BC & $310.0 \pm 14.1$ & $0.42 \pm 0.04$ & $2.50 \pm 0.71^{\dagger}$ & $2.286$ & $75.0\;(100.0)$ & 2 \\" in text
+        r"BC & $310.0 \pm 14.1$ & $0.42 \pm 0.04$ & $2.50 \pm 0.71^{\dagger}$ & $2.286$ & $75.0\;(100.0)$ & 2 \\"
+        in text
     )
     assert r"\textbf{ICBF-Diffuser split+guarded} & $\mathbf{410.0}$" in text and text.count(r"\textbf") == 2
     assert r"my\_method & $1.0$" in text

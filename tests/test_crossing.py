@@ -172,8 +172,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path):
     pilot.reset()
     np.testing.assert_allclose(pilot.act(seen[order]), acted[order], atol=1e-6)
     mine = guard(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
-    action, info = mine.act(seen)
-    assert action.shape == (5, 2) and info["infeasible"].shape == ()
+    assert mine.act(seen).shape == (5, 2) and mine.info["infeasible"].shape == ()
     with pytest.raises(UserError, match="no sight='all'"):
         evaluate(run, episodes=2, guard="shield", world=world, sight="all")
     with pytest.raises(UserError, match="say with agents="):

@@ -183,8 +183,7 @@ def test_any_callable_is_guarded(small_world, small_store):
     """A controller of NumPy arrays; what it may not return is said in a sentence."""
     seen, state = small_store.observations[0], small_store.state[0]
     pilot = ringfence.guard(lambda observations, state: np.zeros((3, 2)), small_world)
-    action, info = pilot.act(seen, state)
-    assert action.shape == (3, 2) and {"infeasible", "strange"} <= set(info)
+    assert pilot.act(seen, state).shape == (3, 2) and {"infeasible", "strange"} <= set(pilot.info)
     pilot.reset()
     pilot.act(seen, state, cost=1.0)
     for wrong, said in (

@@ -525,6 +525,7 @@ MADIFF = dataclasses.replace(
     name="madiff",
     presets={
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
+        "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "steps": 6000},
         "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },

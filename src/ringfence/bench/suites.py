@@ -123,6 +123,8 @@ SUITES = {
             Entry("icbf", "split", ("plain", "select-learned", "shield-learned", "full-learned")),
             Entry("icbf", "split-0", ("plain", "select-learned", "shield-learned")),
             Entry("madiff", "default", _ALONE),
+            Entry("madiff", "long", _ALONE),
+            Entry("icbf", "long", _ALONE),
             Entry("bc", "joint", _ALONE),
             Entry("bc-best", evaluations=_ALONE),
             Entry("bc-return", "default", _ALONE),

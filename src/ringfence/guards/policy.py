@@ -118,21 +118,12 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
 
 
 class Callback:
-    """Anybody's function (observations, state) -> actions under guard, outside JAX: NumPy in, NumPy out.
+    """Anybody's function (observations, state) -> actions under guard, as a policy (types.Policy) outside JAX: it is
+    asked with the whole batch, NumPy in, NumPy out."""
 
-    `act` takes one environment, (N, O) and (S,) or None, and calls the function with the same; `reset` begins an
-    episode. As a policy of the library (`start`, `act` of four arguments) it is played in simulators that step outside
-    JAX.
-    """
-
-    def __init__(self, function: Callable, guarded: Guarded, seed: int = 0, agents: int = 1):
+    def __init__(self, function: Callable, guarded: Guarded, agents: int):
         self.function, self.guarded, self.agents = function, guarded, agents
-        self._key = jax.random.key(seed)
         self._decide = jax.jit(lambda g, memory, present, action, key: g.decided(memory, present, action, key))
-        self.reset()
-
-    def reset(self) -> None:
-        self._memory = self.start(1)
 
     @property
     def _team(self) -> Guarded | Each:
@@ -145,22 +136,12 @@ class Callback:
     def hear(self, memory: PyTree, cost) -> PyTree:
         return self._team.hear(memory, jnp.asarray(cost, jnp.float32))
 
-    def act(self, *given, cost: float | None = None):
-        """(observations, state=None) -> (action (N, A), info), or a policy's (memory, observations, state, key)."""
-        if len(given) == 4:
-            memory, observations, state, key = given
-            wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
-            return self._decided(memory, observations, state, wanted, key)
-        observations, state = given if len(given) == 2 else (given[0], None)
-        wanted = self.function(observations, state)
-        self._key, key = jax.random.split(self._key)
-        if cost is not None:
-            self._memory = self.hear(self._memory, np.full(1, cost))
-        shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
-        self._memory, step = self._decided(self._memory, *shown, np.asarray(wanted)[None], key)
-        return np.asarray(step.action[0]), {k: np.asarray(v[0]) for k, v in step.info.items()}
+    def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
+        wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
+        return self.decided(memory, observations, state, wanted, key)
 
-    def _decided(self, memory, observations, state, wanted, key):
+    def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
+        """What becomes of the function's actions (B, N, A)."""
         world = self.guarded.guard.world
         spec, batch = world.spec, len(observations)
         try:
@@ -180,6 +161,39 @@ class Callback:
         plan = held(apart(action) if spec.alike else action, self.guarded.guard.options.rows)
         memory, step = self._decide(self.guarded, memory, present, plan, key)
         return memory, together(step, (batch, self.agents)) if spec.alike else step
+
+
+class Pilot:
+    """Anybody's function (observations, state) -> actions under guard at run time: one environment, NumPy in, NumPy
+    out, as `Controller`.
+
+    pilot.reset()                                  # at the start of every episode
+    action = pilot.act(observations, state)        # (N, O), (S,) or None -> (N, A)
+
+    `info` says of the last action what the guard knows of it. `policy` is what simulators of whole batches play.
+    """
+
+    def __init__(self, policy: Callback, seed: int = 0):
+        self.policy = policy
+        self._key = jax.random.key(seed)
+        self.info: dict[str, np.ndarray] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self._memory = self.policy.start(1)
+
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: float | None = None) -> np.ndarray:
+        """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, which an
+        adapting guard follows."""
+        wanted = self.policy.function(observations, state)
+        self._key, key = jax.random.split(self._key)
+        if cost is not None:
+            self._memory = self.policy.hear(self._memory, np.full(1, cost))
+        shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
+        self._memory, step = self.policy.decided(self._memory, *shown, np.asarray(wanted)[None], key)
+        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
+        return np.asarray(step.action[0])
 
 
 class Nothing(eqx.Module):
@@ -235,7 +249,7 @@ def guard(
 
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Callback`, for a team of `agents` where the World is of agents who are alike. `guard` is a name in
+    which gives a `Pilot`, for a team of `agents` where the World is of agents who are alike. `guard` is a name in
     GUARDS, `danger` formula, learned or both, `options` fields of GuardOptions; `hazard` is the formula's definition,
     where one is to be used.
     """
@@ -254,4 +268,5 @@ def guard(
         raise UserError("The World is of agents who are alike; say with agents= how many of them there are.")
     if agents not in (None, spec.n_agents) and not spec.alike:
         raise UserError(f"The World is of {spec.n_agents} agents who are not alike; leave agents={agents} out.")
-    return Callback(policy, build(Nothing(), world, hazard, guard, danger, **options), seed, agents or spec.n_agents)
+    guarded = build(Nothing(), world, hazard, guard, danger, **options)
+    return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)

@@ -20,6 +20,8 @@ SPLITS = ("test", "validation")
 NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
+    "bc-best": "BC on the best tenth",
+    "bc-return": "BC told the return",
     "ma-td3bc": "MA-TD3+BC",
     "ma-td3bc-lag": "MA-TD3+BC, Lagrange",
     "fisor": "FISOR",
@@ -27,6 +29,7 @@ NAMES = {
     "omar": "OMAR",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
+    "mpc": "No prior",
 }
 ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
 NEEDED = ("episodes", "return_mean", "cost_mean", "avoidable_cost", "violation_rate", "constants", "protocol", "task")

@@ -1,0 +1,169 @@
+"""Writes docs/attribution.md's tables between their markers, from results/ alone: proposals crossed with guards, and
+every question beside its twin.
+
+python benchmarks/attribution.py
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from evidence import Difference, Row, difference, family, mean, of, tasks_of
+from readme import put
+
+# Proposals: their words, what they see and are told, and their row without a guard.
+PROPOSALS: dict[str, tuple[str, Row]] = {
+    "logs": ("", ("behaviour data", "reference")),
+    "do nothing": ("", ("do-nothing", "reference")),
+    "cloning": ("own", ("bc", "default")),
+    "cloning, all in sight": ("all", ("bc", "joint")),
+    "cloning, best tenth": ("own", ("bc-best", "default")),
+    "cloning, episodes without cost": ("own", ("bc-safe", "default")),
+    "cloning, told the return": ("all", ("bc-return", "default")),
+    "cloning, told the advantage": ("all", ("bc-return", "advantage")),
+    "MA-TD3+BC": ("own", ("ma-td3bc", "default")),
+    "MA-TD3+BC, Lagrange": ("own", ("ma-td3bc-lag", "default")),
+    "OMAR": ("own", ("omar", "default")),
+    "our MADIFF (return)": ("all", ("madiff", "default")),
+    "our MADIFF, four times the updates": ("all", ("madiff", "long")),
+    "ICBF as printed, λ = 0.1": ("all", ("icbf", "paper")),
+    "ICBF as printed, λ = 1": ("all", ("icbf", "paper-1")),
+    "ICBF as printed, λ = 3": ("all", ("icbf", "paper-3")),
+    "ICBF as printed, λ = 10": ("all", ("icbf", "paper-10")),
+    "ICBF, ours (advantage, λ = 3)": ("all", ("icbf", "split")),
+    "its twin with λ = 0": ("all", ("icbf", "split-0")),
+    "no prior (`mpc`)": ("all", ("mpc", "default")),
+}
+GUARDS = {
+    "none": "",
+    "select": "+select-learned",
+    "shield": "+shield-learned",
+    "shield, formula": "+shield-formula",
+    "full": "+full-learned",
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """Does what `row` has and `twin` lacks change `key`?"""
+
+    words: str
+    row: Row
+    twin: Row
+    keys: tuple[str, ...] = ("return", "avoidable")
+
+
+SHIELD, FULL = "+shield-learned", "+full-learned"
+QUESTIONS = (
+    Question("a shield, under cloning", ("bc", f"default{SHIELD}"), ("bc", "default")),
+    Question(
+        "danger learned, not the formula, in that shield",
+        ("bc", f"default{SHIELD}"),
+        ("bc", "default+shield-formula"),
+    ),
+    Question("`full`, not the shield alone", ("bc", f"default{FULL}"), ("bc", f"default{SHIELD}")),
+    Question("cloning under `full`, not no prior", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
+    Question("ICBF under `full`, not cloning", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
+    Question("ICBF under a shield, not cloning", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
+    Question("the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0")),
+    Question("the same under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
+    *(
+        Question(f"the printed losses, λ = {weight}, not MADIFF", ("icbf", f"paper{name}"), ("madiff", "default"))
+        for weight, name in (("0.1", ""), ("1", "-1"), ("3", "-3"), ("10", "-10"))
+    ),
+    Question(
+        "diffusion (λ = 0), not an actor told the same, under a shield",
+        ("icbf", f"split-0{SHIELD}"),
+        ("bc-return", f"advantage{SHIELD}"),
+    ),
+    Question(
+        "diffusion (MADIFF), not an actor told the same, under a shield",
+        ("madiff", f"default{SHIELD}"),
+        ("bc-return", f"default{SHIELD}"),
+    ),
+    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default")),
+    Question("the same under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")),
+    Question(
+        "diffusion of four times the updates, not an actor told the same, under a shield",
+        ("madiff", f"long{SHIELD}"),
+        ("bc-return", f"default{SHIELD}"),
+    ),
+    Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
+    Question("everybody in sight of cloning", ("bc", "joint"), ("bc", "default")),
+)
+
+
+def main() -> None:
+    put("docs/attribution.md", "crossed", crossed("guards"))
+    put("docs/attribution.md", "questions", questions("guards"))
+
+
+def variant(task: str, row: Row) -> Row:
+    """A row on this task: a preset made for its tier stands for the default."""
+    from ringfence import algos, tasks
+
+    name, _, rest = row[1].partition("+")
+    if name != "default" or row[0] not in algos.ALGORITHMS:
+        return row
+    preset = algos.get(row[0]).preset_for(tasks.get(task).presets)
+    return row[0], f"{preset}+{rest}" if rest else preset
+
+
+def crossed(suite: str) -> str:
+    """A line per proposal and guard, a column per task: normalised return / cost of resets that start safely."""
+    names = tasks_of(suite)
+    out = ["| proposal | sees | guard | " + " | ".join(n.partition("-")[2] for n in names) + " |"]
+    out.append("|---" * (3 + len(names)) + "|")
+    for words, (sees, (algorithm, plain)) in PROPOSALS.items():
+        for guard, ending in GUARDS.items():
+            row, cells = (algorithm, plain + ending), []
+            for task in names:
+                here = variant(task, row)
+                earned, cost = mean(suite, task, here, "return_norm"), mean(suite, task, here, "avoidable_cost")
+                seeds = len(of(suite, task, here))
+                told = "–" if earned is None else f"{earned:.2f} / {cost:.3f}"
+                cells.append(told + (f" [{seeds}]" if seeds > 1 else ""))
+            if any(c != "–" for c in cells):
+                out.append(
+                    f"| {words} | {sees} | {guard if plain != 'reference' else ''} | " + " | ".join(cells) + " |"
+                )
+    return "\n".join([*out, "", "[n]: mean of n seeds, else one."])
+
+
+def answers(suite: str, asked: tuple[Question, ...] = QUESTIONS) -> list[tuple[Question, str, list[Difference]]]:
+    """(question, key, difference on every task that has both rows); p-values adjusted over all of them together."""
+    found = [
+        (
+            q,
+            key,
+            [d for t in tasks_of(suite) if (d := difference(suite, t, variant(t, q.row), variant(t, q.twin), key))],
+        )
+        for q in asked
+        for key in q.keys
+    ]
+    adjusted = iter(family([d for *_, ds in found for d in ds]))
+    return [(q, key, [next(adjusted) for _ in ds]) for q, key, ds in found]
+
+
+def questions(suite: str) -> str:
+    """A line per question and number: the difference on every task, bold where it is no chance."""
+    names = tasks_of(suite)
+    out = ["| what differs | of | " + " | ".join(n.partition("-")[2] for n in names) + " |"]
+    out.append("|---" * (2 + len(names)) + "|")
+    for q, key, ds in answers(suite):
+        if not ds:
+            continue
+        told = {d.task: d for d in ds}
+        cells = [shown(told[n], key) if n in told else "–" for n in names]
+        out.append(f"| {q.words} | {'return' if key == 'return' else 'cost'} | " + " | ".join(cells) + " |")
+    return "\n".join(out)
+
+
+def shown(d: Difference, key: str) -> str:
+    digits = 0 if key == "return" else 2
+    text = f"{d.mean:+.{digits}f} [{d.low:.{digits}f}, {d.high:.{digits}f}]"
+    return f"**{text}**" if d.holds else text
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""What tables and claims are made of: every evaluation of a results folder with the numbers of its episodes, and the
+test of one row against its twin."""
+
+from __future__ import annotations
+
+import functools
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ringfence import stats
+from ringfence.bench import rows
+
+RESULTS = Path(__file__).resolve().parent.parent / "results"
+Row = tuple[str, str]  # algorithm and variant
+LEVEL = 0.05
+
+
+@functools.cache
+def evaluations(suite: str) -> dict[tuple[str, str, str], dict[int, dict]]:
+    """By (task, algorithm, variant): the result of every seed, reference rows under seed 0."""
+    found: dict = defaultdict(dict)
+    for r in rows(RESULTS / suite):
+        name = (r["algorithm"], r["variant"])
+        found[r["task"], *name][r["seed"]] = r
+    return dict(found)
+
+
+def tasks_of(suite: str) -> list[str]:
+    return list(dict.fromkeys(task for task, *_ in evaluations(suite)))
+
+
+def of(suite: str, task: str, row: Row) -> dict[int, dict]:
+    return evaluations(suite).get((task, *row), {})
+
+
+def mean(suite: str, task: str, row: Row, key: str) -> float | None:
+    """Over the seeds that there are."""
+    found = [r[key] for r in of(suite, task, row).values() if r.get(key) is not None]
+    return float(np.mean(found)) if found else None
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A row minus its twin on the same resets, by the same seeds."""
+
+    task: str
+    seeds: tuple[int, ...]
+    mean: float
+    low: float  # 95 %, resets and seeds
+    high: float
+    p: float  # Wilcoxon over resets; `family` adjusts it
+
+    @property
+    def holds(self) -> bool:
+        """Whether it is more than chance: after Holm over the family, and by an interval that knows of the seeds."""
+        return self.p < LEVEL and not self.low <= 0 <= self.high
+
+
+def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Difference | None:
+    """Of `return`, `cost` or `avoidable` (cost of the resets that are not unsafe from the start); None where one of the
+    two is missing."""
+    ours, theirs = of(suite, task, row), of(suite, task, twin)
+    seeds = tuple(sorted(set(ours) & set(theirs)))
+    if not seeds:
+        return None
+    kind = "cost" if key == "avoidable" else key
+    x, y = (np.array([r[s]["per_episode"][kind] for s in seeds], float) for r in (ours, theirs))
+    d = x - y
+    if key == "avoidable":
+        fine = ~np.array(ours[seeds[0]]["per_episode"]["unsafe_start"], bool)
+        d = d[:, fine]
+    told = stats.paired_test(d.mean(0), np.zeros(d.shape[1]))
+    low, high = stats.mean_of_runs(d) if len(seeds) > 1 else told["interval"]
+    return Difference(task, seeds, float(d.mean()), low, high, told["p"])
+
+
+def family(found: list[Difference]) -> list[Difference]:
+    """The same with p-values adjusted by Holm's method."""
+    adjusted = stats.holm(np.array([d.p for d in found])) if found else []
+    return [Difference(d.task, d.seeds, d.mean, d.low, d.high, float(p)) for d, p in zip(found, adjusted)]
