@@ -11,15 +11,11 @@ import tempfile
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 # Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
-_MADE = []
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    _MADE.append(tempfile.mkdtemp(prefix="ringfence-tests-"))
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = _MADE[0]
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", tempfile.mkdtemp(prefix="ringfence-tests-"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 # Worlds that tests fit are not the user's.
-_MADE.append(tempfile.mkdtemp(prefix="ringfence-home-"))
-os.environ["RINGFENCE_HOME"] = _MADE[-1]
+os.environ["RINGFENCE_HOME"] = tempfile.mkdtemp(prefix="ringfence-home-")
 
 import jax
 import numpy as np
@@ -31,9 +27,12 @@ from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
 
 
-def pytest_unconfigure():
-    """Leave nothing in the folder for temporary files."""
-    for folder in _MADE:
+def pytest_unconfigure(config):
+    """Leave nothing in the folder for temporary files; workers share the cache of the process that began them."""
+    made = [os.environ["RINGFENCE_HOME"]]
+    if "ringfence-tests-" in (shared := os.environ["JAX_COMPILATION_CACHE_DIR"]) and not hasattr(config, "workerinput"):
+        made.append(shared)
+    for folder in made:
         shutil.rmtree(folder, ignore_errors=True)
 
 
