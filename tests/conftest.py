@@ -11,8 +11,9 @@ import tempfile
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true")
 
 # Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
-_CACHE = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-os.environ["JAX_COMPILATION_CACHE_DIR"] = _CACHE or tempfile.mkdtemp(prefix="ringfence-tests-")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("JAX_COMPILATION_CACHE_DIR") or tempfile.mkdtemp(
+    prefix="ringfence-tests-"
+)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 # Worlds that tests fit are not the user's.
