@@ -19,7 +19,20 @@ import pytest
 
 from ringfence import evaluate, files, reference, tasks, training
 from ringfence.bench import cells as grid
-from ringfence.bench import cluster, local, make_grid, pack, packed, paper, rows, run_local, suites, write_csv
+from ringfence.bench import (
+    cluster,
+    collected,
+    local,
+    make_grid,
+    make_grids,
+    pack,
+    packed,
+    paper,
+    rows,
+    run_local,
+    suites,
+    write_csv,
+)
 from ringfence.cli import _runs, main
 from ringfence.errors import UserError
 from ringfence.guards import GUARDS, GuardOptions
@@ -539,6 +552,15 @@ def test_unpacking_overwrites_nothing_and_brings_back_nothing(made, tmp_path):
     (out / packed.MARK).unlink()  # as if other archives had come: theirs and ours
     packed.unpack(out)
     assert {"mine", "default"} <= set(Run(kept).results)
+
+
+def test_a_collection_is_its_suites(tmp_path):
+    grids = make_grids(collected("attribution"), tmp_path, seeds=1)
+    assert [g.out.name for g in grids] == list(suites.COLLECTIONS["attribution"])
+    (one,) = make_grids(collected("attribution", ["simple_spread-expert"]), tmp_path, ["icbf:paper-10"], seeds=2)
+    assert [(c.task, c.preset, c.seed) for c in one.cells] == [("simple_spread-expert", "paper-10", s) for s in (0, 1)]
+    with pytest.raises(UserError, match="did you mean 'ant_2x4-good'"):
+        collected("attribution", ["ant_2x4-goodd"])
 
 
 @pytest.mark.parametrize("name", ["../../outside/results.json", "cells/a/b/c/evil.sh", "/cells/a/b/c/results.json"])

@@ -461,10 +461,11 @@ def bench(
 
     Args:
         suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites. Under
-            guard: guards, guards-mujoco, own-sight, own-sight-mujoco, crossing, crossing-guards, crossing-teams.
+            guard: guards, guards-mujoco, crossing, crossing-guards, all four of them as attribution; own-sight,
+            own-sight-mujoco, crossing-teams.
         seeds: per algorithm and task.
         episodes: test episodes per run; the suite's number by default.
-        out_dir: folder of results, results/SUITE by default; of paper, the folder that holds both, results.
+        out_dir: folder of results, results/SUITE by default; of paper and attribution, the folder that holds theirs.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.
         steps: updates of every algorithm, for a quick trial.
@@ -474,7 +475,7 @@ def bench(
         memory: GiB that a local process may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
     """
-    from ringfence.bench import make_grid, pack, paper
+    from ringfence.bench import COLLECTIONS, collected, make_grid, make_grids, pack, paper
 
     only_tasks, only = sum(tasks, []), sum(algorithms, [])
     if steps is not None and out_dir is None:
@@ -484,6 +485,8 @@ def bench(
     root, sizes = out_dir or Path("results"), dict(seeds=seeds, episodes=episodes, steps=steps)
     if suite == "paper":
         grids = paper.grids(root, only_tasks, only, **sizes)
+    elif suite in COLLECTIONS:
+        grids = make_grids(collected(suite, only_tasks), root, only, **sizes)
     else:
         root = out_dir or root / suite
         grids = [make_grid(suite, root, only_tasks=only_tasks, only=only, **sizes)]

@@ -23,7 +23,7 @@ from typing import Any
 
 from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
 from ringfence.bench.packed import unpack
-from ringfence.bench.suites import EVALUATIONS, SUITES
+from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
 from ringfence.data.make import make
 from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
@@ -258,6 +258,32 @@ def make_grid(
             "algorithms."
         )
     return Grid(Path(out), suite, tuple(cells), episodes)
+
+
+def make_grids(held: Mapping[str, Iterable[str]], root: Path, only: Iterable[str] = (), **sizes: Any) -> list[Grid]:
+    """The grids of several suites' tasks `held`, each in its folder of `root`; an entry that one suite alone knows is
+    made there. `sizes`: arguments of `make_grid`."""
+    known, only = {suite: entry_names(suite) for suite in held}, list(only)
+    for name in only:
+        if not any(name in k for k in known.values()):
+            raise unknown("entry", name, set().union(*known.values()))
+    mine = {suite: [n for n in only if n in known[suite]] for suite in held}
+    return [
+        make_grid(suite, root / suite, only_tasks=names, only=mine[suite], **sizes)
+        for suite, names in held.items()
+        if mine[suite] or not only
+    ]
+
+
+def collected(name: str, only_tasks: Iterable[str] = ()) -> dict[str, list[str]]:
+    """The tasks of a collection of suites, or those named, by suite."""
+    only_tasks = list(only_tasks)
+    held = {suite: list(SUITES[suite].tasks) for suite in COLLECTIONS[name]}
+    for task in only_tasks:
+        if not any(task in tasks for tasks in held.values()):
+            raise unknown(f"task of {name}", task, set().union(*held.values()))
+    held = {suite: [t for t in tasks if t in only_tasks or not only_tasks] for suite, tasks in held.items()}
+    return {suite: tasks for suite, tasks in held.items() if tasks}
 
 
 def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, Cell], None]) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ringfence import tasks
-from ringfence.bench.cells import Grid, entry_names, make_grid
+from ringfence.bench.cells import Grid, make_grids
 from ringfence.bench.suites import SUITES
 from ringfence.bench.table import rows
 from ringfence.errors import UserError, unknown
@@ -83,17 +83,7 @@ def parts(only: Iterable[str] = ()) -> dict[str, list[str]]:
 def grids(root: Path, only_tasks: Iterable[str] = (), only: Iterable[str] = (), **sizes: Any) -> list[Grid]:
     """The grids of the paper's tasks and methods, or of those named, one per suite, in folders of `root`; an entry that
     one suite alone knows is made there. `sizes`: arguments of `make_grid`."""
-    held, only = parts(only_tasks), list(only) or list(METHODS)
-    known = {suite: entry_names(suite) for suite in held}
-    for name in only:
-        if not any(name in k for k in known.values()):
-            raise unknown("entry", name, set().union(*known.values()))
-    mine = {suite: [n for n in only if n in known[suite]] for suite in held}
-    return [
-        make_grid(suite, root / suite, only_tasks=names, only=mine[suite], **sizes)
-        for suite, names in held.items()
-        if mine[suite]
-    ]
+    return make_grids(parts(only_tasks), root, list(only) or METHODS, **sizes)
 
 
 @dataclass(frozen=True)

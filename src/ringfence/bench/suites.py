@@ -173,7 +173,14 @@ SUITES = {
                 ),
             ),
             Entry("mpc", evaluations=("full-learned",)),
-            Entry("icbf", evaluations=("plain", "shield-learned")),
+            Entry("icbf", evaluations=_ALONE),
+            Entry("madiff", evaluations=_ALONE),
+            Entry("bc-best", evaluations=_ALONE),
+            Entry("bc-return", evaluations=_ALONE),
+            Entry("bc-safe", evaluations=_ALONE),
+            Entry("ma-td3bc", evaluations=_ALONE),
+            Entry("ma-td3bc-lag", evaluations=_ALONE),
+            Entry("omar", evaluations=_ALONE),
         ),
     ),
     "crossing-teams": Suite(
@@ -187,3 +194,6 @@ SUITES = {
         _ROBOTS, (Entry("bc", evaluations=("plain", "adapt-learned-own", "full-learned-own")),), episodes=20
     ),
 }
+
+# Suites that answer one question together.
+COLLECTIONS = {"attribution": ("guards", "guards-mujoco", "crossing", "crossing-guards")}
