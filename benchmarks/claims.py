@@ -1,0 +1,180 @@
+"""What the documents claim, each sentence with the rows and the test behind it; fails when one does not hold, or when
+its words are no longer there.
+
+    python benchmarks/claims.py          # prints docs/claims.md's table into it
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from attribution import FULL, QUESTIONS, SHIELD, Question, answers
+from evidence import mean, of, tasks_of
+from readme import put
+
+from ringfence.report import board, standings
+from ringfence.stats import upper_bound
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "results"
+SPREAD = "results/guards/table.csv"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A piece of a sentence, where it stands, the file it rests on, and a check that tells what it found."""
+
+    page: str
+    words: str
+    file: str
+    check: Callable[[], tuple[bool, str]]
+
+
+def asked(row, twin) -> Question:
+    return next(q for q in QUESTIONS if (q.row, q.twin) == (row, twin))
+
+
+def tested(row, twin, key: str, verdict: Callable[[list], bool]) -> Callable[[], tuple[bool, str]]:
+    """A question of attribution.py: `verdict` of its differences on all tiers, adjusted with all others."""
+
+    def check():
+        found = next(ds for q, k, ds in answers("guards") if q == asked(row, twin) and k == key)
+        told = ", ".join(f"{d.mean:+.3g}{'' if d.holds else ' (chance)'}" for d in found)
+        return len(found) == 4 and verdict(found), f"{key} {told}; Wilcoxon over resets, Holm"
+
+    return check
+
+
+def within(bound: float) -> Callable[[list], bool]:
+    """No interval reaches farther than `bound` from 0: as good as the same."""
+    return lambda found: all(max(-d.low, d.high) <= bound for d in found)
+
+
+def chance(found: list) -> bool:
+    return not any(d.holds for d in found)
+
+
+def lower(found: list) -> bool:
+    return all(d.holds and d.mean < 0 for d in found)
+
+
+def same_safety() -> tuple[bool, str]:
+    """Learned danger beside the formula, under cloning: Simple Spread's shield and the robots' adapting one."""
+    share, left = [], []
+    for task in tasks_of("guards"):
+        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in DANGERS)
+        share.append(learned / formula)
+        left.append(mean("guards", task, ("bc", "default+shield-learned"), "avoidable_cost"))
+    kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in DANGERS]
+    ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
+    return ok, (
+        f"at least {100 * min(share):.1f} % of the return on every tier, at most {max(left):.3f} cost left; robots' "
+        f"limits kept {kept[0]} and {kept[1]} of 18"
+    )
+
+
+DANGERS = ("learned", "formula")
+
+
+def limits(suite: str, algorithm: str, variant: str) -> int:
+    """Tasks on which the upper end of the cost's interval is within the limit."""
+    shown = standings.standings(board.read(RESULTS / suite))
+    found = [
+        r for rows in shown.values() for r in rows if (r.method.algorithm, r.method.variant) == (algorithm, variant)
+    ]
+    return sum(r.safe for r in found)
+
+
+def robots_kept(algorithm: str, variant: str, wanted: int) -> Callable[[], tuple[bool, str]]:
+    def check():
+        kept = limits("guards-mujoco", algorithm, variant)
+        return kept == wanted, f"{kept} of {len(tasks_of('guards-mujoco'))}"
+
+    return check
+
+
+def contact(suite: str, row, low: float, high: float) -> Callable[[], tuple[bool, str]]:
+    """The share of episodes with contact on crossing-hasty lies in a range."""
+
+    def check():
+        share = mean(suite, "crossing-hasty", row, "violation_rate")
+        return low <= share <= high, f"{100 * share:.3g} % of episodes"
+
+    return check
+
+
+def crossing_rare() -> tuple[bool, str]:
+    runs = of("crossing", "crossing-hasty", ("bc", "default+shield-learned"))
+    touched = sum(round(r["violation_rate"] * r["episodes"]) for r in runs.values())
+    episodes = sum(r["episodes"] for r in runs.values())
+    bound = upper_bound(touched, next(iter(runs.values()))["episodes"])
+    return (touched, episodes) == (1, 5000), f"{touched} of {episodes} episodes; at most {100 * bound:.2g} % of resets"
+
+
+CLAIMS = (
+    Claim(
+        "README.md",
+        "21 % of whose episodes hold contact",
+        "results/crossing/table.csv",
+        contact("crossing", ("behaviour data", "reference"), 0.205, 0.215),
+    ),
+    Claim("README.md", "Learned danger does what the formula does", "guards, guards-mujoco", same_safety),
+    Claim(
+        "README.md",
+        "Climbing learned values from cloned actions earns as much as from its plans",
+        SPREAD,
+        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", within(15)),
+    ),
+    Claim(
+        "README.md",
+        "losses as printed (λ = 0.1) do not lower its cost",
+        SPREAD,
+        tested(("icbf", "paper"), ("madiff", "default"), "avoidable", chance),
+    ),
+    Claim(
+        "README.md",
+        "one robot limit of 18 is not kept",
+        "results/guards-mujoco/table.csv",
+        robots_kept("bc", "default+full-learned", 17),
+    ),
+    Claim("docs/crossing.md", "1 of 5000", "results/crossing/table.csv", crossing_rare),
+    Claim(
+        "docs/attribution.md",
+        "The barrier in training lowers the cost of plans that are followed as they are",
+        SPREAD,
+        tested(("icbf", "split"), ("icbf", "split-0"), "avoidable", lower),
+    ),
+    Claim(
+        "docs/attribution.md",
+        "An actor that is told the same earns more than the diffusion model",
+        SPREAD,
+        tested(
+            ("icbf", f"split-0{SHIELD}"),
+            ("bc-return", f"advantage{SHIELD}"),
+            "return",
+            lambda ds: all(d.mean < 0 for d in ds) and sum(d.holds for d in ds) >= 3,
+        ),
+    ),
+)
+
+
+def main() -> None:
+    lines, wrong = ["| page | claim | rests on | found |", "|---|---|---|---|"], 0
+    for claim in CLAIMS:
+        text = re.sub(r"\s+", " ", (ROOT / claim.page).read_text())
+        holds, found = claim.check()
+        if claim.words not in text:
+            holds, found = False, "the sentence is not there"
+        wrong += not holds
+        print(f"{'ok   ' if holds else 'WRONG'} {claim.page}: {claim.words}: {found}")
+        lines.append(f"| {claim.page} | {claim.words} | {claim.file} | {'' if holds else '**wrong**: '}{found} |")
+    put("docs/claims.md", "claims", "\n".join(lines))
+    sys.exit(f"{wrong} claims do not hold" if wrong else 0)
+
+
+if __name__ == "__main__":
+    main()
