@@ -475,15 +475,24 @@ def test_a_field_that_is_gone_is_another_config(trained, small_store, tmp_path):
 def test_damaged_run_folders_are_refused(tmp_path):
     run = Run(tmp_path)
     for content, said in (
-        (b"[]", "is no run folder.*config.json holds a list"),
-        (b"{}", "config.json' says no algorithm"),
-        (b'{"algorithm": 3}', "config.json' says no algorithm"),
-        (b"\xff\xfe{", "is no run folder.*UnicodeDecodeError"),
+        (b"[]", "is no run folder.*Expected `object`, got `array`"),
+        (b"{}", "missing required field `algorithm`"),
+        (b'{"algorithm": 3}', r"Expected `str`, got `int` - at `\$.algorithm`"),
+        (b"\xff\xfe{", "is no run folder.*malformed"),
+        (b"[" * 100_000, "is no run folder"),
+        (b'{"seed": ' + b"9" * 5000, "is no run folder"),
     ):
         (tmp_path / "config.json").write_bytes(content)
         with pytest.raises(UserError, match=said):
             evaluate.evaluate(run)
-    for content, said in ((b"[]", "damaged results.json; delete .*holds a list"), (b"\xff", "UnicodeDecodeError")):
+    for content, said in (
+        (b"[]", "damaged results.json; delete .*got `array`"),
+        (b"\xff", "damaged results.json"),
+        (b'{"default": {"variant": 5}}', "got `int`"),
+        (b'{"default": {"return_mean": NaN}}', "damaged results.json"),
+        (b'{"default": {"episodes": -1}}', ">= 1"),
+        (b'{"../../x": {}}', "damaged results.json"),
+    ):
         (tmp_path / "results.json").write_bytes(content)
         with pytest.raises(UserError, match=said):
             run.results  # noqa: B018 (reading is what fails)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from ringfence import hazards
+from ringfence import hazards, schemas
 from ringfence.data.store import EpisodeStore
 from ringfence.each import Each
 from ringfence.evaluate import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.policies import Constant
-from ringfence.runs import read_json, write_json
+from ringfence.runs import write_json
 from ringfence.tasks import Task
 
 FILE = "reference.json"
@@ -43,7 +43,7 @@ def there(task: Task, out: str | Path, episodes: int, transitions: int | None = 
     file = Path(out) / task.name / FILE
     if not file.exists():
         return False
-    known = read_json(file, "is damaged; delete it")
+    known = schemas.read(file, schemas.References, "has damaged reference rows; delete that file")
     if not all(complete(r, task) for r in known.values()):
         return False
     card = known.get("behaviour data", {}).get("data", {})
@@ -63,7 +63,7 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
     file = Path(out) / task.name / FILE
     safe = (store.episode_costs <= task.cost_limit) & ~store.episode_terminated
     if file.exists():
-        known = read_json(file, "is damaged; delete it")
+        known = schemas.read(file, schemas.References, "has damaged reference rows; delete that file")
         same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()
         if same and all(complete(r, task) for r in known.values()) and known["behaviour data"]["data"] == store.card:
             return known

@@ -15,6 +15,7 @@ import os
 import platform
 import re
 import subprocess
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -24,18 +25,13 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
-from ringfence import __version__
+from ringfence import __version__, schemas
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.files import whole
 from ringfence.trees import load_named, named_arrays
 from ringfence.types import PyTree
 
 KEEP = 2  # checkpoints
-
-
-# What every config.json says, and in which form.
-_SAID = dict.fromkeys(("algorithm", "preset", "task"), str) | dict.fromkeys(("config", "hazard", "data"), dict)
-_SAID |= {"seed": int}
 
 
 @dataclass(frozen=True)
@@ -52,37 +48,23 @@ class Run:
     @property
     def config(self) -> dict:
         """Contents of config.json."""
-        told = read_json(self.path / "config.json", "is no run folder; give the folder that `ringfence train` made")
-        for name, kind in _SAID.items():
-            if not isinstance(told.get(name), kind):
-                raise UserError(
-                    f"'{self.path / 'config.json'}' says no {name}, so it is none of `ringfence train`; delete that "
-                    "folder and train the run again."
-                )
-        return told
+        remedy = "is no run folder that can be read; give the one that `ringfence train` made, or train it again"
+        return schemas.read(self.path / "config.json", schemas.Config, remedy)
 
     @property
     def results(self) -> dict[str, dict]:
         """Evaluations by variant; empty before the first `ringfence eval`."""
         file = self.path / "results.json"
-        return (
-            read_json(file, "holds a damaged results.json; delete that file and evaluate the run again")
-            if file.exists()
-            else {}
-        )
+        remedy = "holds a damaged results.json; delete that file and evaluate the run again"
+        return schemas.read(file, schemas.Results, remedy) if file.exists() else {}
 
     @property
     def metrics(self) -> list[dict]:
-        """Logged training metrics, oldest first; a line cut short by an interruption is dropped, and so is any that
-        tells neither step nor seconds."""
+        """Logged training metrics, oldest first; a line that an interruption cut short is dropped."""
         file, rows = self.path / "metrics.jsonl", []
         for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
-            try:
-                row = json.loads(line)
-            except json.JSONDecodeError:
-                break
-            if isinstance(row, dict) and all(isinstance(row.get(k), int | float) for k in ("step", "seconds")):
-                rows.append(row)
+            with suppress(ValueError):
+                rows.append(schemas.decode(line, schemas.Row))
         return rows
 
     def checkpoints(self) -> list[tuple[int, Path]]:
@@ -127,17 +109,6 @@ class Run:
 
     def add_result(self, variant: str, result: dict) -> None:
         write_json(self.path / "results.json", {**self.results, variant: result})
-
-
-def read_json(path: Path, problem: str) -> dict:
-    """The object that a JSON file holds; whatever else is there is `problem`."""
-    try:
-        told = json.loads(path.read_text())
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise UserError(f"'{path.parent}' {problem} ({type(error).__name__}: {path.name}).") from error
-    if not isinstance(told, dict):
-        raise UserError(f"'{path.parent}' {problem} ({path.name} holds a {type(told).__name__}, not an object).")
-    return told
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ringfence import __version__, algos, evaluate, hazards, reference, tasks, training
+from ringfence import __version__, algos, evaluate, hazards, reference, schemas, tasks, training
 from ringfence.bench.packed import unpack
 from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
 from ringfence.data.make import make
@@ -31,9 +31,10 @@ from ringfence.errors import RunConflict, UserError, unknown
 from ringfence.files import whole
 from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
-from ringfence.runs import Run, build_config, read_json, write_json
+from ringfence.runs import Run, build_config, write_json
 
 FORMAT = 1  # of a results folder
+DAMAGED = "has a damaged status.json; delete that file"
 STATES = ("done", "failed", "to do")
 
 
@@ -105,7 +106,7 @@ class Cell:
 
     def status(self, out: Path) -> dict:
         file = self.folder(out) / "status.json"
-        return read_json(file, "is damaged; delete it") if file.exists() else {}
+        return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {}
 
 
 def same_options(stored: dict, evaluation: dict, usual: Mapping[str, dict]) -> bool:
@@ -187,7 +188,7 @@ def about(suite: str, episodes: int) -> dict:
 
 def read_about(out: Path) -> dict:
     """bench.json of a results folder of this version."""
-    there = read_json(out / "bench.json", "is no results folder; give the --out of `ringfence bench`")
+    there = schemas.read(out / "bench.json", schemas.Bench, "is no results folder; give the --out of `ringfence bench`")
     if there.get("format") != FORMAT:
         raise UserError(
             f"'{out}' has format {there.get('format')}, this version reads {FORMAT}; run `ringfence bench` again."
@@ -204,7 +205,7 @@ def statuses(out: str | Path) -> list[dict]:
     begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):
         file = folder / "status.json"
-        told = read_json(file, "is damaged; delete it") if file.exists() else {"state": "under way"}
+        told = schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {"state": "under way"}
         task, algorithm, seed = folder.parts[-3:]
         found.append({**told, "task": task, "run": f"{algorithm}/{seed}"})
     return found

@@ -15,9 +15,10 @@ import json
 import tarfile
 from pathlib import Path, PurePosixPath
 
+from ringfence import schemas
 from ringfence.errors import UserError
 from ringfence.files import whole
-from ringfence.runs import read_json, write_json
+from ringfence.runs import write_json
 
 PLACES = ("cells", "reference")
 ARCHIVES = {
@@ -37,7 +38,9 @@ def unpack(out: str | Path) -> None:
     if not archives:
         return
     digests = {a.name: hashlib.sha256(a.read_bytes()).hexdigest() for a in archives}
-    if (out / MARK).exists() and read_json(out / MARK, "is damaged; delete that file") == digests:
+    if (out / MARK).exists() and schemas.read(
+        out / MARK, dict[str, str], "holds a damaged mark; delete that file"
+    ) == digests:
         return
     for archive in archives:
         try:
@@ -63,7 +66,8 @@ def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFi
     if file.exists():
         if parts[-1] != "results.json":
             return
-        content = json.dumps({**json.loads(content), **read_json(file, "is damaged; delete it")}, indent=1).encode()
+        known = schemas.read(file, schemas.Results, "holds a damaged results.json; delete that file")
+        content = json.dumps({**json.loads(content), **known}, indent=1).encode()
     with whole(file) as temporary:
         temporary.write_bytes(content)
 

@@ -9,12 +9,13 @@ import csv
 import io
 from pathlib import Path
 
+from ringfence import schemas
 from ringfence.bench.cells import read_about
 from ringfence.bench.packed import unpack
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
-from ringfence.runs import Run, read_json
+from ringfence.runs import Run
 
 COLUMNS = (
     "task, algorithm, variant, guard, danger, sight, agents, seed, episodes, return_mean, return_std, return_norm, "
@@ -31,7 +32,7 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
     unpack(out)
     found, constants, seen = [], {}, {}
     for file in sorted((out / "reference").glob("*/reference.json")):
-        for name, r in read_json(file, "is damaged; delete it").items():
+        for name, r in schemas.read(file, schemas.References, "has damaged reference rows; delete that file").items():
             found.append(
                 {
                     **guard_of({}),

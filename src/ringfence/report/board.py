@@ -15,14 +15,14 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringfence import tasks
+from ringfence import schemas, tasks
 from ringfence.bench import suites
 from ringfence.bench.packed import unpack
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
-from ringfence.runs import Run, read_json
+from ringfence.runs import Run
 
 FORMAT = 1  # of the folder
 FILE = "bench.json"
@@ -178,7 +178,7 @@ RESTORE = "restore that file, e.g. from another results folder of this suite and
 def _declared(folder: Path) -> dict:
     if not is_board(folder):
         raise UserError(f"'{folder}' holds no {FILE}, so it is no results folder; give the one a benchmark wrote.")
-    told = read_json(folder / FILE, f"holds a damaged {FILE}; {RESTORE}")
+    told = schemas.read(folder / FILE, schemas.Bench, f"holds a damaged {FILE}; {RESTORE}")
     lacking = [k for k in DECLARED if k not in told]
     if told.get("format") != FORMAT:
         raise UserError(
@@ -198,7 +198,8 @@ def _place_of(path: Path) -> tuple[str, str, int]:
 def _status(path: Path) -> tuple[str, str]:
     """(state, reason in a line) of a cell; one that was begun and left nothing behind yet is under way."""
     file = path / "status.json"
-    told = read_json(file, "has a damaged status.json; delete that file") if file.exists() else {}
+    damaged = "has a damaged status.json; delete that file"
+    told = schemas.read(file, schemas.Status, damaged) if file.exists() else {}
     reason = str(told.get("error") or "").strip().splitlines()
     return str(told.get("state") or "under way"), reason[-1] if reason else ""
 
@@ -250,7 +251,7 @@ def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
     inside, damaged = folder / "reference", "holds a damaged reference file; delete it and make it again"
     files = [(f, f.parent.name) for f in sorted(inside.glob("*/reference.json"))]
     files += [(f, f.stem) for f in sorted(inside.glob("*.json"))]
-    return {f: (task, read_json(f, damaged)) for f, task in files}
+    return {f: (task, schemas.read(f, schemas.References, damaged)) for f, task in files}
 
 
 def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entry]:

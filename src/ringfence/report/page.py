@@ -11,7 +11,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from ringfence import __version__, algos, hazards, tasks
+from ringfence import __version__, algos, hazards, schemas, tasks
 from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
@@ -20,7 +20,7 @@ from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.table import NAMES, Row, Section, sections
-from ringfence.runs import Run, read_json
+from ringfence.runs import Run
 
 HERE = Path(__file__).parent
 WORDS = {  # hazard -> (what the cost counts, what a violation is)
@@ -369,7 +369,8 @@ def environments(runs: list[Run]) -> list[dict]:
     found: dict[str, dict] = {}
     for run in runs:
         file = run.path / "env.json"
-        told = read_json(file, "has a damaged env.json; delete that file") if file.exists() else {}
+        damaged = "has a damaged env.json; delete that file"
+        told = schemas.read(file, schemas.Environment, damaged) if file.exists() else {}
         if told:
             entry = found.setdefault(json.dumps(told, sort_keys=True), {"facts": facts(told), "runs": []})
             entry["runs"].append(f"{run.path.parent.name}/{run.path.name}")

@@ -9,12 +9,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ringfence import schemas
 from ringfence.algos import ALGORITHMS
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.report.pooling import Numbers, mean_of, pool
-from ringfence.runs import Run, read_json
+from ringfence.runs import Run
 
 SPLITS = ("test", "validation")
 NAMES = {
@@ -166,13 +167,13 @@ def _agree(who: str, result: dict, leader: dict, of: str) -> None:
 
 
 def _references(runs: list[Run], task: str, leader: dict, first: Run) -> list[Row]:
-    rows, read = {}, set()
+    rows, read, damaged = {}, set(), "holds a damaged reference file; delete it and make it again"
     for run in runs:
         file = run.path.resolve().parent.parent / "reference.json"
         if file in read or not file.exists():
             continue
         read.add(file)
-        for name, result in read_json(file, "holds a damaged reference file; delete it and make it again").items():
+        for name, result in schemas.read(file, schemas.References, damaged).items():
             _check(f"'{file}' row '{name}'", result, task)
             _agree(f"'{file}' row '{name}'", result, leader, f"'{first.path}'")
             rows.setdefault(name, pool([result]) | {"split": result.get("split", "test")})

@@ -1,0 +1,194 @@
+"""What the JSON files of this package hold, one schema each, checked where they are read.
+
+msgspec checks while it decodes, so no file is believed before it has the right types: nesting, sizes of numbers, NaN
+and missing fields are its business and not that of who reads the file. Fields that a schema does not name are kept.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
+
+import msgspec
+
+from ringfence.errors import UserError
+
+LARGEST = 2**27  # bytes of a JSON file; the largest that this package writes have some megabytes
+T = TypeVar("T")
+
+# What becomes part of a path: no separator, no control character, no leading dot or dash, of a file system's length.
+_PART = r"\A(?![.\-])[^/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\Z"
+Name = Annotated[str, msgspec.Meta(pattern=_PART, max_length=120)]
+Variant = Annotated[str, msgspec.Meta(pattern=_PART, max_length=200)]
+Count = Annotated[int, msgspec.Meta(ge=0)]
+Positive = Annotated[int, msgspec.Meta(ge=1)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Interval = tuple[float, float]
+Scalar = bool | int | float | str | None
+
+
+class Hazard(TypedDict):
+    kind: str
+
+
+class Spec(TypedDict, total=False):
+    task: Name
+    n_agents: Positive
+    action_dim: Positive
+    feature_names: list[str]
+    action_low: float
+    action_high: float
+    episode_length: Positive
+    alike: bool
+
+
+class Config(TypedDict):
+    """config.json of a run."""
+
+    algorithm: str
+    preset: Name
+    config: dict[str, Any]  # typed by the algorithm's own Config (runs.build_config)
+    task: Name
+    hazard: Hazard
+    seed: Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+    data: dict[str, Any]
+    revision: NotRequired[int]
+    spec: NotRequired[Spec]
+    feature_map: NotRequired[dict[str, Any] | None]
+    widths: NotRequired[tuple[int | None, int | None] | None]
+    world: NotRequired[dict[str, Scalar] | None]
+    team: NotRequired[Positive]
+
+
+class PerEpisode(TypedDict, total=False):
+    cost: list[float]
+    unsafe_start: list[bool]
+    steps: list[int]
+    terminated: list[bool]
+
+
+class Constants(TypedDict):
+    return_min: float
+    return_max: float
+    cost_limit: float
+    cost_offset: float
+
+
+class Result(TypedDict, total=False):
+    """A summary of episodes: an evaluation in results.json, or a reference row."""
+
+    episodes: Positive
+    return_mean: float
+    return_std: float
+    return_norm: float
+    return_interval: Interval
+    cost_mean: float
+    cost_interval: Interval
+    cost_norm: float
+    cost_cvar10: float
+    cost_rate: float
+    violation_rate: Share
+    violation_interval: Interval
+    violation_upper: Share
+    agent_violation_rate: Share
+    unsafe_starts: Count
+    avoidable_cost: float
+    avoidable_interval: Interval
+    avoidable_violation_upper: Share
+    steps_mean: float
+    termination_rate: Share
+    constants: Constants
+    per_episode: PerEpisode
+    protocol: int
+    task: str
+    split: str
+    seed: int
+    step: int
+    algorithm: str
+    variant: Variant
+    planner: str
+    options: dict[str, Scalar]
+    guard: str
+    danger: str
+    sight: str
+    agents: Positive
+    guard_options: dict[str, Scalar]
+    infeasible: float
+    strange: float
+    eval_seconds: float
+    train_seconds: float
+    plan_ms_p50: float | None
+    plan_ms_p99: float | None
+    parameters: int | None
+    data: dict[str, Any]
+
+
+Results = dict[Variant, Result]
+References = dict[str, Result]
+
+
+class Status(TypedDict, total=False):
+    """status.json of a cell."""
+
+    state: str
+    attempts: Count
+    id: str
+    train_seconds: float
+    eval_seconds: float
+    error: str
+    traceback: str
+    adopted: str
+
+
+class Bench(TypedDict, total=False):
+    """bench.json of a results folder."""
+
+    format: int
+    protocol: int
+    suite: str
+    episodes: Positive
+    split: str
+
+
+class Environment(TypedDict, total=False):
+    """env.json of a run."""
+
+    ringfence: str
+    python: str
+    packages: dict[str, str]
+    devices: list[str]
+    processor: str
+    cores: int | None
+    system: str
+    git: str | None
+
+
+class Row(TypedDict):
+    """A line of metrics.jsonl."""
+
+    step: int
+    seconds: float
+
+
+def decode(raw: bytes | str, kind: type[T]) -> T:
+    """JSON of `kind`, with the fields that it does not name; ValueError says what is wrong and where."""
+    try:
+        msgspec.json.decode(raw, type=kind)  # which would leave out what the schema does not name
+        return msgspec.json.decode(raw)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise ValueError(str(error)) from None
+
+
+def read(path: Path, kind: type[T], problem: str) -> T:
+    """What a JSON file holds, as `kind`; whatever else is there is `problem`, a sentence's end with the remedy."""
+    try:
+        if not path.is_file():
+            raise ValueError("it is not there" if not path.exists() else "it is no regular file")
+        if path.stat().st_size > LARGEST:
+            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
+        return decode(path.read_bytes(), kind)
+    except (OSError, ValueError) as error:
+        told = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise UserError(f"'{path.parent}' {problem} ({path.name}: {told}).") from None
