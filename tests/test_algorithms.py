@@ -318,19 +318,29 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
     assert not any(tmp_path.rglob("ckpt"))
 
 
-def test_broken_checkpoints_are_refused(trained, tmp_path):
-    import shutil
-
+def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
     run = Run(tmp_path / "copy")
     shutil.copytree(trained["bc"].path, run.path)
     file = run.checkpoints()[-1][1]
     whole = file.read_bytes()
-    file.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(CheckpointError, match="truncated"):
-        evaluate.load(run)
     from safetensors.numpy import load_file, save_file
 
+    before = run.checkpoints()[-2][0]
+    flipped = bytearray(whole)
+    flipped[-5] ^= 1  # of a weight
+    stepped = {**load_file(file), "step": np.array(-7, np.int32)}
+    for wrong in (whole[: len(whole) // 2], bytes(flipped), stepped):
+        save_file(wrong, file) if isinstance(wrong, dict) else file.write_bytes(wrong)
+        assert evaluate._loaded(run, None, evaluate.asked())[2] == before
+        assert "the one before is used" in capsys.readouterr().err
+        with pytest.raises(CheckpointError, match="truncated or damaged.*train the run again"):
+            evaluate._loaded(run, 12, evaluate.asked())
     file.write_bytes(whole)
+    again = training.train("bc", small_store, folder=lambda seed: run.path, chunk=5, **job_of("bc"))[0]
+    assert again.checkpoints()[-1] == (12, file) and file.read_bytes() == whole
+    file.write_bytes(whole[:100])  # a finished run whose end was lost is finished again, to the same bits
+    training.train("bc", small_store, folder=lambda seed: run.path, chunk=5, **job_of("bc"))
+    assert file.read_bytes() == whole
     arrays = load_file(file)
     name = next(k for k in arrays if k.startswith("ema"))
     save_file({k: v for k, v in arrays.items() if k != name}, file)

@@ -85,10 +85,10 @@ def test_a_group_is_no_array(tmp_path, name):
 @pytest.mark.parametrize(
     ("card", "said"),
     [
-        ("null", "card is a NoneType"),
-        ("[]", "card is a list"),
-        ("{", "no card that can be read"),
-        (3, "no card that can be read"),
+        ("null", "got `null`"),
+        ("[]", "got `array`"),
+        ("{", "has no card"),
+        (3, "has no card"),
         ('{"hazard": null}', "hazard=None; it must be a Separation"),
         ('{"hazard": "near"}', "hazard='near'; it must be"),
         ('{"hazard": {"kind": "All", "hazards": [3]}}', "which is none"),
@@ -99,7 +99,7 @@ def test_a_group_is_no_array(tmp_path, name):
         ('{"task": null}', "task=None"),
         ('{"observation_names": 3}', "observation_names=3; it must be a list of words"),
         ('{"warnings": 3}', "warnings=3; it must be a list of words"),
-        ('{"action_low": NaN}', "action_low=nan"),
+        ('{"action_low": NaN}', "malformed"),
         ('{"action_low": 2}', "the first must be the smaller one"),
         ('{"cost_limit": "few"}', "cost_limit='few'"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 import time
 from collections.abc import Iterator
@@ -15,28 +16,89 @@ from ringfence.errors import UserError
 def whole(path: str | os.PathLike) -> Iterator[Path]:
     """Yields a temporary path beside `path` that is renamed to it on success and removed on any failure.
 
-    A full disk or a folder that cannot be written becomes a `UserError`; whatever stood at `path` stays as it was.
+    A full disk or a folder that cannot be written becomes a `UserError`; whatever stood at `path` stays as it was. A
+    link is followed; what is no regular file (a device, a folder, a pipe) is refused. What a killed writer of the same
+    file left behind is removed.
     """
-    path = Path(path)
-    if not path.name:
-        raise UserError(f"'{path}' names no file; give a file's name.")
+    path = writable(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(path)
         yield temporary
         os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
-        raise UserError(f"'{path}' could not be written ({error}); free some space or choose another place.") from error
+        told = str(error).splitlines()[0]  # some libraries say it in many lines
+        raise UserError(f"'{path}' could not be written ({told}); free some space or choose another place.") from error
     except BaseException:
         _remove(temporary)
         raise
+
+
+def writable(path: str | os.PathLike, folder: bool = False) -> Path:
+    """The path, links followed, if a file (or `folder`) may be written there; refused before any work is done."""
+    path = Path(path)
+    if not path.name or not str(path).strip():
+        raise UserError(f"'{path}' names no file; give a file's name.")
+    try:
+        path = path.resolve() if path.is_symlink() else path
+        there = path.exists()
+        if there and not (path.is_dir() if folder else path.is_file()):
+            raise UserError(f"'{path}' is no {'folder' if folder else 'regular file'}; choose another place.")
+        above = path if there else next(p for p in path.absolute().parents if p.exists())
+        if not above.is_dir() and above is not path:
+            raise UserError(f"'{above}' is no folder, so '{path}' cannot lie in it; choose another place.")
+        if not os.access(above if above.is_dir() else above.parent, os.W_OK):
+            raise UserError(f"'{above}' may not be written to, so '{path}' cannot be made; choose another place.")
+    except (OSError, ValueError) as error:  # a name that is too long, or holds what no name may
+        raise UserError(f"'{path}' cannot be a file's name ({error}); choose another.") from None
+    return path
+
+
+def _sweep(path: Path) -> None:
+    """Remove parts of this file whose writers are gone."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        writer = part.name.removesuffix(".part").rpartition(".")[2]
+        if writer.isdigit() and not _alive(int(writer)):
+            _remove(part)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass
+    return True
 
 
 def _remove(file: Path) -> None:
     """Where a folder of the path is a file, there is nothing to remove, and the system says so with an error."""
     with suppress(OSError):
         file.unlink()
+
+
+@contextmanager
+def alone(file: Path) -> Iterator[None]:
+    """Wait until nobody else is between reading, changing and writing what this lock file stands for."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        lock = os.open(file, os.O_RDWR | os.O_CREAT)
+    except OSError as error:
+        raise UserError(f"'{file.parent}' could not be locked ({error}); make it a folder you may write to.") from error
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(lock)
 
 
 @contextmanager

@@ -10,11 +10,13 @@ results.json    what `ringfence eval` measured, one entry per variant
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import os
 import platform
 import re
 import subprocess
+import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +24,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import jax
 import numpy as np
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from ringfence import __version__, schemas
 from ringfence.errors import CheckpointError, UserError, unknown
-from ringfence.files import whole
+from ringfence.files import alone, whole
 from ringfence.trees import load_named, named_arrays
 from ringfence.types import PyTree
 
@@ -76,13 +78,21 @@ class Run:
                 found.append((int(match[1]), file))
         return sorted(found)
 
+    def drop_damaged(self) -> None:
+        """Delete last checkpoints that are truncated or damaged, and say so: training goes on from the one before."""
+        for at, file in reversed(self.checkpoints()):
+            if not (wrong := damage(file, at)):
+                return
+            print(f"'{file}' is truncated or damaged ({wrong}); it is dropped.", file=sys.stderr)
+            file.unlink(missing_ok=True)
+
     def save_checkpoint(self, step: int, state: PyTree) -> Path:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
         final = self.path / "ckpt" / f"step-{step:08d}.safetensors"
         arrays = named_arrays(state)
         with whole(final) as temporary:
             try:
-                save_file(arrays, temporary, {"step": str(step)})
+                save_file(arrays, temporary, {"step": str(step), "digest": digest_of(arrays)})
             except SafetensorError as error:  # its own wrapping of the operating system's error
                 raise OSError(str(error)) from error
         for _, old in self.checkpoints()[:-KEEP]:
@@ -99,16 +109,44 @@ class Run:
             found = [c for c in found if c[0] == step]
             if not found:
                 raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
-        at, file = found[-1]
-        try:
+        for at, file in reversed(found):
+            if wrong := damage(file, at):
+                told = f"'{file}' is truncated or damaged ({wrong})"
+                if file == found[0][1]:
+                    raise CheckpointError(f"{told}; delete it and train the run again.")
+                print(f"{told}; the one before is used.", file=sys.stderr)
+                continue
             return at, load_named(file, template)
-        except (SafetensorError, OSError) as error:
-            raise CheckpointError(
-                f"'{file}' is truncated or damaged ({error}); delete it to use the one before."
-            ) from (error)
 
     def add_result(self, variant: str, result: dict) -> None:
-        write_json(self.path / "results.json", {**self.results, variant: result})
+        """Keep a result beside the others, whoever else adds some at the same time."""
+        with alone(self.path / ".results.lock"):
+            write_json(self.path / "results.json", {**self.results, variant: result})
+
+
+def digest_of(arrays: dict[str, np.ndarray]) -> str:
+    """Of named arrays, whatever their order."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, array in sorted(arrays.items()):
+        digest.update(f"{name} {array.shape} {array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def damage(file: Path, step: int) -> str:
+    """What is wrong with a checkpoint of that step, empty if nothing is; those older than digests are believed."""
+    try:
+        with safe_open(file, framework="np") as opened:
+            told = opened.metadata() or {}
+            arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (it is no dict)
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        return str(error).splitlines()[0]
+    inside = arrays.get("step")
+    if told.get("step", str(step)) != str(step) or (inside is not None and inside.tolist() != step):
+        return "it is not of the step in its name"
+    if told.get("digest", (found := digest_of(arrays))) != found:
+        return "its contents have changed"
+    return ""
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -200,6 +200,8 @@ def train(
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
     steps = job.config.steps
+    for run in runs:
+        run.drop_damaged()
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)

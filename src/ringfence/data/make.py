@@ -11,6 +11,7 @@ from ringfence import __version__, hazards
 from ringfence.data.cache import cache_dir
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
+from ringfence.files import writable
 from ringfence.tasks import Task, siblings
 
 
@@ -27,7 +28,7 @@ def make(
         raise UserError(f"size={transitions} and seed={seed} must be a positive size and a seed of 0 or more.")
     transitions = recipe.whole(task, transitions)
     cached = _kept(task.name, transitions, seed)
-    path = Path(out) if out else cached
+    path = writable(out) if out else cached
     danger = hazards.to_dict(task.hazard)
     card = {
         "task": task.name,
@@ -44,7 +45,13 @@ def make(
         return kept, kept.save(path) if out else path
     store = None if fresh else _relabelled(task, kept, transitions, seed, card)
     store = store or recipe.collect(task, transitions, seed, card)
-    return store, store.save(path)
+    try:
+        return store, store.save(path)
+    except UserError as error:
+        if out:
+            raise
+        warnings.warn(f"{error} The data are used as they are and not kept.", stacklevel=2)
+        return store, path
 
 
 def _kept(name: str, transitions: int, seed: int) -> Path:

@@ -20,14 +20,16 @@ import json
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
-from ringfence import hazards
+from ringfence import hazards, schemas
 from ringfence.errors import StoreError, UserError
 from ringfence.files import whole
 
+LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed")
@@ -291,54 +293,95 @@ class EpisodeStore:
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
         path = Path(path)
-        with whole(path) as temporary, h5py.File(temporary, "w") as f:
-            f.attrs["ringfence_store"] = FORMAT
-            f.attrs["card"] = json.dumps(self.card)
-            for name in (*ARRAYS, *OPTIONAL):
-                if getattr(self, name) is not None:
-                    f.create_dataset(name, data=getattr(self, name))
+        with whole(path) as temporary:
+            try:
+                with h5py.File(temporary, "w") as f:
+                    f.attrs["ringfence_store"] = FORMAT
+                    f.attrs["card"] = json.dumps(self.card)
+                    f.attrs["digest"] = self.content
+                    for name in (*ARRAYS, *OPTIONAL):
+                        if getattr(self, name) is not None:
+                            f.create_dataset(name, data=getattr(self, name))
+            except RuntimeError as error:  # HDF5 on a full disk, when it closes the file
+                raise OSError(str(error)) from error
         return path
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> EpisodeStore:
-        """Read and validate; a foreign, truncated or invalid file is refused, never read in part."""
+        """Read and validate; a foreign, truncated, damaged or invalid file is refused, never read in part."""
         path = Path(path)
         if not path.exists():
             raise StoreError(f"No episode store at '{path}'; make one with `ringfence data make TASK`.")
+        if not path.is_file():
+            raise StoreError(f"'{path}' is no regular file; give the file of an episode store.")
         try:
             with h5py.File(path, "r") as f:
                 if f.attrs.get("ringfence_store") != FORMAT:
                     raise StoreError(
                         f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
                     )
-                missing = [name for name in ARRAYS if name not in f]
-                if missing:
-                    raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
-                there = [name for name in (*ARRAYS, *OPTIONAL) if name in f]
-                odd = [name for name in there if not isinstance(f[name], h5py.Dataset)]
-                if odd:
-                    raise StoreError(
-                        f"'{path}' holds a group where the array '{odd[0]}' belongs; make the store again."
-                    )
-                size = sum(f[name].nbytes for name in there)
-                if size > (memory := _memory()):
-                    raise StoreError(
-                        f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB "
-                        "of memory; take a larger machine, or store fewer episodes."
-                    )
-                arrays = {name: f[name][()] for name in there}
-                card = json.loads(f.attrs["card"])
+                there = _checked(path, f)
+                raw, digest = f.attrs["card"], f.attrs.get("digest")
+                if not isinstance(raw, str | bytes) or len(raw) > 2**24:
+                    raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
+                card = schemas.decode(raw, dict[str, Any])
+                arrays = {name: array[()] for name, array in there.items()}
         except StoreError:
             raise
-        except (KeyError, TypeError, ValueError) as error:  # no card, or one that is no JSON
-            raise StoreError(f"'{path}' has no card that can be read ({error}); make or import it again.") from error
         except OSError as error:
             told = str(error).splitlines()[0]
             raise StoreError(f"'{path}' is truncated or not HDF5 ({told}); make or import the store again.") from error
+        except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
+            told = (str(error).splitlines() or [type(error).__name__])[0]
+            raise StoreError(f"'{path}' is damaged or has no card ({told}); make or import it again.") from error
         try:
-            return cls(**arrays, card=card)
+            found = cls(**arrays, card=card)
         except UserError as error:
             raise StoreError(f"'{path}': {error}") from None
+        if digest is not None and digest != found.content:
+            raise StoreError(
+                f"'{path}' holds other numbers than were written (its digest differs); make or import it again."
+            )
+        return found
+
+
+def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
+    """The arrays of a file, looked at before any of them is read: plain ones, in the file itself, of shapes that belong
+    together and of no more bytes than the file can hold."""
+    missing = [name for name in ARRAYS if name not in f]
+    if missing:
+        raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
+    found = {}
+    for name in (n for n in (*ARRAYS, *OPTIONAL) if n in f):
+        array = f[name] if isinstance(f.get(name, getlink=True), h5py.HardLink) else None
+        if array is None or (isinstance(array, h5py.Dataset) and (array.external or array.is_virtual)):
+            raise StoreError(f"'{path}' keeps '{name}' in another file; copy it into the store itself.")
+        if not isinstance(array, h5py.Dataset):
+            raise StoreError(f"'{path}' holds a group where the array '{name}' belongs; make the store again.")
+        if array.dtype.kind not in "biuf":
+            raise StoreError(f"'{path}' holds '{name}' of type {array.dtype}; it must hold numbers.")
+        if array.shape is None or not array.shape:
+            raise StoreError(f"'{path}' holds no array in '{name}'; make the store again.")
+        found[name] = array
+    steps, episodes = found["actions"].shape[0], found["episode_ends"].shape[0]
+    rows = {"observations": steps + episodes, "state": steps + episodes, "episode_ends": episodes}
+    for name, array in found.items():
+        if array.shape[0] != rows.get(name, steps):
+            raise StoreError(
+                f"'{path}' holds {array.shape[0]} rows of '{name}' for {steps} steps of {episodes} episodes; make or "
+                "import the store again."
+            )
+    size, there = sum(array.nbytes for array in found.values()), path.stat().st_size
+    if size > (memory := _memory()):
+        raise StoreError(
+            f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB of memory; "
+            "take a larger machine, or store fewer episodes."
+        )
+    if size > 4 * there + LOOSE:
+        raise StoreError(
+            f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {there / 2**20:.1f}; store them uncompressed."
+        )
+    return found
 
 
 def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
