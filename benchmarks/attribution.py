@@ -32,6 +32,7 @@ PROPOSALS: dict[str, tuple[str, Row]] = {
     "ICBF as printed, λ = 10": ("all", ("icbf", "paper-10")),
     "ICBF, ours (advantage, λ = 3)": ("all", ("icbf", "split")),
     "its twin with λ = 0": ("all", ("icbf", "split-0")),
+    "ICBF, ours, four times the updates": ("all", ("icbf", "long")),
     "no prior (`mpc`)": ("all", ("mpc", "default")),
 }
 GUARDS = {

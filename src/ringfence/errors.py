@@ -8,7 +8,11 @@ from pathlib import Path
 
 
 class UserError(ValueError):
-    """Bad input, refused before work starts. The command line prints the message alone, without a traceback."""
+    """Bad input, refused before work starts. The command line prints the message alone, without a traceback, so what
+    it quotes of a stranger's file is kept from breaking lines or speaking to the terminal."""
+
+    def __str__(self) -> str:
+        return plain(super().__str__())
 
 
 class StoreError(UserError):
@@ -25,6 +29,12 @@ class RunConflict(UserError):
     def __init__(self, message: str, folder: Path):
         super().__init__(message)
         self.folder = folder
+
+
+def plain(text: str) -> str:
+    """The text on one line, with what no terminal and no file can show as escapes."""
+    shown = (c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in text)
+    return "".join(shown)
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:

@@ -440,6 +440,9 @@ def load_job(run: Run, agents: int | None = None) -> training.Job:
         raise UserError(f"'{run.path / 'config.json'}' lacks '{lacking[0]}', so nothing can be played; train it again.")
     algorithm = algos.get(told["algorithm"])
     config = build_config(algorithm.Config, told["config"], algorithm.name)
+    fields = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
+    if lacking := sorted(fields - set(told["spec"])):
+        raise UserError(f"'{run.path / 'config.json'}' has a spec without '{lacking[0]}'; train the run again.")
     spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
     if told["feature_map"] is None:
         # Danger is what the run's data said it is, as in training.

@@ -335,6 +335,9 @@ class _Joint(FeatureMap):
 
 def from_dict(data: dict) -> FeatureMap:
     """The map that a run's config.json describes."""
+    rows, width = {len(data["plus"]), len(data["minus"])}, {len(row) for row in (*data["plus"], *data["minus"])}
+    if len(rows) > 1 or width != {len(data["names"])}:
+        raise UserError("The run's feature map is damaged: its rows are not of one length; train the run again.")
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(data["plus"]), np.array(data["minus"]))
     if data.get("dt") is not None:

@@ -39,7 +39,7 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
 def writable(path: str | os.PathLike, folder: bool = False) -> Path:
     """The path, links followed, if a file (or `folder`) may be written there; refused before any work is done."""
     path = Path(path)
-    if not path.name or not str(path).strip():
+    if not path.name or not str(path).strip() or "\0" in str(path):
         raise UserError(f"'{path}' names no file; give a file's name.")
     try:
         path = path.resolve() if path.is_symlink() else path

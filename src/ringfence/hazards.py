@@ -217,6 +217,7 @@ def from_dict(data: dict) -> Hazard:
             raise UserError(f"Hazard {kind} needs a value of '{name}'; add it to the card.")
     for name in ("radius", "limit", "safe_margin"):
         value = data.get(name)
-        if value is not None and (isinstance(value, bool) or not isinstance(value, int | float) or not value >= 0):
-            raise UserError(f"Hazard {kind} has {name}={value!r}; it must be a number, 0 or more.")
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if value is not None and not (number and 0 <= value < float("inf")):
+            raise UserError(f"Hazard {kind} has {name}={value!r}; it must be a number, 0 or more, and finite.")
     return kinds[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})

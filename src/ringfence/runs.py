@@ -202,7 +202,7 @@ def _in_range(of: str, name: str, value: Any) -> None:
     low, high = RANGES.get(name, (None, None))
     if not isinstance(value, int | float) or isinstance(value, bool):
         return
-    if not np.isfinite(value) or (low is not None and value < low) or (high is not None and value > high):
+    if not abs(value) < 2**53 or (low is not None and value < low) or (high is not None and value > high):
         bound = "finite" if low is None else f"at least {low}" if high is None else f"between {low} and {high}"
         raise UserError(f"{name}={value} of {of} must be {bound}.")
     if name in POSITIVE and value <= 0:

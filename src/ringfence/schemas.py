@@ -42,6 +42,19 @@ class Spec(TypedDict, total=False):
     alike: bool
 
 
+class Map(TypedDict):
+    """features.to_dict"""
+
+    view: str
+    names: list[str]
+    source: str
+    plus: list[list[int]]
+    minus: list[list[int]]
+    joint: bool
+    follows: NotRequired[list[int]]
+    dt: NotRequired[float | None]
+
+
 class Config(TypedDict):
     """config.json of a run."""
 
@@ -54,7 +67,7 @@ class Config(TypedDict):
     data: dict[str, Any]
     revision: NotRequired[int]
     spec: NotRequired[Spec]
-    feature_map: NotRequired[dict[str, Any] | None]
+    feature_map: NotRequired[Map | None]
     widths: NotRequired[tuple[int | None, int | None] | None]
     world: NotRequired[dict[str, Scalar] | None]
     team: NotRequired[Positive]
@@ -177,6 +190,14 @@ def decode(raw: bytes | str, kind: type[T]) -> T:
         return msgspec.json.decode(raw)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
+    except (msgspec.MsgspecError, UnicodeError) as error:
+        raise ValueError(str(error)) from None
+
+
+def check(value: Any, kind: type[T]) -> None:
+    """ValueError where a value of Python's is not of the kind."""
+    try:
+        msgspec.convert(value, kind)
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise ValueError(str(error)) from None
 

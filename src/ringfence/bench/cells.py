@@ -193,6 +193,8 @@ def read_about(out: Path) -> dict:
         raise UserError(
             f"'{out}' has format {there.get('format')}, this version reads {FORMAT}; run `ringfence bench` again."
         )
+    if lacking := [name for name in about("", 0) if name not in there]:
+        raise UserError(f"'{out / 'bench.json'}' lacks '{lacking[0]}'; run `ringfence bench` into an empty folder.")
     return there
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import lzma
 import tarfile
 from pathlib import Path, PurePosixPath
 
@@ -25,6 +26,7 @@ ARCHIVES = {
     "runs.tar.xz": ("config.json", "env.json", "status.json", "results.json", "reference.json"),
     "curves.tar.xz": ("metrics.jsonl",),
 }
+LARGEST = 2**29  # bytes of an archive, unpacked
 MARK = Path("cells", ".unpacked.json")  # digests of the archives whose files are loose
 
 
@@ -44,16 +46,21 @@ def unpack(out: str | Path) -> None:
         return
     for archive in archives:
         try:
-            with tarfile.open(archive) as tar:
+            with tarfile.open(fileobj=io.BytesIO(_content(archive))) as tar:
                 for member in tar:
                     _place(out, archive, member, tar)
-        except (tarfile.TarError, EOFError, OSError) as error:
-            if isinstance(error, PermissionError):
-                raise UserError(
-                    f"'{out}' cannot be written, so its archives cannot be unpacked there; copy it."
-                ) from error
+        except (tarfile.TarError, lzma.LZMAError, EOFError, ValueError) as error:
             raise UserError(f"'{archive}' is truncated or damaged ({error}); restore that file.") from error
     write_json(out / MARK, digests)
+
+
+def _content(archive: Path) -> bytes:
+    """The whole of it, so that its checksum is read, and no more than anybody packs."""
+    unpacker = lzma.LZMADecompressor(format=lzma.FORMAT_XZ)
+    content = unpacker.decompress(archive.read_bytes(), max_length=LARGEST)
+    if not unpacker.eof:
+        raise EOFError(f"its end is missing, or it holds more than {LARGEST / 2**20:.0f} MiB")
+    return content
 
 
 def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFile) -> None:

@@ -17,6 +17,7 @@ from ringfence.evaluate import of_last_step
 from ringfence.files import whole
 from ringfence.runs import Run
 
+TOLD = ("split", "protocol", "episodes", "task", "algorithm", "seed", "variant", "constants")  # by every evaluation
 COLUMNS = (
     "task, algorithm, variant, guard, danger, sight, agents, seed, episodes, return_mean, return_std, return_norm, "
     "cost_mean, cost_norm, avoidable_cost, violation_rate, violation_upper, agent_violation_rate, unsafe_starts, "
@@ -45,7 +46,9 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
             )
     for file in sorted((out / "cells").glob("*/*/[!.]*/results.json")):
         run = Run(file.parent)
-        for r in run.results.values():
+        for variant, r in run.results.items():
+            if lacking := [name for name in TOLD if name not in r]:
+                raise UserError(f"'{file}' tells no {lacking[0]} of {variant}; evaluate that run again.")
             if r["split"] != about["split"] or not of_last_step(r, run.config["config"]):
                 continue  # settings were chosen there, or training went on; no table is made of it
             for name in ("protocol", "episodes"):

@@ -386,6 +386,8 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
 
 def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
     """An array of real numbers, with that many axes; ragged lists, words and None are refused by name."""
+    if np.ma.is_masked(value):
+        raise StoreError(f"{name} hides entries behind a mask; fill them in, or drop the episodes that hold them.")
     try:
         array = np.asarray(value)
     except ValueError as error:  # rows of several lengths
@@ -439,6 +441,14 @@ def complete_card(card: dict) -> dict:
             raise StoreError(f"The card has {name}={words!r}; it must be a list of words, or be left out.")
         if name in card:
             card[name] = words if words is None else list(words)
+        told = card[name] if name != "warnings" and card.get(name) else ()
+        twice = [w for k, w in enumerate(told) if w in told[:k] or not w.isprintable()]
+        if twice:
+            raise StoreError(
+                f"The card has {name} with {twice[0]!r} twice or unprintable; give every entry its own name."
+            )
+    if not isinstance(card.get("alike", False), bool):
+        raise StoreError(f"The card has alike={card['alike']!r}; it must be true or false.")
     if isinstance(card["hazard"], hazards.Hazard):
         card["hazard"] = hazards.to_dict(card["hazard"])
     elif not isinstance(card["hazard"], dict):
@@ -470,14 +480,21 @@ def _is_sound(hazard: hazards.Hazard) -> bool:
     features = getattr(hazard, "features", ())
     sizes = ("radius", "safe_margin") if isinstance(hazard, hazards.Separation) else ("limit",)
     sized = all(getattr(hazard, name, 0.0) is not None for name in sizes)
-    return sized and isinstance(features, tuple) and all(isinstance(name, str) for name in features)
+    named = isinstance(features, tuple) and all(isinstance(name, str) for name in features)
+    return sized and named and (bool(features) or not isinstance(hazard, hazards.SpeedLimit))
 
 
 def _check_name(task) -> None:
     """A task's name becomes that of folders and files."""
-    if not isinstance(task, str) or not task.strip() or task in (".", "..") or set(task) & {"/", "\\", "\0"}:
+    try:
+        schemas.check(task, schemas.Name)
+        sound = bool(task.strip())
+    except ValueError:
+        sound = False
+    if not sound:
         raise StoreError(
-            f"The card has task={task!r}; it must be a name without slashes, since folders of runs are called so."
+            f"The card has task={repr(task)[:200]}; it must be a name without slashes, line breaks or a leading dot or "
+            "dash, of at most 120 letters, since folders of runs are called so."
         )
 
 

@@ -1,0 +1,256 @@
+"""Nothing that is read can hurt: it is refused in a sentence, or it is what it was; nothing outside is touched."""
+
+import json
+import os
+import random
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ringfence import evaluate
+from ringfence.bench import pack, rows
+from ringfence.bench.cells import statuses
+from ringfence.data.store import EpisodeStore
+from ringfence.errors import UserError
+from ringfence.report import board
+from ringfence.report.table import sections
+from ringfence.runs import Run
+from tests import corpus
+
+TASK = "simple_spread-expert"
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory):
+    """A results folder of one cell and its reference rows, as they are in the repository."""
+    from ringfence.bench import unpack
+
+    whole = tmp_path_factory.mktemp("whole") / "guards"
+    shutil.copytree(Path(__file__).parent.parent / "results" / "guards", whole, ignore=shutil.ignore_patterns("cells"))
+    unpack(whole)
+    few = tmp_path_factory.mktemp("few") / "guards"
+    few.mkdir()
+    shutil.copyfile(whole / "bench.json", few / "bench.json")
+    shutil.copytree(whole / "reference" / TASK, few / "reference" / TASK)
+    cell = next((whole / "cells" / TASK / "bc").glob("seed-0-*"))
+    shutil.copytree(cell, few / "cells" / TASK / "bc" / cell.name)
+    return few
+
+
+def tried(what: str, attempt) -> bool:
+    """Whether it was refused; anything but a refusal in a sentence fails."""
+    try:
+        attempt()
+    except UserError as error:
+        assert str(error).isprintable() and "Traceback" not in str(error), what
+        return True
+    except BaseException as error:
+        raise AssertionError(f"{what}: {type(error).__name__}: {error}") from error
+    return False
+
+
+@pytest.mark.parametrize("name", ["config", "results", "status", "env", "bench", "reference"])
+def test_json_of_strangers(results, tmp_path, name):
+    folder = shutil.copytree(results, tmp_path / "guards")
+    run = Run(next((folder / "cells" / TASK / "bc").iterdir()))
+    places = {"bench": folder / "bench.json", "reference": folder / "reference" / TASK / "reference.json"}
+    file = places.get(name, run.path / f"{name}.json")
+    readers = [lambda: rows(folder), lambda: board.read(folder), lambda: statuses(folder), lambda: sections([run])]
+    readers += [lambda: evaluate.load_job(run)] if name == "config" else []
+    raw, refused, count = file.read_bytes(), 0, 0
+    for what, content in corpus.broken_json(raw, random.Random(0)):
+        file.write_bytes(content)
+        refused += any([tried(f"{name}: {what}", read) for read in readers])
+        count += 1
+    assert count > 30 and (refused > count // 4 or name in ("env", "status"))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["guards"], "nothing is written beside it"
+
+
+def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
+    """A preset of a run that would lead outside is refused, and what lies there stays."""
+    victim = tmp_path / "victim.npz"
+    victim.write_text("mine")
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "a" / "b" / "run"))
+    told = json.loads((run.path / "config.json").read_text())
+    (run.path / "config.json").write_text(json.dumps(told | {"preset": "/../../../../victim"}))
+    for record in (0, 1):
+        with pytest.raises(UserError, match="no run folder that can be read"):
+            evaluate.evaluate(run, episodes=2, record=record)
+    assert victim.read_text() == "mine"
+
+
+@pytest.fixture(scope="module")
+def trained_run(tmp_path_factory):
+    from ringfence import training
+
+    told = {"view": "decentralized", "steps": 4, "width": 16}
+    return training.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=told, quiet=True)[0]
+
+
+def test_stores_of_strangers(tmp_path):
+    """A flipped bit is refused or changes no number; what claims too much or lies elsewhere is refused unread."""
+    store, file = corpus.small_store(), tmp_path / "s.h5"
+    raw = store.save(file).read_bytes()
+    refused = 0
+    for what, content in corpus.broken_bytes(raw, random.Random(1), 500):
+        file.write_bytes(content)
+        if tried(what, lambda: EpisodeStore.load(file)):
+            refused += 1
+        else:
+            assert EpisodeStore.load(file).content == store.content, what
+    assert refused > 150
+    for what, path in corpus.broken_stores(raw, tmp_path):
+        assert tried(what, lambda path=path: EpisodeStore.load(path)), what
+    os.mkfifo(tmp_path / "pipe")
+    for odd in (tmp_path / "pipe", tmp_path, tmp_path / "nothing"):
+        assert tried(str(odd), lambda odd=odd: EpisodeStore.load(odd))
+
+
+def test_opening_a_file_takes_no_more_than_it_holds(tmp_path):
+    """20 kB that claim 5 GB; measured in a process of its own."""
+    raw = corpus.small_store().save(tmp_path / "s.h5").read_bytes()
+    made = dict(corpus.broken_stores(raw, tmp_path))
+    (tmp_path / "edited.h5").unlink()
+    for what in ("costs huge", "all huge"):
+        path = next(p for w, p in corpus.broken_stores(raw, tmp_path) if w == what)
+        code = (
+            "import resource, sys\nfrom ringfence.data.store import EpisodeStore\n"
+            "from ringfence.errors import StoreError\n"
+            "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+            "try:\n    EpisodeStore.load(sys.argv[1])\nexcept StoreError:\n"
+            "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
+        )
+        told = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+        assert int(told.stdout) < 200 * 1024  # kB
+    assert made
+
+
+def test_checkpoints_of_strangers(trained_run, tmp_path):
+    """A damaged one is never believed: the one before is used, or the run is refused."""
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    file = run.checkpoints()[-1][1]
+    for other in run.checkpoints()[:-1]:
+        other[1].unlink()
+    raw = file.read_bytes()
+    head = 8 + int.from_bytes(raw[:8], "little")
+    for what, content in corpus.broken_bytes(raw, random.Random(2), 120):
+        file.write_bytes(content)
+        refused = tried(what, lambda: evaluate.load(run))
+        changed = len(content) < len(raw) or content[head:] != raw[head:]
+        assert refused or not changed, what
+
+
+def test_archives_of_strangers(results, tmp_path):
+    folder = shutil.copytree(results, tmp_path / "guards")
+    good = rows(folder)
+    archive = pack(folder)[0]
+    raw = archive.read_bytes()
+    for what, content in corpus.broken_bytes(raw, random.Random(3), 60):
+        for loose in ("cells", "reference"):
+            shutil.rmtree(folder / loose, ignore_errors=True)
+        archive.write_bytes(content)
+        assert tried(what, lambda: rows(folder)) or rows(folder) == good, what
+
+
+ARRAYS = {
+    "big-endian": lambda x: x.astype(">f4"),
+    "long double": lambda x: x.astype(np.longdouble),
+    "bool": lambda x: x > 0,
+    "complex": lambda x: x.astype(complex),
+    "words": lambda x: x.astype(str),
+    "objects": lambda x: x.astype(object),
+    "masked": lambda x: np.ma.masked_array(x, x > 0.5),
+    "1e300": lambda x: x.astype(np.float64) * 1e300,
+    "NaN": lambda x: np.where(x > 0, np.nan, x),
+    "flat": lambda x: x.ravel(),
+    "one axis more": lambda x: x[None],
+    "nobody": lambda x: x[:, :, :0],
+    "no step": lambda x: x[:, :0],
+    "no entry": lambda x: x[..., :0],
+    "list": lambda x: x.tolist(),
+    "ragged": lambda x: [x[0].tolist(), x[1, :2].tolist()],
+    "None": lambda x: None,
+    "text": lambda x: "observations",
+}
+
+
+@pytest.mark.parametrize("kind", ARRAYS)
+@pytest.mark.parametrize("place", ["observations", "actions", "rewards", "costs"])
+def test_arrays_of_strangers(place, kind):
+    """They become a store of plain numbers that can be kept, or are refused."""
+    rng = np.random.default_rng(0)
+    given = {
+        "observations": rng.normal(size=(4, 6, 2, 3)).astype(np.float32),
+        "actions": rng.uniform(-1, 1, (4, 5, 2, 2)).astype(np.float32),
+        "rewards": rng.normal(size=(4, 5, 2)).astype(np.float32),
+        "costs": (rng.random((4, 5, 2)) < 0.2).astype(np.float32),
+    }
+    given[place] = ARRAYS[kind](given[place])
+
+    def attempt():
+        store = EpisodeStore.from_episodes(**given, card={"task": "strange"})
+        for name in ("observations", "actions", "rewards", "costs"):
+            array = getattr(store, name)
+            assert array.dtype in (np.float32, np.float64) and array.dtype.isnative and np.isfinite(array).all()
+
+    tried(f"{place} {kind}", attempt)
+
+
+CARDS = {
+    "task": ["", " ", ".", "..", ".hidden", "a/b", "a\\b", "a\nb", "a\0b", "x" * 300, 3, None, ["x"], "\ud800", "-x"],
+    "hazard": [3, {"kind": ["x"]}, {"kind": "None"}, {"kind": "SpeedLimit", "limit": 1.0, "features": []}]
+    + [{"kind": "Separation", "radius": r} for r in (float("inf"), float("nan"), -1, "x", None, True)]
+    + [{"kind": "SpeedLimit", "limit": v, "features": ["o0"]} for v in (-1, float("inf"), "x", None)],
+    "observation_names": [["x", "x", "y"], ["x"], "xyz", [1, 2, 3], ["a\nb", "b", "c"]],
+    "action_low": [float("nan"), "x", None, 2.0, [0]],
+    "cost_limit": [-1, float("inf"), "x", [1]],
+    "alike": ["yes", 3],
+}
+
+
+@pytest.mark.parametrize(("field", "value"), [(k, v) for k, vs in CARDS.items() for v in vs], ids=repr)
+def test_cards_of_strangers(field, value):
+    rng = np.random.default_rng(0)
+    arrays = (
+        rng.normal(size=(4, 6, 2, 3)),
+        rng.uniform(-1, 1, (4, 5, 2, 2)),
+        rng.normal(size=(4, 5, 2)),
+        np.zeros((4, 5)),
+    )
+    with pytest.raises(UserError):
+        EpisodeStore.from_episodes(*arrays, card={field: value})
+
+
+def test_results_of_several_processes_are_all_kept(tmp_path):
+    code = (
+        "import sys\nfrom pathlib import Path\nfrom ringfence.runs import Run\nrun = Run(Path(sys.argv[1]))\n"
+        "for k in range(50):\n    run.add_result(f'{sys.argv[2]}-{k}', {'episodes': 1})"
+    )
+    started = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path), str(k)]) for k in range(4)]
+    assert [p.wait() for p in started] == [0] * 4
+    assert len(Run(tmp_path).results) == 200
+
+
+def test_what_is_no_regular_file_is_not_replaced(tmp_path):
+    from ringfence.files import whole
+
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "target").write_text("old")
+    (tmp_path / "link").symlink_to(tmp_path / "target")
+    (tmp_path / "file").write_text("x")
+    for name in ("pipe", "folder", "file/below", "x" * 300, "a\0b", ""):
+        with pytest.raises(UserError), whole(str(tmp_path / name) if name else "") as temporary:
+            Path(temporary).write_text("new")
+    with whole(tmp_path / "link") as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "target").read_text() == "new"
+    left = tmp_path / ".target.4194304.part"  # of a process that is no more
+    left.write_text("half")
+    with whole(tmp_path / "target") as temporary:
+        temporary.write_text("newer")
+    assert not left.exists()
