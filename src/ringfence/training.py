@@ -9,9 +9,10 @@ from __future__ import annotations
 import dataclasses
 import json
 import operator
+import shutil
 import time
-from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -198,7 +199,11 @@ def train(
     job = make_job(algorithm, task, preset, changes or {}, logs := task.logs(data), world)
     lessons = _Lessons(job, logs, quiet)
     place = folder or (lambda seed: folder_of(out, job, seed))
-    runs = [_prepare(Run(place(seed)), job, seed, data) for seed in seeds]
+    runs = [Run(place(seed)) for seed in seeds]
+    fresh = [run for run in runs if not run.path.exists()]
+    with _undone(fresh):
+        for run, seed in zip(runs, seeds):
+            _prepare(run, job, seed, data)
     steps = job.config.steps
     for run in runs:
         run.drop_damaged()
@@ -206,14 +211,33 @@ def train(
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
     if together and left:
-        _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
+        with _undone(fresh):
+            _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
     for run, seed in zip(runs, seeds):
         if run in left and not together:
-            program = _loop(job, lessons, [run], [seed], options, program)
+            with _undone(fresh):
+                program = _loop(job, lessons, [run], [seed], options, program)
         if on_finish:
             on_finish(run)
     return runs
+
+
+@contextmanager
+def _undone(fresh: list[Run]) -> Iterator[None]:
+    """A start that fails leaves no folder in the way of the right one."""
+    try:
+        yield
+    except Exception as error:
+        for run in fresh:
+            if not run.checkpoints():
+                shutil.rmtree(run.path, ignore_errors=True)
+        told = str(error)
+        if isinstance(error, MemoryError) or any(word in told for word in ("RESOURCE_EXHAUSTED", "Out of memory")):
+            raise UserError(
+                "This machine has not enough memory for that; lower batch, width, horizon or the number of seeds."
+            ) from error
+        raise
 
 
 def _seeds(given: Iterable[int]) -> tuple[int, ...]:
@@ -411,7 +435,7 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
     return Path(out) / job.task.name / name / f"seed-{seed}"
 
 
-def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
+def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
     card = data.card if regenerated(data.card) else data.card | {"content": data.content}
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
@@ -428,10 +452,9 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> Run:
                 f"'{run.path}' holds another run (its {what} differs); give another --out or delete that folder.",
                 run.path,
             )
-    else:
-        write_json(run.path / "config.json", mine)
+    else:  # the config last: a folder without one is begun anew
         write_json(run.path / "env.json", environment())
-    return run
+        write_json(run.path / "config.json", mine)
 
 
 def _trim_metrics(run: Run, step: int) -> None:

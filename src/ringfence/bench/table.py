@@ -16,6 +16,7 @@ from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
 from ringfence.runs import Run
+from ringfence.words import spreadsheet
 
 TOLD = ("split", "protocol", "episodes", "task", "algorithm", "seed", "variant", "constants")  # by every evaluation
 COLUMNS = (
@@ -95,7 +96,8 @@ def write_csv(out: str | Path) -> Path:
     writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for r in rows(out):
-        writer.writerow({k: f"{v:.6g}" if isinstance(v := r.get(k, ""), float) else v for k in COLUMNS})
+        told = {k: f"{v:.6g}" if isinstance(v := r.get(k, ""), float) else spreadsheet(v) for k in COLUMNS}
+        writer.writerow(told)
     path = Path(out) / "table.csv"
     with whole(path) as temporary:
         temporary.write_text(buffer.getvalue())

@@ -6,12 +6,13 @@ import csv
 import io
 from pathlib import Path
 
-from ringfence.errors import unknown
+from ringfence.errors import plain, unknown
 from ringfence.files import whole
 from ringfence.report.board import Board, Method, read
 from ringfence.report.board_page import rankings, short
 from ringfence.report.page import share
 from ringfence.report.standings import Standing, references, standings
+from ringfence.words import latex, markdown, spreadsheet
 
 # CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
 COLUMNS = (
@@ -50,7 +51,7 @@ def board_csv(board: Board) -> str:
     for task, rows in _rows(board).items():
         for r in rows:
             known = {"suite": board.suite, "task": task} | (_absent(r) if isinstance(r, Method) else _numbers(r))
-            writer.writerow({k: _plain(v) for k, v in known.items()})
+            writer.writerow({k: spreadsheet(_plain(v)) for k, v in known.items()})
     return file.getvalue()
 
 
@@ -95,21 +96,7 @@ def _plain(value):
 
 # --- LaTeX ---
 
-SPECIAL = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "≤": r"$\le$",
-    "±": r"$\pm$",
-    "–": "--",
-    "−": "$-$",
-} | {c: f"\\{c}" for c in "&%$#_{}"}
 HEAD = r"Method & Return & Norm.\ return & Cost & Avoidable cost & Unsafe episodes (\%) & Seeds \\"
-
-
-def escape(text: str) -> str:
-    """Text that LaTeX prints as it stands."""
-    return "".join(SPECIAL.get(c, c) for c in text)
 
 
 def board_latex(board: Board) -> str:
@@ -120,7 +107,7 @@ def board_latex(board: Board) -> str:
         limit = f", cost limit {c['cost_limit']:g} per episode" if c else ""
         lines += [
             "",
-            f"% {task}{limit}, {board.episodes} {board.split} episodes per seed, protocol {board.protocol}",
+            f"% {plain(task)}{limit}, {board.episodes} {board.split} episodes per seed, protocol {board.protocol}",
             "% bold: the highest return within the limit; dagger: over the limit; in brackets: exact 95 % upper bound",
             r"\begin{tabular}{lrrrrrr}",
             r"\toprule",
@@ -138,7 +125,7 @@ def board_latex(board: Board) -> str:
 
 
 def _latex(r: Standing | Method) -> str:
-    name = escape(r.label)
+    name = latex(r.label)
     if isinstance(r, Method):
         return " & ".join([name, *["--"] * 5, "0"]) + r" \\"
     returns = _pm(r.returns, r.returns_sd, 1, r"\pm")
@@ -171,7 +158,7 @@ def board_markdown(board: Board) -> str:
         facts = (
             f", cost limit {c['cost_limit']:g}, normalised with {c['return_min']:g} → {c['return_max']:g}" if c else ""
         )
-        blocks.append(f"**{_cell(task)}**{facts}\n\n" + _table(columns, [_markdown(r, board, ends) for r in rows]))
+        blocks.append(f"**{markdown(task)}**{facts}\n\n" + _table(columns, [_markdown(r, board, ends) for r in rows]))
     return "\n\n".join([*blocks, "± standard deviation between seeds. " + _legend(board)]) + "\n"
 
 
@@ -233,13 +220,10 @@ def _legend(board: Board) -> str:
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
-    lines = [head, ["---"] + ["---:"] * (len(head) - 1), *([_cell(c) for c in row] for row in rows)]
+    """The first cell of a row is a name."""
+    lines = [[markdown(h) for h in head], ["---"] + ["---:"] * (len(head) - 1)]
+    lines += [[markdown(name), *cells] for name, *cells in rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _cell(text: str) -> str:
-    """A bar would end the cell, an underscore might begin an emphasis."""
-    return text.replace("|", "\\|").replace("_", "\\_")
 
 
 FORMS = {

@@ -22,6 +22,7 @@ MARKERS = "osD^vPX*"
 FAR = 8.0  # times the limit: axes of cost that reach further are not linear
 INK, GRID = "#010203", "#010204"
 STYLE = {
+    "text.parse_math": False,  # a name with $ is a name
     "svg.fonttype": "none",
     "svg.hashsalt": "ringfence",
     "font.family": "sans-serif",

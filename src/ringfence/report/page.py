@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.table import NAMES, Row, Section, sections
 from ringfence.runs import Run
+from ringfence.words import shell
 
 HERE = Path(__file__).parent
 WORDS = {  # hazard -> (what the cost counts, what a violation is)
@@ -260,16 +260,18 @@ def _fields(section: Section, k: int) -> list[dict]:
 def commands(section: Section, out: Path) -> list[str]:
     """Shell lines that make this section's numbers again."""
     card, lines = section.card, []
-    data = section.task
+    data = shell(section.task)
     if regenerated(card):
         steps = card.get("size", card.get("transitions"))
         full = tasks.TASKS[section.task].transitions if section.task in tasks.TASKS else None
         if card.get("seed", 0) == 0 and steps in (None, full):
-            lines.append(f"ringfence data make {section.task}" + ("" if steps else "  # its size was not recorded"))
+            lines.append(
+                f"ringfence data make {shell(section.task)}" + ("" if steps else "  # its size was not recorded")
+            )
         else:
-            data = f"{section.task}.h5"
+            data = shell(f"{section.task}.h5")
             size = f" --size {steps}" if steps else ""
-            lines.append(f"ringfence data make {section.task}{size} --seed {card.get('seed', 0)} --out {data}")
+            lines.append(f"ringfence data make {shell(section.task)}{size} --seed {card.get('seed', 0)} --out {data}")
     else:
         data = "DATA.h5"
     jobs: dict[tuple[str, str, str, str], list[Run]] = {}
@@ -279,15 +281,15 @@ def commands(section: Section, out: Path) -> list[str]:
         root = str(run.path.parent.parent.parent)
         jobs.setdefault((told["algorithm"], told["preset"], changed, root), []).append(run)
     for (algorithm, preset, changed, root), members in jobs.items():
-        line = ["ringfence", "train", algorithm, data]
+        line = ["ringfence", "train", shell(algorithm), data]
         if preset != _usual_preset(algorithm, section.task):
-            line += ["--preset", preset]
+            line += ["--preset", shell(preset)]
         for first, count in _stretches(sorted(r.config["seed"] for r in members)):
             tail = [f"--seeds {count}"] + ([f"--first-seed {first}"] if first else [])
             if root != "runs":
-                tail.append(f"--out {shlex.quote(root)}")
+                tail.append(f"--out {shell(root)}")
             if given := json.loads(changed):
-                tail.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))
+                tail.append("--set " + " ".join(shell(f"{k}={v}") for k, v in given.items()))
             lines.append(" ".join(line + tail))
     evaluations: dict[tuple, list[str]] = {}
     for row in section.rows:
@@ -296,10 +298,10 @@ def commands(section: Section, out: Path) -> list[str]:
             split = " --split validation" if row.split == "validation" else ""
             step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
             how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
-            evaluations.setdefault((how,), []).append(shlex.quote(str(run.path)))
+            evaluations.setdefault((how,), []).append(shell(str(run.path)))
     lines += [f"ringfence eval {' '.join(dict.fromkeys(paths))} {how}" for (how,), paths in evaluations.items()]
-    roots = dict.fromkeys(shlex.quote(str(r.path.parent.parent)) for r in section.runs)
-    lines.append(f"ringfence report {' '.join(roots)} --out {shlex.quote(str(out))}")
+    roots = dict.fromkeys(shell(str(r.path.parent.parent)) for r in section.runs)
+    lines.append(f"ringfence report {' '.join(roots)} --out {shell(str(out))}")
     return lines
 
 
@@ -323,7 +325,7 @@ def _how(result: dict) -> str:
         usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"], usual)
         given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
     if given:
-        words.append("--set " + " ".join(shlex.quote(f"{k}={v}") for k, v in given.items()))
+        words.append("--set " + " ".join(shell(f"{k}={v}") for k, v in given.items()))
     return " ".join(words)
 
 
