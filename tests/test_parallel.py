@@ -146,3 +146,44 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
     with pytest.raises(UserError, match="episodes=0 must be at least 1"):
         play(run, SimpleSpreadParallel, episodes=0)
     assert evaluate.load_job(run).task.cost_limit == 3
+
+
+class Odd(SimpleSpreadParallel):
+    """Tells one of the five otherwise."""
+
+    place, value = 0, None
+
+    def step(self, actions):
+        told = list(super().step(actions))
+        told[self.place] = self.value(told[self.place]) if callable(self.value) else self.value
+        return tuple(told)
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "said"),
+    [
+        *((k, None, "returned a NoneType; each of its five is a dict") for k in range(5)),
+        (1, lambda r: dict.fromkeys(r, "much"), "tells the reward 'much', which is no number"),
+        (1, lambda r: dict.fromkeys(r, [1, 2]), "is no number"),
+        (1, lambda r: dict.fromkeys(r, float("nan")), "not finite"),
+        (4, lambda i: dict.fromkeys(i, {"cost": "x"}), "tells the cost 'x'"),
+        (4, lambda i: dict.fromkeys(i, {"cost": -1}), "a cost is 0 or positive"),
+        (4, lambda i: dict.fromkeys(i, 3), "pass cost="),
+        (0, lambda s: dict.fromkeys(s, "far"), "no array of numbers"),
+        (3, lambda t: dict.fromkeys(t, False), "has not ended after 20 steps"),
+    ],
+)
+def test_simulators_that_tell_nonsense(run, place, value, said):
+    kind = type("Odd", (Odd,), {"place": place, "value": staticmethod(value) if callable(value) else value})
+    with pytest.raises(UserError, match=said):
+        play(run, kind, episodes=1, longest=20)
+
+
+def test_agents_have_names_of_their_own(run):
+    class Twins(SimpleSpreadParallel):
+        def __init__(self):
+            super().__init__()
+            self.possible_agents = ["a", "a", "b"]
+
+    with pytest.raises(UserError, match="names an agent twice"):
+        play(run, Twins, episodes=1)

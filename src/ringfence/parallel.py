@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -29,6 +29,7 @@ def play(
     seed: int = 0,
     cost: Cost | None = None,
     at_once: int = 16,
+    longest: int | None = None,
     quiet: bool = True,
     **options,
 ) -> dict:
@@ -37,7 +38,8 @@ def play(
     `make_env()` makes a PettingZoo `ParallelEnv` whose agents, in the order of `possible_agents`, are those of the
     run's data, and who begin and end together. `at_once` of them are stepped side by side, so that one compiled call
     acts in all. Episode k is reset with the seed 7 000 001 + k, on the split "validation", for choosing settings,
-    with 9 000 001 + k; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are
+    with 9 000 001 + k; one that has not ended after `longest` steps (twenty times the longest logged one, at least
+    10 000) is refused; `seed` moves the policy's noise. `planner` and `options` (guard, danger, sight, world, ...) are
     as in `evaluate.load`.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
@@ -51,7 +53,10 @@ def play(
             raise UserError(f"{name}={value} must be at least 1.")
     if split not in evaluate.RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
+    if longest is not None and longest < 1:
+        raise UserError(f"longest={longest} must be at least 1, the most steps that an episode may take.")
     job, policy = evaluate.load(run, planner=planner, **options)
+    most = longest or max(10_000, 20 * job.spec.episode_length)
     envs = [make_env() for _ in range(min(at_once, episodes))]
     if len({id(env) for env in envs}) < len(envs):
         raise UserError(
@@ -70,7 +75,7 @@ def play(
     with Progress(f"{job.algorithm.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
         for first in range(0, episodes, len(envs)):
             seeds = range(first, min(first + len(envs), episodes))
-            table = [_Episode(env, job, evaluate.RESETS[split] + k) for env, k in zip(envs, seeds)]
+            table = [_Episode(env, job, evaluate.RESETS[split] + k, most) for env, k in zip(envs, seeds)]
             if formula:
                 for episode, unsafe in zip(table, np.asarray(label(*_seen(table)))):
                     episode.unsafe_start = bool(unsafe)
@@ -106,13 +111,15 @@ def play(
 class _Episode:
     """One episode under way: what its agents see, and what they have earned and cost."""
 
-    def __init__(self, env: Any, job: Job, seed: int):
+    def __init__(self, env: Any, job: Job, seed: int, longest: int):
         lacking = [name for name in ("possible_agents", "reset", "step") if not hasattr(env, name)]
         if lacking:
             raise UserError(
                 f"make_env() made a {type(env).__name__} without {lacking[0]}; give a PettingZoo ParallelEnv."
             )
-        self.env, self.job, self.agents = env, job, list(env.possible_agents)
+        self.env, self.job, self.agents, self.longest = env, job, list(env.possible_agents), longest
+        if len(set(map(str, self.agents))) < len(self.agents):
+            raise UserError(f"{type(env).__name__} names an agent twice in possible_agents; give each its own name.")
         if len(self.agents) != job.team:
             remedy = f"; pass agents={len(self.agents)}" if job.task.alike else ""
             raise UserError(
@@ -146,23 +153,32 @@ class _Episode:
 
     def step(self, action: np.ndarray, cost: Cost | None) -> None:
         """Act (N, A) and take note of what came of it."""
-        told = self.env.step(dict(zip(self.agents, action)))
-        if len(told) not in (5, 6):
-            raise UserError(
-                f"step() of {type(self.env).__name__} returned {len(told)} things; a ParallelEnv's are five."
-            )
+        told, name = self.env.step(dict(zip(self.agents, action))), type(self.env).__name__
+        if not isinstance(told, tuple | list) or len(told) not in (5, 6):
+            count = len(told) if hasattr(told, "__len__") else 1
+            raise UserError(f"step() of {name} returned {count} things; a ParallelEnv's are five.")
+        if odd := [type(part).__name__ for part in told if not isinstance(part, Mapping)]:
+            raise UserError(f"step() of {name} returned a {odd[0]}; each of its five is a dict by agent.")
         seen, rewards, *costs, terminations, truncations, infos = told
         self._all_in("rewards", rewards, len(self.rewards) + 1)
         ended = [bool(terminations.get(a) or truncations.get(a)) for a in self.agents]
         if any(ended) and not all(ended):
             gone = self.agents[ended.index(True)]
             raise UserError(f"{gone} ended at step {len(self.rewards) + 1} before its team; agents must end together.")
-        self.rewards.append(float(np.mean([rewards[a] for a in self.agents])))
-        each = costs[0] if costs else {a: i["cost"] for a, i in infos.items() if "cost" in i}
+        self.rewards.append(float(np.mean([_number(rewards[a], "reward", name) for a in self.agents])))
+        told_of = {a: i for a, i in infos.items() if isinstance(i, Mapping)}
+        each = costs[0] if costs else {a: i["cost"] for a, i in told_of.items() if "cost" in i}
         if cost is not None:
-            self.costs.append(float(cost(infos)))
+            self.costs.append(_number(cost(infos), "cost", "cost="))
         elif each:
-            self.costs.append(float(max(each.values())))
+            self.costs.append(max(_number(c, "cost", name) for c in each.values()))
+        if self.costs[-1:] and self.costs[-1] < 0:
+            raise UserError(f"Step {len(self.rewards)} has the cost {self.costs[-1]:g}; a cost is 0 or positive.")
+        if len(self.rewards) >= self.longest and not all(ended):
+            raise UserError(
+                f"An episode of {name} has not ended after {self.longest} steps; let truncations end it, or pass "
+                "longest=."
+            )
         if not np.isfinite([*self.rewards[-1:], *self.costs[-1:]]).all():
             raise UserError(f"Step {len(self.rewards)} has a reward or cost that is not finite; repair the simulator.")
         self.running = not all(ended)
@@ -188,6 +204,13 @@ class _Episode:
         there = [seen[a] for a in self.agents]
         self.seen = evaluate.given_as("observations", there, (n, width))
         self.state = evaluate.given_as("state", self.env.state(), (state_width,)) if state_width else None
+
+
+def _number(value: Any, what: str, whose: str) -> float:
+    try:
+        return float(np.asarray(value, np.float64).reshape(()))
+    except (TypeError, ValueError):
+        raise UserError(f"{whose} tells the {what} {str(value)[:80]!r}, which is no number; give one.") from None
 
 
 def _seen(table: list[_Episode]) -> tuple[np.ndarray, np.ndarray | None]:
