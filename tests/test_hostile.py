@@ -254,3 +254,41 @@ def test_what_is_no_regular_file_is_not_replaced(tmp_path):
     with whole(tmp_path / "target") as temporary:
         temporary.write_text("newer")
     assert not left.exists()
+
+
+NUMBERS = (None, "x", 2.5, float("nan"), -1, True, {}, 10**30)
+
+
+@pytest.mark.parametrize("value", NUMBERS, ids=repr)
+def test_numbers_of_strangers(trained_run, value, tmp_path):
+    """None, floats, words and what no machine can count, where a whole number belongs."""
+    from ringfence import Controller, play, tasks, training
+    from ringfence.bench import make_grid
+    from ringfence.data.make import make
+
+    store = corpus.small_store()
+    for attempt in (
+        lambda: evaluate.evaluate(trained_run, episodes=value),
+        lambda: evaluate.evaluate(trained_run, record=value),
+        lambda: evaluate.load(value),
+        lambda: Controller(trained_run, seed=value),
+        lambda: Controller(trained_run, agents=value or -1),
+        lambda: play(trained_run, object, episodes=value),
+        lambda: training.train("bc", store, out=tmp_path, seeds=value),
+        lambda: training.train("bc", store, out=tmp_path, seeds=(value,)),
+        lambda: training.train("bc", store, out=tmp_path, changes={"batch": value}),
+        lambda: training.train("bc", store, out=tmp_path, changes={"steps": value}),
+        lambda: make(tasks.get("simple_spread-random"), value if value is not None else 0),
+        lambda: make(tasks.get("simple_spread-random"), 25, value),
+        lambda: make_grid("guards", tmp_path, seeds=value),
+    ):
+        assert tried(f"{value!r}", attempt), attempt.__code__.co_names
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"PYTHONIOENCODING": "cp1252"}, {"HOME": ""}])
+def test_terminals_of_few_letters_and_users_without_a_home(environment):
+    told = {k: v for k, v in os.environ.items() if k not in ("HOME", "RINGFENCE_HOME", "XDG_CACHE_HOME")}
+    code = "from ringfence.cli import main; main(['tasks'])"
+    done = subprocess.run([sys.executable, "-c", code], env={**told, **environment}, capture_output=True)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr

@@ -143,7 +143,7 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
     shared = SimpleSpreadParallel()
     with pytest.raises(UserError, match="gave the same SimpleSpreadParallel twice"):
         play(run, lambda: shared, episodes=2)
-    with pytest.raises(UserError, match="episodes=0 must be at least 1"):
+    with pytest.raises(UserError, match="episodes=0 must be a whole number from 1"):
         play(run, SimpleSpreadParallel, episodes=0)
     assert evaluate.load_job(run).task.cost_limit == 3
 

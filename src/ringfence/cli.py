@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, whole_number
 from ringfence.files import writable
 from ringfence.words import terminal
 
@@ -201,6 +201,7 @@ def train(
     from ringfence import training
 
     changes = _assignments(set)
+    whole_number("seeds", seeds, 1, 10_000)
     _early(algorithm, preset, changes)
     runs = training.train(
         algorithm,

@@ -18,7 +18,7 @@ import numpy as np
 
 from ringfence import algos, features, hazards, stats, tasks, training, worlds
 from ringfence.each import Each, look
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError, unknown, whole_number
 from ringfence.files import whole, writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
 from ringfence.guards.policy import build
@@ -247,10 +247,7 @@ def evaluate_policy(
     `act` (types.Policy); Simple Spread, which runs inside JAX, by pytrees."""
     if task.env is None:
         raise UserError(f"Task '{task.name}' exists only as data, so nothing can be evaluated; use a simulated task.")
-    if episodes < 1:
-        raise UserError(f"episodes={episodes} must be at least 1.")
-    if record < 0:
-        raise UserError(f"record={record} must be 0 or more: the number of episodes to keep for the report.")
+    episodes, record = whole_number("episodes", episodes, 1, 10**7), whole_number("record", record)
     record = min(record, episodes)
     begun = time.perf_counter()
     played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
@@ -321,8 +318,8 @@ def asked(
     for name in plan:
         if name not in (names := {f.name for f in dataclasses.fields(PlanOptions)}):
             raise unknown("option of planner or guard", name, names | fields)
-    if agents is not None and (isinstance(agents, bool) or not isinstance(agents, int | np.integer) or agents < 1):
-        raise UserError(f"agents={agents!r} must be a whole number, at least 1.")
+    if agents is not None:
+        whole_number("agents", agents, 1, 100_000)
     found = Asked(planner, guard, danger or "learned", sight, world, agents, plan, given)
     if not found.guarded and (danger is not None or sight == "own" or world is not None):
         told = next(k for k, v in (("danger", danger), ("sight", sight == "own"), ("world", world)) if v)
@@ -365,7 +362,7 @@ class Controller:
 
     def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
         self.job, self.policy = load(run, planner=planner, **options)
-        self._key = jax.random.key(seed)
+        self._key = jax.random.key(whole_number("seed", seed, 0, 2**31 - 1))
         self._act = jax.jit(act_with)
         self.info: dict[str, np.ndarray] = {}
         self.reset()
@@ -517,6 +514,8 @@ def evaluate(
     the checkpoint that was played; where training is unfinished, a line on stderr says so.
     """
     run, how = Run.of(run), asked(planner, **options)
+    whole_number("episodes", episodes, 1, 10**7)
+    whole_number("record", record)
     job, policy, at = _loaded(run, step, how)
     _ = run.results, writable(run.path / "results.json")  # what cannot be kept is refused before anything is played
     if step is None and at < job.config.steps:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ringfence import evaluate
 from ringfence.each import look
-from ringfence.errors import UserError
+from ringfence.errors import UserError, whole_number
 from ringfence.progress import Progress
 from ringfence.runs import Run
 from ringfence.training import Job
@@ -48,13 +48,10 @@ def play(
 
     The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
     """
-    for name, value in (("episodes", episodes), ("at_once", at_once)):
-        if value < 1:
-            raise UserError(f"{name}={value} must be at least 1.")
+    for name, value in (("episodes", episodes), ("at_once", at_once), ("longest", 1 if longest is None else longest)):
+        whole_number(name, value, 1)
     if split not in evaluate.RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
-    if longest is not None and longest < 1:
-        raise UserError(f"longest={longest} must be at least 1, the most steps that an episode may take.")
     job, policy = evaluate.load(run, planner=planner, **options)
     most = longest or max(10_000, 20 * job.spec.episode_length)
     envs = [make_env() for _ in range(min(at_once, episodes))]

@@ -45,6 +45,8 @@ class Run:
     @classmethod
     def of(cls, run: Run | str | Path) -> Run:
         """A run, or the one in the folder that is named."""
+        if not isinstance(run, Run | str | Path) or not str(getattr(run, "path", run)).strip():
+            raise UserError(f"{str(run)[:60]!r} is no run; give the folder that `ringfence train` made.")
         return run if isinstance(run, Run) else cls(Path(run))
 
     @property
@@ -177,7 +179,9 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 
 
 # Least and largest value that a field of this name may have, in whatever config it is.
-RANGES = dict.fromkeys(("steps", "batch", "width", "depth", "diffusion_steps", "inverse_width"), (1, None))
+RANGES = {"steps": (1, 10**9), "batch": (1, 10**8), "width": (1, 10**5), "depth": (1, 1000), "horizon": (2, 10_000)}
+RANGES |= {"plans": (1, 10_000), "starts": (1, 10_000), "rows": (1, 10_000), "refine": (0, 10**6), "shield": (0, 10**6)}
+RANGES |= dict.fromkeys(("diffusion_steps", "inverse_width"), (1, 10**5))
 RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "gradient_batch", "barrier_updates"), (1, None))
 RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates", "dynamics_width"), (1, None))
 RANGES |= {
@@ -194,7 +198,7 @@ RANGES |= dict.fromkeys(("history", "warmup", "barrier_weight", "delta", "cql_we
 RANGES |= dict.fromkeys(("alpha", "multiplier_rate", "multiplier_max", "action_penalty", "logit_penalty"), (0, None))
 RANGES |= dict.fromkeys(("search_deviation", "target_noise", "target_noise_clip", "inverse_noise"), (0, None))
 RANGES |= dict.fromkeys(("temperature_reward", "temperature_danger", "snr_floor", "snr_ceiling"), (0, None))
-RANGES |= {"horizon": (2, None), "grad_clip": (0, None), "cost_limit": (0, None)}
+RANGES |= {"grad_clip": (0, None), "cost_limit": (0, None)}
 POSITIVE = ("lr", "clip")
 
 
@@ -203,7 +207,12 @@ def _in_range(of: str, name: str, value: Any) -> None:
     if not isinstance(value, int | float) or isinstance(value, bool):
         return
     if not abs(value) < 2**53 or (low is not None and value < low) or (high is not None and value > high):
-        bound = "finite" if low is None else f"at least {low}" if high is None else f"between {low} and {high}"
+        if high is not None and high <= 1000:
+            bound = f"between {low} and {high}"
+        elif low is not None and value < low:
+            bound = f"at least {low}"
+        else:
+            bound = "finite" if high is None else f"at most {high}"
         raise UserError(f"{name}={value} of {of} must be {bound}.")
     if name in POSITIVE and value <= 0:
         raise UserError(f"{name}={value} of {of} must be positive.")

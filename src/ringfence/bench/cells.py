@@ -27,7 +27,7 @@ from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
 from ringfence.data.make import make
 from ringfence.data.origin import other_data
 from ringfence.data.store import EpisodeStore
-from ringfence.errors import RunConflict, UserError, unknown
+from ringfence.errors import RunConflict, UserError, unknown, whole_number
 from ringfence.files import whole
 from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
@@ -235,8 +235,7 @@ def make_grid(
         raise unknown("suite", suite, SUITES)
     chosen = SUITES[suite]
     episodes = chosen.episodes if episodes is None else episodes
-    if seeds < 1 or episodes < 1:
-        raise UserError(f"seeds={seeds} and episodes={episodes} must be at least 1.")
+    seeds, episodes = whole_number("seeds", seeds, 1, 10_000), whole_number("episodes", episodes, 1, 10**7)
     names, only = tuple(only_tasks) or chosen.tasks, tuple(only)
     for name in names:
         if name not in chosen.tasks:

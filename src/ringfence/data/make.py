@@ -10,7 +10,7 @@ from pathlib import Path
 from ringfence import __version__, hazards
 from ringfence.data.cache import cache_dir
 from ringfence.data.store import EpisodeStore
-from ringfence.errors import StoreError, UserError
+from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.files import writable
 from ringfence.tasks import Task, siblings
 
@@ -24,8 +24,7 @@ def make(
     if recipe is None:
         raise UserError(f"Task '{task.name}' has no simulator to regenerate data with; import its files instead.")
     transitions = task.transitions if transitions is None else transitions
-    if transitions < 1 or seed < 0:
-        raise UserError(f"size={transitions} and seed={seed} must be a positive size and a seed of 0 or more.")
+    transitions, seed = whole_number("size", transitions, 1), whole_number("seed", seed, 0, 2**31 - 1)
     transitions = recipe.whole(task, transitions)
     cached = _kept(task.name, transitions, seed)
     path = writable(out) if out else cached
