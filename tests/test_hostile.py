@@ -292,3 +292,17 @@ def test_terminals_of_few_letters_and_users_without_a_home(environment):
     code = "from ringfence.cli import main; main(['tasks'])"
     done = subprocess.run([sys.executable, "-c", code], env={**told, **environment}, capture_output=True)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
+
+
+def test_ctrl_c_is_not_swallowed():
+    """One that falls into a destructor, where Python prints and forgets it, ends the work at its next step."""
+    code = (
+        "import os, signal, time\nfrom ringfence import interrupts\nfrom ringfence.progress import Progress\n"
+        "class Last:\n    def __del__(self):\n        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(0.01)\n"
+        "interrupts.listen()\nx = Last()\ndel x\n"
+        "try:\n    Progress('work', 2, quiet=True).advance(1)\nexcept KeyboardInterrupt:\n    print('heard')\n"
+        "interrupts.listen()\ntry:\n    with interrupts.held():\n        os.kill(os.getpid(), signal.SIGINT)\n"
+        "        time.sleep(0.01)\n        print('finished')\nexcept KeyboardInterrupt:\n    print('heard')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["heard", "finished", "heard"]

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
+from ringfence import interrupts
 from ringfence.errors import UserError, whole_number
 from ringfence.files import writable
 from ringfence.words import terminal
@@ -635,6 +636,7 @@ COMMANDS = {
 
 def main(arguments: list[str] | None = None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
+    interrupts.listen()
     for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")

@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Rich
 
+from ringfence import interrupts
+
 SHOWN = (
     "loss/denoising",
     "loss/shaping",
@@ -49,6 +51,7 @@ class Progress:
             self.bar.stop()
 
     def advance(self, count: int, metrics: dict[str, float] | None = None) -> None:
+        interrupts.check()
         self.done += count
         note = "  ".join(f"{k.split('/')[-1]} {metrics[k]:.3g}" for k in SHOWN if metrics and k in metrics)
         if self.terminal:

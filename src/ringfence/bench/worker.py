@@ -42,8 +42,10 @@ def main() -> None:
     def say(**message) -> None:
         print(json.dumps(message), file=wire, flush=True)
 
+    from ringfence import interrupts
     from ringfence.bench import cells as grid
 
+    interrupts.listen()
     say(event="ready")
     for line in sys.stdin:
         job = json.loads(line)

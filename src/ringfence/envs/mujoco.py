@@ -26,6 +26,7 @@ from typing import ClassVar, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence import interrupts
 from ringfence.errors import UserError, unknown
 from ringfence.features import VIEWS, FeatureMap
 from ringfence.types import Array
@@ -349,13 +350,15 @@ class _Batch:
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         self._batch.reset(ids=ids, stage=0)
         self.qpos[ids], self.qvel[ids] = qpos, qvel
-        self._batch.forward(ids=ids)
+        with interrupts.held():
+            self._batch.forward(ids=ids)
         self.warmstart[ids] = warmstart
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
         if len(live):
             self._ctrl[:] = ctrl
-            self._batch.step(ids=live, nstep=FRAME_SKIP)
+            with interrupts.held():
+                self._batch.step(ids=live, nstep=FRAME_SKIP)
 
 
 class _Loop:
@@ -393,7 +396,8 @@ class _Loop:
         if self._pool is None:
             run(live)
         else:
-            list(self._pool.map(run, np.array_split(live, self._threads)))
+            with interrupts.held():
+                list(self._pool.map(run, np.array_split(live, self._threads)))
 
     def _read(self, k: int) -> None:
         d = self._data[k]
