@@ -182,8 +182,10 @@ def build_config(kind: type, changes: dict[str, Any], of: str) -> Any:
 RANGES = {"steps": (1, 10**9), "batch": (1, 10**8), "width": (1, 10**5), "depth": (1, 1000), "horizon": (2, 10_000)}
 RANGES |= {"plans": (1, 10_000), "starts": (1, 10_000), "rows": (1, 10_000), "refine": (0, 10**6), "shield": (0, 10**6)}
 RANGES |= dict.fromkeys(("diffusion_steps", "inverse_width"), (1, 10**5))
-RANGES |= dict.fromkeys(("barrier_width", "barrier_batch", "gradient_batch", "barrier_updates"), (1, None))
-RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates", "dynamics_width"), (1, None))
+RANGES |= dict.fromkeys(("barrier_batch", "gradient_batch", "barrier_updates"), (1, 10**9))
+RANGES |= {"barrier_width": (1, 10**5)}
+RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates"), (1, 10**9))
+RANGES |= {"dynamics_width": (1, 10**5)}
 RANGES |= {
     "members": (1, 20),
     "future_discount": (0, 0.999),

@@ -73,6 +73,14 @@ class Config(TypedDict):
     team: NotRequired[Positive]
 
 
+class World(TypedDict):
+    """What a World's file says of it."""
+
+    map: Map
+    spec: Spec
+    card: dict[str, Any]
+
+
 class PerEpisode(TypedDict, total=False):
     cost: list[float]
     unsafe_start: list[bool]

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -19,12 +19,13 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
-from ringfence import features, hazards
+from ringfence import features, hazards, schemas
 from ringfence.data.cache import cache_dir
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
 from ringfence.files import whole
 from ringfence.normalise import varying
+from ringfence.runs import build_config
 from ringfence.trees import load_named, named_arrays
 from ringfence.types import PyTree, Spec
 from ringfence.windows import WindowData, returns_to_go
@@ -411,9 +412,9 @@ def load(
     path = Path(path)
     try:
         with safe_open(path, "numpy") as f:
-            about: dict[str, Any] = json.loads((f.metadata() or {})["ringfence_world"])
+            about = schemas.decode((f.metadata() or {})["ringfence_world"], schemas.World)
         told = about["card"]
-        settings = Settings(**told["settings"])
+        settings = build_config(Settings, told["settings"], "the World")
         spec = Spec(**{**about["spec"], "feature_names": tuple(about["spec"]["feature_names"])})
         map = map_of(spec.task, settings.view, told["data"]["hazard"]) or features.from_dict(about["map"])
         map = features.alone(map) if settings.sight == "own" else map
@@ -422,7 +423,7 @@ def load(
         world = load_named(path, _blank(map, spec, settings))
     except UserError:
         raise
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+    except Exception as error:  # what is in it may be anything
         raise UserError(
             f"'{path}' is no World that can be read ({type(error).__name__}); fit it again with `ringfence fit`."
         ) from error
