@@ -19,7 +19,8 @@ def listen() -> None:
     global _asked
     _asked = False
     with suppress(ValueError):  # not in the main thread
-        signal.signal(signal.SIGINT, _heard)
+        if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background, where nobody means us
+            signal.signal(signal.SIGINT, _heard)
 
 
 def _heard(signum, frame) -> None:

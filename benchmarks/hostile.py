@@ -1,0 +1,181 @@
+"""Broken files by the thousand: how many are refused in a sentence, raise anything else, are believed although they
+have changed, hang, or leave something behind; and the memory that all of them take.
+
+    python benchmarks/hostile.py            # writes results/hostile.csv and docs/security.md's table; some minutes
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from readme import put
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from ringfence import evaluate, training, worlds  # noqa: E402
+from ringfence.bench import pack, rows, unpack  # noqa: E402
+from ringfence.bench.cells import statuses  # noqa: E402
+from ringfence.data.store import EpisodeStore  # noqa: E402
+from ringfence.errors import UserError  # noqa: E402
+from ringfence.report import board  # noqa: E402
+from ringfence.report.table import sections  # noqa: E402
+from ringfence.runs import Run  # noqa: E402
+from tests import corpus  # noqa: E402
+from tests.quick import QUICK_WORLD  # noqa: E402
+
+TASK = "simple_spread-expert"
+SECONDS = 20  # after which reading hangs
+HEAD = ("files", "tried", "refused", "read, unchanged", "traceback", "believed though changed", "hang", "left behind")
+
+
+class Hang(BaseException):
+    """It took too long."""
+
+
+def late(*_):
+    raise Hang
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--times", type=int, default=2, help="as many inputs as the tests try")
+    times = parser.parse_args().times
+    signal.signal(signal.SIGALRM, late)
+    warnings.simplefilter("ignore")
+    before, found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, []
+    with tempfile.TemporaryDirectory() as place:
+        os.environ["RINGFENCE_HOME"] = str(Path(place) / "home")
+        for name, cases in (("JSON of runs and results folders", json_files), ("stores", stores)):
+            found.append([name, *count(cases(Path(place), times), Path(place))])
+        for name, cases in (("checkpoints", checkpoints), ("Worlds", world_files), ("archives of results", archives)):
+            found.append([name, *count(cases(Path(place), times), Path(place))])
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    with (ROOT / "results" / "hostile.csv").open("w") as f:
+        writer = csv.writer(f, lineterminator="\n")
+        writer.writerows([HEAD, *found])
+    lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
+    lines += ["| " + " | ".join(map(str, row)) + " |" for row in found]
+    lines.append(f"\nPeak memory grew by {grown:.0f} MiB over all of it.")
+    put("docs/security.md", "hostile", "\n".join(lines))
+    sys.exit(any(sum(row[4:]) for row in found))
+
+
+Case = tuple[str, Callable, Callable]  # what was done, reading it, and whether what was read is what it was
+
+
+def count(cases: Iterator[Case], place: Path) -> list[int]:
+    told, there = Counter(), None
+    for what, read, same in cases:
+        there = there or set(place.rglob("*"))
+        signal.alarm(SECONDS)
+        try:
+            kind = "unchanged" if same(read()) else "believed"
+        except UserError:
+            kind = "refused"
+        except Hang:
+            kind = "hang"
+        except Exception as error:
+            kind = "traceback"
+            print(f"{what}: {type(error).__name__}: {error}", file=sys.stderr)
+        finally:
+            signal.alarm(0)
+        told[kind] += 1
+        told["tried"] += 1
+    told["left"] = len({p for p in set(place.rglob("*")) - there if p.name.endswith(".part") or p.name == "victim"})
+    return [told[k] for k in ("tried", "refused", "unchanged", "traceback", "believed", "hang", "left")]
+
+
+def always(_) -> bool:
+    return True
+
+
+def folder_of_results(place: Path) -> Path:
+    whole, few = place / "whole", place / "few"
+    if not few.exists():
+        whole.mkdir()
+        for name in ("bench.json", "runs.tar.xz", "curves.tar.xz"):
+            shutil.copyfile(ROOT / "results" / "guards" / name, whole / name)
+        unpack(whole)
+        shutil.copytree(whole / "reference" / TASK, few / "reference" / TASK)
+        shutil.copyfile(whole / "bench.json", few / "bench.json")
+        cell = next((whole / "cells" / TASK / "bc").glob("seed-0-*"))
+        shutil.copytree(cell, few / "cells" / TASK / "bc" / cell.name)
+    return few
+
+
+def json_files(place: Path, times: int) -> Iterator[Case]:
+    folder = folder_of_results(place)
+    run = Run(next((folder / "cells" / TASK / "bc").iterdir()))
+    files = [run.path / f"{n}.json" for n in ("config", "results", "status", "env")]
+    files += [folder / "bench.json", folder / "reference" / TASK / "reference.json"]
+    readers = [lambda: rows(folder), lambda: board.read(folder), lambda: statuses(folder), lambda: sections([run])]
+    readers.append(lambda: evaluate.load_job(run))
+    for file in files:
+        raw = file.read_bytes()
+        for what, content in corpus.broken_json(raw, random.Random(times), each=times):
+            file.write_bytes(content)
+            for read in readers:
+                yield f"{file.name}: {what}", read, always
+        file.write_bytes(raw)
+
+
+def stores(place: Path, times: int) -> Iterator[Case]:
+    store, file = corpus.small_store(), place / "s.h5"
+    raw = store.save(file).read_bytes()
+    for what, content in corpus.broken_bytes(raw, random.Random(times), 500 * times):
+        file.write_bytes(content)
+        yield what, lambda: EpisodeStore.load(file), lambda s: s.content == store.content
+    for what, path in corpus.broken_stores(raw, place):
+        yield what, lambda path=path: EpisodeStore.load(path), lambda s: False
+
+
+def checkpoints(place: Path, times: int) -> Iterator[Case]:
+    told = {"view": "decentralized", "steps": 4, "width": 16}
+    run = training.train("bc", corpus.small_store(), out=place / "runs", changes=told, quiet=True)[0]
+    for _, old in run.checkpoints()[:-1]:
+        old.unlink()
+    file = run.checkpoints()[-1][1]
+    raw = file.read_bytes()
+    head = 8 + int.from_bytes(raw[:8], "little")
+    for what, content in corpus.broken_bytes(raw, random.Random(times), 50 * times):
+        file.write_bytes(content)
+        same = len(content) == len(raw) and content[head:] == raw[head:]
+        yield what, lambda: evaluate.load(run), lambda _, same=same: same
+
+
+def world_files(place: Path, times: int) -> Iterator[Case]:
+    from ringfence.world import save
+
+    file = save(worlds.fit(corpus.small_store(), **QUICK_WORLD), place / "world.safetensors")
+    raw = file.read_bytes()
+    head = 8 + int.from_bytes(raw[:8], "little")
+    for what, content in corpus.broken_bytes(raw, random.Random(times), 50 * times, head):
+        file.write_bytes(content)
+        yield what, lambda: worlds.load(file), always
+
+
+def archives(place: Path, times: int) -> Iterator[Case]:
+    folder = folder_of_results(place)
+    good, archive = rows(folder), pack(folder)[0]
+    raw = archive.read_bytes()
+    for what, content in corpus.broken_bytes(raw, random.Random(times), 60 * times):
+        for loose in ("cells", "reference"):
+            shutil.rmtree(folder / loose, ignore_errors=True)
+        archive.write_bytes(content)
+        yield what, lambda: rows(folder), lambda found: found == good
+
+
+if __name__ == "__main__":
+    main()
