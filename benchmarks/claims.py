@@ -12,8 +12,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from attribution import FULL, QUESTIONS, SHIELD, Question, answers
-from evidence import mean, of, tasks_of
+from evidence import evaluations, mean, of, tasks_of
 from readme import put
 
 from ringfence.report import board, standings
@@ -60,6 +61,24 @@ def chance(found: list) -> bool:
 
 def lower(found: list) -> bool:
     return all(d.holds and d.mean < 0 for d in found)
+
+
+def higher(found: list) -> bool:
+    return all(d.holds and d.mean > 0 for d in found)
+
+
+def shielded_all() -> tuple[bool, str]:
+    """No proposal under the learned shield has more cost left than that on any tier, nor less return by more than 2 %
+    of the range."""
+    left, lost = [], []
+    for (task, algorithm, variant), runs in evaluations("guards").items():
+        alone = of("guards", task, (algorithm, variant.removesuffix(SHIELD)))
+        if variant.endswith(SHIELD) and alone:
+            left.append(mean("guards", task, (algorithm, variant), "avoidable_cost"))
+            both = set(runs) & set(alone)
+            lost.append(np.mean([alone[s]["return_norm"] - runs[s]["return_norm"] for s in both]))
+    told = f"{len(left)} proposals and tiers: at most {max(left):.3f} cost left, {max(lost):.3f} normalised return lost"
+    return max(left) <= 0.03 and max(lost) <= 0.02, told
 
 
 def same_safety() -> tuple[bool, str]:
@@ -142,6 +161,24 @@ CLAIMS = (
         robots_kept("bc", "default+full-learned", 17),
     ),
     Claim("docs/crossing.md", "1 of 5000", "results/crossing/table.csv", crossing_rare),
+    Claim("docs/attribution.md", "A shield takes the cost from every proposal", SPREAD, shielded_all),
+    Claim(
+        "docs/attribution.md",
+        "The return comes from climbing learned values",
+        SPREAD,
+        tested(("bc", f"default{FULL}"), ("bc", f"default{SHIELD}"), "return", higher),
+    ),
+    Claim(
+        "docs/attribution.md",
+        "it earns more on two tiers and less on none",
+        SPREAD,
+        tested(
+            ("madiff", f"long{SHIELD}"),
+            ("bc-return", f"default{SHIELD}"),
+            "return",
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) >= 2 and not any(d.holds and d.mean > 0 for d in ds),
+        ),
+    ),
     Claim(
         "docs/attribution.md",
         "The barrier in training lowers the cost of plans that are followed as they are",
