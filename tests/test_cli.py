@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import pytest
 
-from ringfence import demo
+from ringfence import demo, evaluate
 from ringfence.cli import main
 from ringfence.data import EpisodeStore
 from ringfence.errors import UserError
+from ringfence.guards import GUARDS
 
 
 def test_lists_tasks(capsys):
@@ -144,6 +145,9 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
 def test_the_whole_job(tmp_path, monkeypatch, capsys):
     """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(evaluate, "CHUNK", 10)
+    monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "rows": 2, "starts": 2, "shield": 1})
+    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
     page = demo.run(tmp_path / "demo", "random", quick=True)
     text = page.read_text()
     assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 
 import ringfence
+from ringfence.guards import GUARDS
 from tests.quick import QUICK_WORLD
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results" / "README.md"]
 
 
-def test_the_first_lines_of_python_run(tmp_path):
-    """Word by word, but for how long things are fitted."""
+def test_the_first_lines_of_python_run(tmp_path, monkeypatch):
+    """Word by word, but for how long things are fitted and how hard the shield tries."""
+    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
     rng = np.random.default_rng(0)
     names = ["own.x", "own.y", "goal.dx", "goal.dy"]
     told = SimpleNamespace(

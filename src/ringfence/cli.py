@@ -706,7 +706,7 @@ def _store(data: str):
 
     if Path(data).suffix in (".h5", ".hdf5", ".hdf") or Path(data).is_file() or len(Path(data).parts) > 1:
         return EpisodeStore.load(data)
-    return make(tasks.get(data))[0]
+    return make(tasks.get(data), must_keep=False)[0]
 
 
 def _runs(paths: list[Path]) -> list:

@@ -18,8 +18,8 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     """Make `out`/report.html and print the table that it holds; a few minutes on two cores."""
     console, begun = Console(highlight=False), time.monotonic()
     task = tasks.get(f"simple_spread-{tier}")
-    episodes = 50 if quick else 100
-    store, path = make(task, 20_000 if quick else None)
+    episodes = 10 if quick else 100
+    store, path = make(task, 5_000 if quick else None)
     console.print(f"data        {store.episodes:,} episodes, return {store.returns.mean():.1f}: {path}", soft_wrap=True)
     small = {"steps": 60, "batch": 32, "barrier_batch": 16, "width": 64}
     known = {f"{part}_updates": 100 for part in ("dynamics", "value", "barrier", "future")}

@@ -44,15 +44,18 @@ def writable(path: str | os.PathLike, folder: bool = False) -> Path:
     try:
         path = path.resolve() if path.is_symlink() else path
         there = path.exists()
-        if there and not (path.is_dir() if folder else path.is_file()):
-            raise UserError(f"'{path}' is no {'folder' if folder else 'regular file'}; choose another place.")
+        kind_fits = not there or (path.is_dir() if folder else path.is_file())
         above = path if there else next(p for p in path.absolute().parents if p.exists())
-        if not above.is_dir() and above is not path:
-            raise UserError(f"'{above}' is no folder, so '{path}' cannot lie in it; choose another place.")
-        if not os.access(above if above.is_dir() else above.parent, os.W_OK):
-            raise UserError(f"'{above}' may not be written to, so '{path}' cannot be made; choose another place.")
-    except (OSError, ValueError) as error:  # a name that is too long, or holds what no name may
-        raise UserError(f"'{path}' cannot be a file's name ({error}); choose another.") from None
+        holds = above.is_dir() or above is path
+        allowed = os.access(above if above.is_dir() else above.parent, os.W_OK)
+    except OSError as error:  # a name that is too long
+        raise UserError(f"'{path}' could not be written ({error.strerror}); choose another name.") from None
+    if not kind_fits:
+        raise UserError(f"'{path}' is no {'folder' if folder else 'regular file'}; choose another place.")
+    if not holds:
+        raise UserError(f"'{path}' could not be written: '{above}' is a file, no folder; choose another place.")
+    if not allowed:
+        raise UserError(f"'{path}' could not be written: '{above}' may not be written to; choose another place.")
     return path
 
 

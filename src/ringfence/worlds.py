@@ -125,7 +125,7 @@ def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
 
     card = told["data"]
     size = card.get("size", card.get("transitions"))
-    store, _ = make(tasks.get(told["task"]), size, card.get("seed", 0))
+    store, _ = make(tasks.get(told["task"]), size, card.get("seed", 0), must_keep=False)
     return fit(store, seed=told["seed"], sight=sight, quiet=quiet)
 
 

@@ -347,7 +347,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
 def data_of(task: str, transitions: int | None) -> EpisodeStore:
     """The data set of a task. The last one is kept: groups of one task follow each other, and what was computed from a
     store (windows, critic) is found again by the store itself."""
-    return make(tasks.get(task), transitions)[0]
+    return make(tasks.get(task), transitions, must_keep=False)[0]
 
 
 def adopt(cell: Cell, out: Path, card: dict) -> Cell | None:

@@ -16,10 +16,16 @@ from ringfence.tasks import Task, siblings
 
 
 def make(
-    task: Task, transitions: int | None = None, seed: int = 0, out: str | Path | None = None, fresh: bool = False
+    task: Task,
+    transitions: int | None = None,
+    seed: int = 0,
+    out: str | Path | None = None,
+    fresh: bool = False,
+    must_keep: bool = True,
 ) -> tuple[EpisodeStore, Path]:
     """(store, its file). `transitions` (default: the full size) is rounded up to whole episodes; a kept file of the
-    same data is taken, unless `fresh` or another place is asked for."""
+    same data is taken, unless `fresh` or another place is asked for. Where the cache cannot be written, the data are
+    used all the same if they need not be kept."""
     recipe = task.recipe
     if recipe is None:
         raise UserError(f"Task '{task.name}' has no simulator to regenerate data with; import its files instead.")
@@ -47,7 +53,7 @@ def make(
     try:
         return store, store.save(path)
     except UserError as error:
-        if out:
+        if out or must_keep:
             raise
         warnings.warn(f"{error} The data are used as they are and not kept.", stacklevel=2)
         return store, path
