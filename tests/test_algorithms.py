@@ -260,7 +260,12 @@ def test_no_seed_and_no_store_are_refused(small_store, tmp_path):
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])
 def test_views(small_store, tmp_path, view, execution):
     changes = {**TINY["madiff"], "view": view, "steps": 2, "observe": "mixed"}
-    run = training.train("madiff", small_store, out=tmp_path, **job_of("madiff") | {"changes": changes})[0]
+    run = training.train(
+        "madiff",
+        small_store,
+        out=tmp_path,
+        **job_of("madiff") | {"changes": changes, "world": {**QUICK_WORLD, "barrier": False}},
+    )[0]
     result = evaluate.evaluate(run, **QUICK, execution=execution)
     assert np.isfinite(result["return_mean"])
 
