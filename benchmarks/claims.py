@@ -141,6 +141,7 @@ CLAIMS = (
         "results/crossing/table.csv",
         contact("crossing", ("behaviour data", "reference"), 0.205, 0.215),
     ),
+    Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
     Claim("README.md", "Learned danger does what the formula does", "guards, guards-mujoco", same_safety),
     Claim(
         "README.md",

@@ -126,8 +126,13 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         ("mujoco", "ma-td3bc-lag", ""),
         None,
     ),
-    "our MADIFF": (("simple_spread", "madiff", "default"), ("mujoco", "madiff", ""), None),
-    "ICBF-Diffuser, losses as printed": (("simple_spread", "icbf", "paper"), ("mujoco", "icbf", "mujoco-paper"), None),
+    "our MADIFF, 6000 updates": (("guards", "madiff", "long"), ("mujoco", "madiff", ""), None),
+    "our MADIFF, 1500 updates": (("simple_spread", "madiff", "default"), None, None),
+    "ICBF-Diffuser, losses as printed, the same budgets": (
+        ("simple_spread", "icbf", "paper"),
+        ("mujoco", "icbf", "mujoco-paper"),
+        None,
+    ),
     "cloning + guard, *formula*": (
         ("guards", "bc", "+shield-formula"),
         ("guards-mujoco", "bc", "+adapt-formula"),
