@@ -21,9 +21,6 @@ SPREAD = {
     "**shield, learned**": "bc shield learned all",
     "**full, learned**": "bc full learned all",
     "no prior (`mpc`), full, learned": "mpc full learned all",
-    "`icbf`": "icbf none none all",
-    "`icbf`, full, learned": "icbf full learned all",
-    "`icbf`, full, formula": "icbf full formula all",
 }
 ROBOTS = {
     "cloning": "bc none none all",
@@ -31,6 +28,9 @@ ROBOTS = {
     "adapt, learned": "bc adapt learned all",
     "full, formula": "bc full formula all",
     "**full, learned**": "bc full learned all",
+    "`icbf` (steady)": "icbf none none all",
+    "`icbf`, adapt, formula": "icbf adapt formula all",
+    "`icbf`, adapt, learned": "icbf adapt learned all",
 }
 OWN = {
     "cloning": "bc none none all",

@@ -86,6 +86,7 @@ def count(cases: Iterator[Case], place: Path) -> list[int]:
             kind = "refused"
         except Hang:
             kind = "hang"
+            print(f"{what}: hangs", file=sys.stderr)
         except Exception as error:
             kind = "traceback"
             print(f"{what}: {type(error).__name__}: {error}", file=sys.stderr)

@@ -20,8 +20,9 @@ T = TypeVar("T")
 _PART = r"\A(?![.\-])[^/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]+\Z"
 Name = Annotated[str, msgspec.Meta(pattern=_PART, max_length=120)]
 Variant = Annotated[str, msgspec.Meta(pattern=_PART, max_length=200)]
-Count = Annotated[int, msgspec.Meta(ge=0)]
-Positive = Annotated[int, msgspec.Meta(ge=1)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=10**12)]
+Positive = Annotated[int, msgspec.Meta(ge=1, le=10**9)]
+Few = Annotated[int, msgspec.Meta(ge=1, le=100_000)]  # agents, entries: what loops go over
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Interval = tuple[float, float]
 Scalar = bool | int | float | str | None
@@ -33,8 +34,8 @@ class Hazard(TypedDict):
 
 class Spec(TypedDict, total=False):
     task: Name
-    n_agents: Positive
-    action_dim: Positive
+    n_agents: Few
+    action_dim: Few
     feature_names: list[str]
     action_low: float
     action_high: float
@@ -70,7 +71,7 @@ class Config(TypedDict):
     feature_map: NotRequired[Map | None]
     widths: NotRequired[tuple[int | None, int | None] | None]
     world: NotRequired[dict[str, Scalar] | None]
-    team: NotRequired[Positive]
+    team: NotRequired[Few]
 
 
 class World(TypedDict):
@@ -132,7 +133,7 @@ class Result(TypedDict, total=False):
     guard: str
     danger: str
     sight: str
-    agents: Positive
+    agents: Few
     guard_options: dict[str, Scalar]
     infeasible: float
     strange: float
