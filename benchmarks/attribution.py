@@ -67,7 +67,7 @@ QUESTIONS = (
     Question("ICBF under `full`, not cloning", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
     Question("ICBF under a shield, not cloning", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
     Question("the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0")),
-    Question("the same under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
+    Question("the barrier in training, under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
     *(
         Question(f"the printed losses, λ = {weight}, not MADIFF", ("icbf", f"paper{name}"), ("madiff", "default"))
         for weight, name in (("0.1", ""), ("1", "-1"), ("3", "-3"), ("10", "-10"))
@@ -83,7 +83,9 @@ QUESTIONS = (
         ("bc-return", f"default{SHIELD}"),
     ),
     Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default")),
-    Question("the same under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")),
+    Question(
+        "four times MADIFF's updates, under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")
+    ),
     Question(
         "diffusion of four times the updates, not an actor told the same, under a shield",
         ("madiff", f"long{SHIELD}"),
@@ -97,6 +99,7 @@ QUESTIONS = (
 def main() -> None:
     put("docs/attribution.md", "crossed", crossed("guards"))
     put("docs/attribution.md", "questions", questions("guards"))
+    put("docs/attribution.md", "robots", robots("guards-mujoco"))
 
 
 def variant(task: str, row: Row) -> Row:
@@ -129,6 +132,28 @@ def crossed(suite: str) -> str:
                     f"| {words} | {sees} | {guard if plain != 'reference' else ''} | " + " | ".join(cells) + " |"
                 )
     return "\n".join([*out, "", "[n]: mean of n seeds, else one."])
+
+
+# Robots' proposals under `adapt`, danger learned: their words and rows.
+ROBOTS: dict[str, Row] = {
+    "cloning": ("bc", "default+adapt-learned"),
+    "best tenth": ("bc-best", "default+adapt-learned"),
+    "told the return": ("bc-return", "default+adapt-learned"),
+    "ICBF (steady)": ("icbf", "default+steady+adapt-learned"),
+}
+
+
+def robots(suite: str) -> str:
+    """A line per task on which the planner was played: return / steps above the limit under the same guard."""
+    out = ["| | " + " | ".join(ROBOTS) + " |", "|---" * (1 + len(ROBOTS)) + "|"]
+    for task in tasks_of(suite):
+        told = []
+        for row in ROBOTS.values():
+            earned, cost = (mean(suite, task, variant(task, row), key) for key in ("return_mean", "cost_mean"))
+            told.append("–" if earned is None else f"{earned:.0f} / {cost:.1f}")
+        if told[-1] != "–":
+            out.append(f"| `{task}` | " + " | ".join(told) + " |")
+    return "\n".join(out)
 
 
 def answers(suite: str, asked: tuple[Question, ...] = QUESTIONS) -> list[tuple[Question, str, list[Difference]]]:
