@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from evidence import Difference, Row, difference, family, mean, of, tasks_of
+from evidence import Difference, Row, difference, family, mean, of, tasks_of, variant
 from readme import put
 
 # Proposals: their words, what they see and are told, and their row without a guard.
@@ -100,17 +100,6 @@ def main() -> None:
     put("docs/attribution.md", "crossed", crossed("guards"))
     put("docs/attribution.md", "questions", questions("guards"))
     put("docs/attribution.md", "robots", robots("guards-mujoco"))
-
-
-def variant(task: str, row: Row) -> Row:
-    """A row on this task: a preset made for its tier stands for the default."""
-    from ringfence import algos, tasks
-
-    name, _, rest = row[1].partition("+")
-    if name != "default" or row[0] not in algos.ALGORITHMS:
-        return row
-    preset = algos.get(row[0]).preset_for(tasks.get(task).presets)
-    return row[0], f"{preset}+{rest}" if rest else preset
 
 
 def crossed(suite: str) -> str:

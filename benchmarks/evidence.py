@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import functools
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from ringfence import stats
+from ringfence import algos, stats, tasks
 from ringfence.bench import rows
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
@@ -34,6 +34,15 @@ def tasks_of(suite: str) -> list[str]:
 
 def of(suite: str, task: str, row: Row) -> dict[int, dict]:
     return evaluations(suite).get((task, *row), {})
+
+
+def variant(task: str, row: Row) -> Row:
+    """A row on this task: a preset made for its tier or its simulator stands for the default."""
+    name, _, rest = row[1].partition("+")
+    if name != "default" or row[0] not in algos.ALGORITHMS:
+        return row
+    preset = algos.get(row[0]).preset_for(tasks.get(task).presets)
+    return row[0], f"{preset}+{rest}" if rest else preset
 
 
 def mean(suite: str, task: str, row: Row, key: str) -> float | None:
@@ -80,4 +89,4 @@ def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Differen
 def family(found: list[Difference]) -> list[Difference]:
     """The same with p-values adjusted by Holm's method."""
     adjusted = stats.holm(np.array([d.p for d in found])) if found else []
-    return [Difference(d.task, d.seeds, d.mean, d.low, d.high, float(p)) for d, p in zip(found, adjusted)]
+    return [replace(d, p=float(p)) for d, p in zip(found, adjusted)]

@@ -9,33 +9,34 @@ import csv
 from pathlib import Path
 
 import numpy as np
+from evidence import Row, of, tasks_of, variant
 from readme import put
 
 from ringfence.stats import upper_bound
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
-# Columns: their heads, and algorithm, guard, danger and sight of their rows.
+# Columns: their heads, and their rows.
 SPREAD = {
-    "cloning": "bc none none all",
-    "shield, formula": "bc shield formula all",
-    "**shield, learned**": "bc shield learned all",
-    "**full, learned**": "bc full learned all",
-    "no prior (`mpc`), full, learned": "mpc full learned all",
+    "cloning": ("bc", "default"),
+    "shield, formula": ("bc", "default+shield-formula"),
+    "**shield, learned**": ("bc", "default+shield-learned"),
+    "**full, learned**": ("bc", "default+full-learned"),
+    "no prior (`mpc`), full, learned": ("mpc", "default+full-learned"),
 }
 ROBOTS = {
-    "cloning": "bc none none all",
-    "adapt, formula": "bc adapt formula all",
-    "adapt, learned": "bc adapt learned all",
-    "full, formula": "bc full formula all",
-    "**full, learned**": "bc full learned all",
-    "`icbf` (steady)": "icbf none none all",
-    "`icbf`, adapt, formula": "icbf adapt formula all",
-    "`icbf`, adapt, learned": "icbf adapt learned all",
+    "cloning": ("bc", "default"),
+    "adapt, formula": ("bc", "default+adapt-formula"),
+    "adapt, learned": ("bc", "default+adapt-learned"),
+    "full, formula": ("bc", "default+full-formula"),
+    "**full, learned**": ("bc", "default+full-learned"),
+    "`icbf` (steady)": ("icbf", "default+steady"),
+    "`icbf`, adapt, formula": ("icbf", "default+steady+adapt-formula"),
+    "`icbf`, adapt, learned": ("icbf", "default+steady+adapt-learned"),
 }
 OWN = {
-    "cloning": "bc none none all",
-    "shield, learned, own sight": "bc shield learned own",
-    "full, learned, own sight": "bc full learned own",
+    "cloning": ("bc", "default"),
+    "shield, learned, own sight": ("bc", "default+shield-learned-own"),
+    "full, learned, own sight": ("bc", "default+full-learned-own"),
 }
 # Crossing's rows: algorithm and variant, and their words.
 BESIDE = {
@@ -57,9 +58,9 @@ WAYS = BESIDE | {
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
 OWN_ROBOTS = {
-    "cloning": "bc none none all",
-    "adapt, learned, own sight": "bc adapt learned own",
-    "full, learned, own sight": "bc full learned own",
+    "cloning": ("bc", "default"),
+    "adapt, learned, own sight": ("bc", "default+adapt-learned-own"),
+    "full, learned, own sight": ("bc", "default+full-learned-own"),
 }
 
 
@@ -75,19 +76,14 @@ def main() -> None:
     put("docs/crossing.md", "other", other_simulator())
 
 
-def table(suite: str, columns: dict[str, str], cell) -> str:
+def table(suite: str, columns: dict[str, Row], cell) -> str:
     """A row per task, a column per guard; – where nothing was made."""
-    rows = list(csv.DictReader((RESULTS / suite / "table.csv").open()))
-    names = dict.fromkeys(r["task"] for r in rows)
     out = ["| | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
-    for task in names:
+    for task in tasks_of(suite):
         cells = []
-        for of in columns.values():
-            keys = ("algorithm", "guard", "danger", "sight")
-            mine = (r for r in rows if r["task"] == task and r["variant"] != "reference")
-            found = [r for r in mine if [r[k] for k in keys] == of.split()]
-            seeds = {r["seed"] for r in found}
-            cells.append(cell(found) + (f" ({len(seeds)} seeds)" if len(seeds) > 1 else "") if found else "–")
+        for row in columns.values():
+            found = list(of(suite, task, variant(task, row)).values())
+            cells.append(cell(found) + (f" ({len(found)} seeds)" if len(found) > 1 else "") if found else "–")
         if any(c != "–" for c in cells[1:]):
             out.append(f"| `{task}` | " + " | ".join(cells) + " |")
     return "\n".join(out)

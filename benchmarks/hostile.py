@@ -20,12 +20,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 from readme import put
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from ringfence import evaluate, training, worlds  # noqa: E402
-from ringfence.bench import pack, rows, unpack  # noqa: E402
+from ringfence import evaluate, recordings, training, worlds  # noqa: E402
+from ringfence.bench import pack, rows  # noqa: E402
 from ringfence.bench.cells import statuses  # noqa: E402
 from ringfence.data.store import EpisodeStore  # noqa: E402
 from ringfence.errors import UserError  # noqa: E402
@@ -33,9 +34,9 @@ from ringfence.report import board  # noqa: E402
 from ringfence.report.table import sections  # noqa: E402
 from ringfence.runs import Run  # noqa: E402
 from tests import corpus  # noqa: E402
+from tests.corpus import TASK  # noqa: E402
 from tests.quick import QUICK_WORLD  # noqa: E402
 
-TASK = "simple_spread-expert"
 SECONDS = 20  # after which reading hangs
 HEAD = ("files", "tried", "refused", "read, unchanged", "traceback", "believed though changed", "hang", "left behind")
 
@@ -57,9 +58,14 @@ def main() -> None:
     before, found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, []
     with tempfile.TemporaryDirectory() as place:
         os.environ["RINGFENCE_HOME"] = str(Path(place) / "home")
-        for name, cases in (("JSON of runs and results folders", json_files), ("stores", stores)):
-            found.append([name, *count(cases(Path(place), times), Path(place))])
-        for name, cases in (("checkpoints", checkpoints), ("Worlds", world_files), ("archives of results", archives)):
+        for name, cases in (
+            ("JSON of runs and results folders", json_files),
+            ("stores", stores),
+            ("checkpoints", checkpoints),
+            ("Worlds", world_files),
+            ("archives of results", archives),
+            ("recordings", films),
+        ):
             found.append([name, *count(cases(Path(place), times), Path(place))])
     grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
     with (ROOT / "results" / "hostile.csv").open("w") as f:
@@ -102,22 +108,8 @@ def always(_) -> bool:
     return True
 
 
-def folder_of_results(place: Path) -> Path:
-    whole, few = place / "whole", place / "few"
-    if not few.exists():
-        whole.mkdir()
-        for name in ("bench.json", "runs.tar.xz", "curves.tar.xz"):
-            shutil.copyfile(ROOT / "results" / "guards" / name, whole / name)
-        unpack(whole)
-        shutil.copytree(whole / "reference" / TASK, few / "reference" / TASK)
-        shutil.copyfile(whole / "bench.json", few / "bench.json")
-        cell = next((whole / "cells" / TASK / "bc").glob("seed-0-*"))
-        shutil.copytree(cell, few / "cells" / TASK / "bc" / cell.name)
-    return few
-
-
 def json_files(place: Path, times: int) -> Iterator[Case]:
-    folder = folder_of_results(place)
+    folder = corpus.one_cell(place / "json")
     run = Run(next((folder / "cells" / TASK / "bc").iterdir()))
     files = [run.path / f"{n}.json" for n in ("config", "results", "status", "env")]
     files += [folder / "bench.json", folder / "reference" / TASK / "reference.json"]
@@ -137,7 +129,7 @@ def stores(place: Path, times: int) -> Iterator[Case]:
     raw = store.save(file).read_bytes()
     for what, content in corpus.broken_bytes(raw, random.Random(times), 500 * times):
         file.write_bytes(content)
-        yield what, lambda: EpisodeStore.load(file), lambda s: s.content == store.content
+        yield what, lambda: EpisodeStore.load(file), lambda s: (s.content, s.card) == (store.content, store.card)
     for what, path in corpus.broken_stores(raw, place):
         yield what, lambda path=path: EpisodeStore.load(path), lambda s: False
 
@@ -167,8 +159,18 @@ def world_files(place: Path, times: int) -> Iterator[Case]:
         yield what, lambda: worlds.load(file), always
 
 
+def films(place: Path, times: int) -> Iterator[Case]:
+    file = corpus.small_recording(place)
+    raw, good = file.read_bytes(), recordings.read(place, "plain")
+    for what, content in corpus.broken_bytes(raw, random.Random(times), 100 * times):
+        file.write_bytes(content)
+        yield what, lambda: recordings.read(place, "plain"), lambda r: all(np.array_equal(r[k], good[k]) for k in good)
+    for what, _ in corpus.broken_recordings(good, file):
+        yield what, lambda: recordings.read(place, "plain"), lambda r: False
+
+
 def archives(place: Path, times: int) -> Iterator[Case]:
-    folder = folder_of_results(place)
+    folder = corpus.one_cell(place / "archives")
     good, archive = rows(folder), pack(folder)[0]
     raw = archive.read_bytes()
     for what, content in corpus.broken_bytes(raw, random.Random(times), 60 * times):

@@ -133,17 +133,17 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         None,
     ),
     "cloning + guard, *formula*": (
-        ("guards", "bc", "+shield-formula"),
+        ("guards", "bc", "default+shield-formula"),
         ("guards-mujoco", "bc", "+adapt-formula"),
         None,
     ),
     "**cloning + guard**": (
-        ("guards", "bc", "+shield-learned"),
+        ("guards", "bc", "default+shield-learned"),
         ("guards-mujoco", "bc", "+adapt-learned"),
         ("crossing", "bc", "default+shield-learned"),
     ),
     "**cloning + guard that also climbs values** (`full`)": (
-        ("guards", "bc", "+full-learned"),
+        ("guards", "bc", "default+full-learned"),
         ("guards-mujoco", "bc", "+full-learned"),
         ("crossing-guards", "bc", "default+full-learned"),
     ),
@@ -168,20 +168,12 @@ def front() -> str:
             if kind == "robots":
                 cells.append(_robots_cell(robots[suite], algorithm, variant))
             elif kind == "spread":
-                found = [r for tier in TIERS for r in ending_in(data[suite], tier, algorithm, variant)]
+                found = [r for tier in TIERS for r in of(data[suite], tier, algorithm, variant)]
                 cells.append(_spread_cell(found))
             else:
                 cells.append(_crossing_cell(data[suite].get(("crossing-hasty", algorithm, variant), [])))
         lines.append(f"| {words} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def ending_in(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:
-    """Rows of a variant, or of one whose preset may be named after the tier."""
-    if not variant.startswith("+"):
-        return of(groups, tier, algorithm, variant)
-    task = f"simple_spread-{tier}"
-    return next((r for (t, a, v), r in groups.items() if (t, a) == (task, algorithm) and v.endswith(variant)), [])
 
 
 def _spread_cell(rows: list[dict]) -> str:

@@ -8,15 +8,19 @@ from __future__ import annotations
 import copy
 import json
 import random
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from ringfence import hazards
+from ringfence import hazards, recordings
+from ringfence.bench.packed import ARCHIVES, unpack
 from ringfence.data.store import EpisodeStore
 
+TASK = "simple_spread-expert"
+RESULTS = Path(__file__).resolve().parent.parent / "results" / "guards"
 Broken = tuple[str, bytes]  # what was done, and the contents
 _GONE = object()
 JUNK = [
@@ -73,6 +77,20 @@ def broken_bytes(raw: bytes, rng: random.Random, count: int, within: int | None 
         yield f"cut at {at}", raw[:at]
 
 
+def one_cell(place: Path) -> Path:
+    """A results folder of one cell and its reference rows, as they are in the repository."""
+    whole, few = place / "whole", place / "few"
+    whole.mkdir(parents=True)
+    for name in ("bench.json", *ARCHIVES):
+        shutil.copyfile(RESULTS / name, whole / name)
+    unpack(whole)
+    shutil.copytree(whole / "reference" / TASK, few / "reference" / TASK)
+    shutil.copyfile(whole / "bench.json", few / "bench.json")
+    cell = next((whole / "cells" / TASK / "bc").glob("seed-0-*"))
+    shutil.copytree(cell, few / "cells" / TASK / "bc" / cell.name)
+    return few
+
+
 def small_store(seed: int = 0) -> EpisodeStore:
     rng = np.random.default_rng(seed)
     return EpisodeStore.from_episodes(
@@ -117,7 +135,11 @@ def broken_stores(raw: bytes, folder: Path) -> Iterator[tuple[str, Path]]:
         '{"hazard": {"kind": ["x"]}}',
     )
     edits = {f"costs {k}": (lambda f, put=put: (f.__delitem__("costs"), put(f))) for k, put in instead.items()}
-    edits |= {f"card {str(c)[:20]}": (lambda f, c=c: f.attrs.__setitem__("card", c)) for c in cards}
+    edits |= {
+        f"card {str(c)[:20]}": (lambda f, c=c: (f.attrs.__delitem__("card_digest"), f.attrs.__setitem__("card", c)))
+        for c in cards
+    }
+    edits["another limit"] = lambda f: f.attrs.__setitem__("card", json.dumps({"task": "strange", "cost_limit": 9.0}))
     edits["all huge"] = lambda f: [
         (f.__delitem__(n), f.create_dataset(n, shape=s, chunks=_chunks(s))) for n, s in huge.items()
     ]
@@ -139,3 +161,27 @@ def _layout(other: Path) -> h5py.VirtualLayout:
 
 def _chunks(shape: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(min(n, 1000) for n in shape)
+
+
+def small_recording(folder: Path) -> Path:
+    """Of one variant, "plain", in a run's folder."""
+    rng = np.random.default_rng(0)
+    played = {"states": rng.normal(size=(2, 6, 12)), "costs": rng.random((2, 5)), "rewards": rng.normal(size=(2, 5))}
+    recordings.write(folder, "plain", played | {"plans": rng.normal(size=(2, 5, 3, 4, 2, 8))}, 2)
+    return folder / "rollout-plain.npz"
+
+
+def broken_recordings(good: dict[str, np.ndarray], path: Path) -> Iterator[tuple[str, Path]]:
+    """Recordings of other kinds and shapes, and one that unpacks to ten thousand times its size."""
+    states = good["states"]
+    for what, instead in {
+        "without costs": {k: v for k, v in good.items() if k != "costs"},
+        "flat": good | {"states": states.ravel()},
+        "words": good | {"states": states.astype(str)},
+        "objects": good | {"states": states.astype(object)},
+        "too short": good | {"plans": good["plans"][:, :2]},
+        "nothing": good | {"costs": np.zeros((0, 5)), "states": states[:0]},
+        "a bomb": good | {"states": np.zeros((2, 6, 20_000_000), np.int8)},
+    }.items():
+        np.savez_compressed(path, **instead)
+        yield what, path

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import evaluate
+from ringfence import evaluate, recordings
 from ringfence.bench import pack, rows
 from ringfence.bench.cells import statuses
 from ringfence.data.store import EpisodeStore
@@ -20,25 +20,12 @@ from ringfence.report import board
 from ringfence.report.table import sections
 from ringfence.runs import Run
 from tests import corpus
-
-TASK = "simple_spread-expert"
+from tests.corpus import TASK
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    """A results folder of one cell and its reference rows, as they are in the repository."""
-    from ringfence.bench import unpack
-
-    whole = tmp_path_factory.mktemp("whole") / "guards"
-    shutil.copytree(Path(__file__).parent.parent / "results" / "guards", whole, ignore=shutil.ignore_patterns("cells"))
-    unpack(whole)
-    few = tmp_path_factory.mktemp("few") / "guards"
-    few.mkdir()
-    shutil.copyfile(whole / "bench.json", few / "bench.json")
-    shutil.copytree(whole / "reference" / TASK, few / "reference" / TASK)
-    cell = next((whole / "cells" / TASK / "bc").glob("seed-0-*"))
-    shutil.copytree(cell, few / "cells" / TASK / "bc" / cell.name)
-    return few
+    return corpus.one_cell(tmp_path_factory.mktemp("results"))
 
 
 def tried(what: str, attempt) -> bool:
@@ -101,7 +88,8 @@ def test_stores_of_strangers(tmp_path):
         if tried(what, lambda: EpisodeStore.load(file)):
             refused += 1
         else:
-            assert EpisodeStore.load(file).content == store.content, what
+            found = EpisodeStore.load(file)
+            assert (found.content, found.card) == (store.content, store.card), what
     assert refused > 150
     for what, path in corpus.broken_stores(raw, tmp_path):
         assert tried(what, lambda path=path: EpisodeStore.load(path)), what
@@ -127,6 +115,18 @@ def test_opening_a_file_takes_no_more_than_it_holds(tmp_path):
         told = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
         assert int(told.stdout) < 200 * 1024  # kB
     assert made
+
+
+def test_recordings_of_strangers(tmp_path):
+    file = corpus.small_recording(tmp_path)
+    raw, good = file.read_bytes(), recordings.read(tmp_path, "plain")
+    for what, content in corpus.broken_bytes(raw, random.Random(4), 100):
+        file.write_bytes(content)
+        if not tried(what, lambda: recordings.read(tmp_path, "plain")):
+            found = recordings.read(tmp_path, "plain")
+            assert all(np.array_equal(found[k], good[k]) for k in good), what
+    for what, _ in corpus.broken_recordings(good, file):
+        assert tried(what, lambda: recordings.read(tmp_path, "plain")), what
 
 
 def test_checkpoints_of_strangers(trained_run, tmp_path):

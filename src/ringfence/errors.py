@@ -41,7 +41,7 @@ def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
     """A count that somebody gave, in bounds; anything else is refused by its name."""
     number = value if isinstance(value, int) else getattr(value, "item", lambda: None)()  # NumPy's, too
     if isinstance(number, bool) or not isinstance(number, int) or not low <= number <= high:
-        raise UserError(f"{name}={str(value)[:60]!s} must be a whole number from {low:,} to {high:,}.")
+        raise UserError(f"{name}={str(value)[:60]} must be a whole number from {low:,} to {high:,}.")
     return number
 
 

@@ -16,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import algos, features, hazards, stats, tasks, training, worlds
+from ringfence import algos, features, hazards, recordings, stats, tasks, training, worlds
 from ringfence.each import Each, look
 from ringfence.errors import UserError, unknown, whole_number
-from ringfence.files import whole, writable
+from ringfence.files import writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
 from ringfence.guards.policy import build
 from ringfence.hazards import BoundHazard
@@ -544,12 +544,7 @@ def evaluate(
         "parameters": _parameters(policy),
     }
     run.add_result(variant, result)
-    for kind in ("npz", "gif"):
-        (run.path / f"rollout-{variant}.{kind}").unlink(missing_ok=True)  # it would show what was played before
-    if record:
-        keep = {k: v[:record] for k, v in played.items()}
-        with whole(run.path / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **keep)
+    recordings.write(run.path, variant, played, record)
     return result
 
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 import glob
 import os
 import time
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
+
 from ringfence.errors import UserError
+
+LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
 
 
 @contextmanager
@@ -36,22 +41,22 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
         raise
 
 
-def writable(path: str | os.PathLike, folder: bool = False) -> Path:
-    """The path, links followed, if a file (or `folder`) may be written there; refused before any work is done."""
+def writable(path: str | os.PathLike) -> Path:
+    """The path, links followed, if a file may be written there; refused before any work is done."""
     path = Path(path)
     if not path.name or not str(path).strip() or "\0" in str(path):
         raise UserError(f"'{path}' names no file; give a file's name.")
     try:
         path = path.resolve() if path.is_symlink() else path
         there = path.exists()
-        kind_fits = not there or (path.is_dir() if folder else path.is_file())
+        kind_fits = not there or path.is_file()
         above = path if there else next(p for p in path.absolute().parents if p.exists())
         holds = above.is_dir() or above is path
         allowed = os.access(above if above.is_dir() else above.parent, os.W_OK)
     except OSError as error:  # a name that is too long
         raise UserError(f"'{path}' could not be written ({error.strerror}); choose another name.") from None
     if not kind_fits:
-        raise UserError(f"'{path}' is no {'folder' if folder else 'regular file'}; choose another place.")
+        raise UserError(f"'{path}' is no regular file; choose another place.")
     if not holds:
         raise UserError(f"'{path}' could not be written: '{above}' is a file, no folder; choose another place.")
     if not allowed:
@@ -132,3 +137,23 @@ def owned(folder: Path, taken: str) -> Iterator[int]:
         yield file
     finally:
         os.close(file)
+
+
+def read_npz(path: Path) -> dict[str, np.ndarray]:
+    """Arrays of numbers, or ValueError: nothing is unpickled, and no more is unpacked than a file of that size may
+    claim."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            claimed, there = sum(member.file_size for member in packed.infolist()), path.stat().st_size
+        if claimed > 4 * there + LOOSE:
+            raise ValueError(f"it claims {claimed / 2**20:.0f} MiB and holds {there / 2**20:.1f}")
+        with np.load(path, allow_pickle=False) as arrays:
+            found = {name: arrays[name] for name in arrays.files}
+    except ValueError:
+        raise
+    except Exception as error:  # a damaged file raises anything: BadZipFile, zlib's error, EOFError, MemoryError, ...
+        raise ValueError((str(error).splitlines() or [type(error).__name__])[0]) from error
+    for name, array in found.items():
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "biuf":
+            raise ValueError(f"'{name}' is no array of numbers")
+    return found

@@ -10,7 +10,6 @@ results.json    what `ringfence eval` measured, one entry per variant
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import json
 import os
 import platform
@@ -30,7 +29,7 @@ from safetensors.numpy import save_file
 from ringfence import __version__, schemas
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.files import alone, whole
-from ringfence.trees import load_named, named_arrays
+from ringfence.trees import as_tree, digest_of, named_arrays
 from ringfence.types import PyTree
 
 KEEP = 2  # checkpoints
@@ -83,10 +82,12 @@ class Run:
     def drop_damaged(self) -> None:
         """Delete last checkpoints that are truncated or damaged, and say so: training goes on from the one before."""
         for at, file in reversed(self.checkpoints()):
-            if not (wrong := damage(file, at)):
+            try:
+                sound_arrays(file, at)
                 return
-            print(f"'{file}' is truncated or damaged ({wrong}); it is dropped.", file=sys.stderr)
-            file.unlink(missing_ok=True)
+            except ValueError as wrong:
+                print(f"'{file}' is truncated or damaged ({wrong}); it is dropped.", file=sys.stderr)
+                file.unlink(missing_ok=True)
 
     def save_checkpoint(self, step: int, state: PyTree) -> Path:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
@@ -94,7 +95,8 @@ class Run:
         arrays = named_arrays(state)
         with whole(final) as temporary:
             try:
-                save_file(arrays, temporary, {"step": str(step), "digest": digest_of(arrays)})
+                # one entry: safetensors writes several in any order, and a run is the same to the byte
+                save_file(arrays, temporary, {"digest": digest_of(sorted(arrays.items()))})
             except SafetensorError as error:  # its own wrapping of the operating system's error
                 raise OSError(str(error)) from error
         for _, old in self.checkpoints()[:-KEEP]:
@@ -112,13 +114,15 @@ class Run:
             if not found:
                 raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
         for at, file in reversed(found):
-            if wrong := damage(file, at):
+            try:
+                arrays = sound_arrays(file, at)
+            except ValueError as wrong:
                 told = f"'{file}' is truncated or damaged ({wrong})"
                 if file == found[0][1]:
-                    raise CheckpointError(f"{told}; delete it and train the run again.")
+                    raise CheckpointError(f"{told}; delete it and train the run again.") from wrong
                 print(f"{told}; the one before is used.", file=sys.stderr)
                 continue
-            return at, load_named(file, template)
+            return at, as_tree(arrays, template, file)
 
     def add_result(self, variant: str, result: dict) -> None:
         """Keep a result beside the others, whoever else adds some at the same time."""
@@ -126,29 +130,20 @@ class Run:
             write_json(self.path / "results.json", {**self.results, variant: result})
 
 
-def digest_of(arrays: dict[str, np.ndarray]) -> str:
-    """Of named arrays, whatever their order."""
-    digest = hashlib.blake2b(digest_size=8)
-    for name, array in sorted(arrays.items()):
-        digest.update(f"{name} {array.shape} {array.dtype}".encode())
-        digest.update(np.ascontiguousarray(array).data)
-    return digest.hexdigest()
-
-
-def damage(file: Path, step: int) -> str:
-    """What is wrong with a checkpoint of that step, empty if nothing is; those older than digests are believed."""
+def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:
+    """What a checkpoint of that step holds; ValueError says what is wrong with it. Those older than digests are
+    believed."""
     try:
         with safe_open(file, framework="np") as opened:
             told = opened.metadata() or {}
             arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (it is no dict)
     except (SafetensorError, OSError, ValueError, TypeError) as error:
-        return str(error).splitlines()[0]
-    inside = arrays.get("step")
-    if told.get("step", str(step)) != str(step) or (inside is not None and inside.tolist() != step):
-        return "it is not of the step in its name"
-    if told.get("digest", (found := digest_of(arrays))) != found:
-        return "its contents have changed"
-    return ""
+        raise ValueError(str(error).splitlines()[0]) from error
+    if arrays.get("step", np.array(step)).tolist() != step:
+        raise ValueError("it is not of the step in its name")
+    if "digest" in told and told["digest"] != digest_of(sorted(arrays.items())):
+        raise ValueError("its contents have changed")
+    return arrays
 
 
 def write_json(path: Path, data: Any) -> None:

@@ -195,12 +195,13 @@ class Row(TypedDict):
 def decode(raw: bytes | str, kind: type[T]) -> T:
     """JSON of `kind`, with the fields that it does not name; ValueError says what is wrong and where."""
     try:
-        msgspec.json.decode(raw, type=kind)  # which would leave out what the schema does not name
-        return msgspec.json.decode(raw)
+        told = msgspec.json.decode(raw)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise ValueError(str(error)) from None
+    check(told, kind)  # what the schema does not name stays
+    return told
 
 
 def check(value: Any, kind: type[T]) -> None:

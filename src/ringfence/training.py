@@ -12,7 +12,7 @@ import operator
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -231,7 +231,8 @@ def _undone(fresh: list[Run]) -> Iterator[None]:
     except Exception as error:
         for run in fresh:
             if not run.checkpoints():
-                shutil.rmtree(run.path, ignore_errors=True)
+                with suppress(UserError), owned(run.path, "another process trains there by now"):
+                    shutil.rmtree(run.path, ignore_errors=True)
         told = str(error)
         if isinstance(error, MemoryError) or any(word in told for word in ("RESOURCE_EXHAUSTED", "Out of memory")):
             raise UserError(

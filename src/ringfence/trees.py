@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,23 @@ def named_arrays(tree: PyTree) -> dict[str, np.ndarray]:
     return {name: np.array(leaf, order="C") for name, leaf in named_leaves(tree)}
 
 
+def digest_of(arrays: Iterable[tuple[str, np.ndarray]]) -> str:
+    """Of arrays and their names, in this order."""
+    digest = hashlib.blake2b(digest_size=8)
+    for name, array in arrays:
+        digest.update(f"{name} {array.shape} {array.dtype}".encode())
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
 def load_named(file: str | Path, template: PyTree) -> PyTree:
     """The tree in a file of named arrays, which must be the template's in name and shape."""
-    arrays, leaves = load_file(file), []
+    return as_tree(load_file(file), template, file)
+
+
+def as_tree(arrays: dict[str, np.ndarray], template: PyTree, file: str | Path) -> PyTree:
+    """The tree of named arrays that were read from `file`."""
+    leaves = []
     for name, leaf in named_leaves(template):
         if name not in arrays:
             raise CheckpointError(f"'{file}' lacks the array '{name}'; it was made by another model: make it again.")

@@ -76,11 +76,17 @@ def reads(config: Config) -> Literal["costs", "nothing"]:
 
 
 def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: None) -> WindowData:
-    """All episodes, or those within the limit; if they are too few to learn from, the cheapest hundredth."""
-    if config.cost_limit is not None:
-        costs = store.episode_costs
-        store = store.select(costs <= max(config.cost_limit, np.quantile(costs, 0.01, method="higher")))
-    return WindowData(store, feature_map)
+    """All episodes, or those within the limit."""
+    return WindowData(within(store, config), feature_map)
+
+
+def within(store: EpisodeStore, config: Config) -> EpisodeStore:
+    """The episodes within the cost limit, where there is one; if they are too few to learn from, the cheapest
+    hundredth."""
+    if config.cost_limit is None:
+        return store
+    costs = store.episode_costs
+    return store.select(costs <= max(config.cost_limit, np.quantile(costs, 0.01, method="higher")))
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):

@@ -33,7 +33,8 @@ class BestConfig(bc.Config):
 
 
 def best_of(store: EpisodeStore, config: BestConfig, feature_map: features.FeatureMap, world: None) -> WindowData:
-    """The episodes that earned most."""
+    """The episodes that earned most, of those within the cost limit where there is one."""
+    store = bc.within(store, config)
     earned = store.returns
     chosen = np.zeros(len(earned), bool)
     chosen[np.argsort(-earned, kind="stable")[: max(1, round(config.best * len(earned)))]] = True
@@ -82,6 +83,7 @@ def init(
 
 def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None) -> WindowData:
     """Windows with their scores."""
+    store = bc.within(store, config)
     seen, values = None, None
     if config.condition == "advantage":
         seen, values = jnp.asarray(feature_map(store.observations, store.state), jnp.float32), world.values
@@ -108,7 +110,6 @@ BC_BEST = replace(
     name="bc-best",
     Config=BestConfig,
     prepare=best_of,
-    reads=lambda config: "nothing",
     presets={"default": {}, "mujoco": {"steps": 20_000}},
 )
 BC_RETURN = Algorithm(
@@ -120,7 +121,7 @@ BC_RETURN = Algorithm(
     ac.no_diagnosis,
     make_policy,
     {"default": {}, "mujoco": {"steps": 8_000}, "advantage": {"condition": "advantage"}},
-    reads=lambda config: "nothing",
+    reads=bc.reads,
     prepare=prepare,
     needs=needs,
     of_world=lambda world, config: {},

@@ -173,7 +173,6 @@ class Grid:
                 raise UserError(f"'{self.out}' holds something else; give --out an empty or a results folder.")
             return
         there = read_about(self.out)
-        unpack(self.out)
         wrong = [k for k in mine if there.get(k) != mine[k]]
         if wrong:
             raise UserError(
@@ -186,15 +185,25 @@ def about(suite: str, episodes: int) -> dict:
     return {"format": FORMAT, "protocol": evaluate.PROTOCOL, "suite": suite, "episodes": episodes, "split": "test"}
 
 
+RESTORE = "restore that file, e.g. from another results folder of this suite and number of episodes"
+
+
 def read_about(out: Path) -> dict:
-    """bench.json of a results folder of this version."""
-    there = schemas.read(out / "bench.json", schemas.Bench, "is no results folder; give the --out of `ringfence bench`")
+    """bench.json of a results folder of this version, whose archives are unpacked then."""
+    file = out / "bench.json"
+    if not file.is_file():
+        raise UserError(
+            f"'{out}' holds no bench.json, so it is no results folder; give the --out of `ringfence bench`."
+        )
+    there = schemas.read(file, schemas.Bench, f"holds a damaged bench.json; {RESTORE}")
     if there.get("format") != FORMAT:
         raise UserError(
-            f"'{out}' has format {there.get('format')}, this version reads {FORMAT}; run `ringfence bench` again."
+            f"'{file}' has format {there.get('format')}, this version reads format {FORMAT}; use the version of "
+            "ringfence that wrote it, or run the benchmark again."
         )
     if lacking := [name for name in about("", 0) if name not in there]:
-        raise UserError(f"'{out / 'bench.json'}' lacks '{lacking[0]}'; run `ringfence bench` into an empty folder.")
+        raise UserError(f"'{file}' lacks '{lacking[0]}'; {RESTORE}.")
+    unpack(out)
     return there
 
 
@@ -202,7 +211,6 @@ def statuses(out: str | Path) -> list[dict]:
     """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way, and
     one that failed early has nothing else."""
     read_about(Path(out))
-    unpack(out)
     found = []
     begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):
@@ -279,13 +287,17 @@ def make_grids(held: Mapping[str, Iterable[str]], root: Path, only: Iterable[str
 
 def collected(name: str, only_tasks: Iterable[str] = ()) -> dict[str, list[str]]:
     """The tasks of a collection of suites, or those named, by suite."""
-    only_tasks = list(only_tasks)
-    held = {suite: list(SUITES[suite].tasks) for suite in COLLECTIONS[name]}
-    for task in only_tasks:
-        if not any(task in tasks for tasks in held.values()):
-            raise unknown(f"task of {name}", task, set().union(*held.values()))
-    held = {suite: [t for t in tasks if t in only_tasks or not only_tasks] for suite, tasks in held.items()}
-    return {suite: tasks for suite, tasks in held.items() if tasks}
+    return narrowed({suite: SUITES[suite].tasks for suite in COLLECTIONS[name]}, only_tasks, name)
+
+
+def narrowed(held: Mapping[str, Iterable[str]], only: Iterable[str], of: str) -> dict[str, list[str]]:
+    """The tasks of several suites, or those named; a name that no suite of the collection `of` holds is refused."""
+    only, known = list(only), set().union(*held.values())
+    for task in only:
+        if task not in known:
+            raise unknown(f"task of {of}", task, known)
+    kept = {suite: [t for t in names if t in only or not only] for suite, names in held.items()}
+    return {suite: names for suite, names in kept.items() if names}
 
 
 def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, Cell], None]) -> None:

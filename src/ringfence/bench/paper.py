@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from ringfence import tasks
-from ringfence.bench.cells import Grid, make_grids
+from ringfence.bench.cells import Grid, make_grids, narrowed
 from ringfence.bench.suites import SUITES
 from ringfence.bench.table import rows
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError
 from ringfence.files import whole
 
 FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
@@ -73,11 +73,7 @@ OURS = {
 
 def parts(only: Iterable[str] = ()) -> dict[str, list[str]]:
     """The paper's tasks, or those named, by the suite that holds them."""
-    for name in only:
-        if name not in PRINTED:
-            raise unknown("task of the paper", name, PRINTED)
-    found = {suite: [t for t in SUITES[suite].tasks if t in (only or PRINTED)] for suite in FOLDERS}
-    return {suite: names for suite, names in found.items() if names}
+    return narrowed({s: [t for t in SUITES[s].tasks if t in PRINTED] for s in FOLDERS}, only, "the paper")
 
 
 def grids(root: Path, only_tasks: Iterable[str] = (), only: Iterable[str] = (), **sizes: Any) -> list[Grid]:

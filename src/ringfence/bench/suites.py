@@ -80,6 +80,7 @@ _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.val
 
 # How a proposal is played for its own sake, and under the cheapest guard.
 _ALONE, _ADAPTED = ("plain", "shield-learned"), ("plain", "adapt-learned")
+_RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 
 SUITES = {
     "simple_spread": Suite(
@@ -126,13 +127,8 @@ SUITES = {
             Entry("madiff", "long", _ALONE),
             Entry("icbf", "long", _ALONE),
             Entry("bc", "joint", _ALONE),
-            Entry("bc-best", evaluations=_ALONE),
-            Entry("bc-return", "default", _ALONE),
+            *(Entry(name, evaluations=_ALONE) for name in _RIVALS),
             Entry("bc-return", "advantage", _ALONE),
-            Entry("bc-safe", evaluations=_ALONE),
-            Entry("ma-td3bc", evaluations=_ALONE),
-            Entry("ma-td3bc-lag", evaluations=_ALONE),
-            Entry("omar", evaluations=_ALONE),
             *(Entry("icbf", f"paper{weight}", _ALONE) for weight in ("", "-1", "-3", "-10")),
         ),
     ),
@@ -142,12 +138,7 @@ SUITES = {
             Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
             Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
             Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
-            Entry("bc-best", evaluations=_ADAPTED),
-            Entry("bc-return", evaluations=_ADAPTED),
-            Entry("bc-safe", evaluations=_ADAPTED),
-            Entry("ma-td3bc", evaluations=_ADAPTED),
-            Entry("ma-td3bc-lag", evaluations=_ADAPTED),
-            Entry("omar", evaluations=_ADAPTED),
+            *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
             Entry("mpc", evaluations=("full-learned",)),
         ),
         episodes=20,
@@ -175,12 +166,7 @@ SUITES = {
             Entry("mpc", evaluations=("full-learned",)),
             Entry("icbf", evaluations=_ALONE),
             Entry("madiff", evaluations=_ALONE),
-            Entry("bc-best", evaluations=_ALONE),
-            Entry("bc-return", evaluations=_ALONE),
-            Entry("bc-safe", evaluations=_ALONE),
-            Entry("ma-td3bc", evaluations=_ALONE),
-            Entry("ma-td3bc-lag", evaluations=_ALONE),
-            Entry("omar", evaluations=_ALONE),
+            *(Entry(name, evaluations=_ALONE) for name in _RIVALS),
         ),
     ),
     "crossing-teams": Suite(

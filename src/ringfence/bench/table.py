@@ -11,7 +11,6 @@ from pathlib import Path
 
 from ringfence import schemas
 from ringfence.bench.cells import read_about
-from ringfence.bench.packed import unpack
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.files import whole
@@ -31,7 +30,6 @@ def rows(out: str | Path, may_be_empty: bool = False) -> list[dict]:
     """Every evaluation of every cell, and the reference rows; mixed protocols are refused, naming the files."""
     out = Path(out)
     about = read_about(out)
-    unpack(out)
     found, constants, seen = [], {}, {}
     for file in sorted((out / "reference").glob("*/reference.json")):
         for name, r in schemas.read(file, schemas.References, "has damaged reference rows; delete that file").items():

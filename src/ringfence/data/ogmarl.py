@@ -385,7 +385,7 @@ def _load(directory: Path, name: str) -> np.ndarray:
             f"'{directory}' lacks {name}.npy; pass a folder of MADIFF's robots (obs.npy, actions.npy, ...)."
         )
     try:
-        array = np.load(file, allow_pickle=False)
+        array = np.load(file, mmap_mode="r", allow_pickle=False)  # a header that lies is refused before it is believed
         if array.dtype.kind not in "biuf":
             raise ValueError(f"it holds entries of type {array.dtype}")
         return array

@@ -27,9 +27,9 @@ import numpy as np
 
 from ringfence import hazards, schemas
 from ringfence.errors import StoreError, UserError
-from ringfence.files import whole
+from ringfence.files import LOOSE, whole
+from ringfence.trees import digest_of
 
-LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed")
@@ -112,13 +112,8 @@ class EpisodeStore:
 
     def digest(self, *names: str) -> str:
         """Of some of the arrays."""
-        digest = hashlib.blake2b(digest_size=8)
-        for name in names:
-            array = getattr(self, name)
-            if array is not None:
-                digest.update(f"{name} {array.shape} {array.dtype}".encode())
-                digest.update(np.ascontiguousarray(array).data)
-        return digest.hexdigest()
+        arrays = ((name, getattr(self, name)) for name in names)
+        return digest_of((name, array) for name, array in arrays if array is not None)
 
     def select(self, keep: np.ndarray) -> EpisodeStore:
         """The episodes where `keep` (E,) is true."""
@@ -297,8 +292,8 @@ class EpisodeStore:
             try:
                 with h5py.File(temporary, "w") as f:
                     f.attrs["ringfence_store"] = FORMAT
-                    f.attrs["card"] = json.dumps(self.card)
-                    f.attrs["digest"] = self.content
+                    f.attrs["card"] = told = json.dumps(self.card)
+                    f.attrs["digest"], f.attrs["card_digest"] = self.content, _digest(told)
                     for name in (*ARRAYS, *OPTIONAL):
                         if getattr(self, name) is not None:
                             f.create_dataset(name, data=getattr(self, name))
@@ -324,6 +319,11 @@ class EpisodeStore:
                 raw, digest = f.attrs["card"], f.attrs.get("digest")
                 if not isinstance(raw, str | bytes) or len(raw) > 2**24:
                     raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
+                if f.attrs.get("card_digest", of := _digest(raw)) != of:
+                    raise StoreError(
+                        f"'{path}' has another card than was written; make or import it again, or delete its "
+                        "attribute 'card_digest' if you wrote the card yourself."
+                    )
                 card = schemas.decode(raw, dict[str, Any])
                 arrays = {name: array[()] for name, array in there.items()}
         except StoreError:
@@ -382,6 +382,10 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
             f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {there / 2**20:.1f}; store them uncompressed."
         )
     return found
+
+
+def _digest(card: str | bytes) -> str:
+    return hashlib.blake2b(card.encode() if isinstance(card, str) else card, digest_size=8).hexdigest()
 
 
 def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import base64
-import zipfile
-import zlib
 
 import numpy as np
 
-from ringfence import tasks
-from ringfence.errors import UserError
+from ringfence import recordings, tasks
 from ringfence.report.table import Row, Section
 from ringfence.runs import Run
 
@@ -18,27 +15,15 @@ VARIANTS = 2  # per task
 NUMBERS = 20_000  # of an episode's plans; more plans than fit are left out, never the chosen one
 
 
-def recording(run: Run, variant: str) -> dict[str, np.ndarray] | None:
-    """Arrays of `rollout-<variant>.npz`, or None if nothing was recorded."""
-    file = run.path / f"rollout-{variant}.npz"
-    if not file.exists():
-        return None
-    try:
-        with np.load(file) as arrays:
-            return {k: arrays[k] for k in arrays.files}
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error
-
-
 def variant_key(row: Row, run: Run) -> str:
     """The variant's name in results.json, which the recording carries too."""
     return next(result["variant"] for member, result in row.members if member == run)
 
 
-def recordings(row: Row) -> tuple[Run, dict[str, np.ndarray]] | None:
+def of_row(row: Row) -> tuple[Run, recordings.Recording] | None:
     """The first seed of a row that has a recording."""
     for run, _ in sorted(row.members, key=lambda m: m[0].config["seed"]):
-        arrays = recording(run, variant_key(row, run))
+        arrays = recordings.read(run.path, variant_key(row, run))
         if arrays is not None:
             return run, arrays
     return None
@@ -48,7 +33,7 @@ def players(section: Section) -> list[dict]:
     """At most two variants of a task: the planner with the most plans and one that draws a single plan."""
     found = []
     for row in section.rows:
-        if row.split == "test" and (kept := recordings(row)):
+        if row.split == "test" and (kept := of_row(row)):
             options = row.members[0][1].get("options") or {}
             found.append(((options.get("plans", 0), options.get("ascent", 0.0)), row, *kept))
     if not found:

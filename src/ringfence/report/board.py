@@ -17,16 +17,14 @@ from pathlib import Path
 
 from ringfence import schemas, tasks
 from ringfence.bench import suites
-from ringfence.bench.packed import unpack
+from ringfence.bench.cells import read_about
 from ringfence.data.origin import other_data
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
 from ringfence.runs import Run
 
-FORMAT = 1  # of the folder
 FILE = "bench.json"
-DECLARED = ("format", "protocol", "suite", "episodes", "split")
 CELL = re.compile(r"seed-(\d+)(?:-(.+))?")
 
 
@@ -117,8 +115,7 @@ def is_board(folder: Path) -> bool:
 def read(folder: str | Path) -> Board:
     """The results folder as rows. `UserError` names the files that disagree where numbers must not be mixed."""
     folder = Path(folder)
-    told = _declared(folder)
-    unpack(folder)
+    told = read_about(folder)
     cells = [(path, *_place_of(path)) for path in sorted((folder / "cells").glob("*/*/*/")) if CELL.match(path.name)]
     finished, missing, partial = [], [], []
     for path, task, job, seed in cells:
@@ -170,24 +167,6 @@ def read(folder: str | Path) -> Board:
         constants=_constants(entries, references),
         runs=[run for run, *_ in finished],
     )
-
-
-RESTORE = "restore that file, e.g. from another results folder of this suite and number of episodes"
-
-
-def _declared(folder: Path) -> dict:
-    if not is_board(folder):
-        raise UserError(f"'{folder}' holds no {FILE}, so it is no results folder; give the one a benchmark wrote.")
-    told = schemas.read(folder / FILE, schemas.Bench, f"holds a damaged {FILE}; {RESTORE}")
-    lacking = [k for k in DECLARED if k not in told]
-    if told.get("format") != FORMAT:
-        raise UserError(
-            f"'{folder / FILE}' has format {told.get('format')}, this version reads format {FORMAT}; "
-            "use the version of ringfence that wrote it, or run the benchmark again."
-        )
-    if lacking:
-        raise UserError(f"'{folder / FILE}' lacks '{lacking[0]}'; {RESTORE}.")
-    return told
 
 
 def _place_of(path: Path) -> tuple[str, str, int]:

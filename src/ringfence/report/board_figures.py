@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.report.board import Method
-from ringfence.report.figures import FAR, INK, MARKERS, STYLE, figure, to_svg
+from ringfence.report.figures import FAR, INK, MARKERS, STYLE, Ticks, figure, to_svg
 from ringfence.report.standings import Aggregate, Standing
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
@@ -150,6 +150,7 @@ def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
         axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
         if told.cost_thresholds[-1] > FAR:
             axes[1].set_xscale("symlog", linthresh=1.0)
+            axes[1].xaxis.set_major_formatter(Ticks())
             axes[1].set_xlim(-0.05, told.cost_thresholds[-1])
         handles, labels = axes[0].get_legend_handles_labels()
         made.legend(

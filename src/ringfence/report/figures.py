@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from ringfence.errors import UserError
 from ringfence.report.table import Row, Section
@@ -21,6 +22,15 @@ COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
 FAR = 8.0  # times the limit: axes of cost that reach further are not linear
 INK, GRID = "#010203", "#010204"
+
+
+class Ticks(LogFormatter):
+    """Numbers as they are read, on a logarithmic axis: no mathematics. Which are shown is matplotlib's choice."""
+
+    def __call__(self, x: float, pos: int | None = None) -> str:
+        return f"{x:g}" if super().__call__(x, pos) else ""
+
+
 STYLE = {
     "text.parse_math": False,  # a name with $ is a name
     "svg.fonttype": "none",
@@ -247,9 +257,11 @@ def training_curves(rows: list[Row], name: str) -> list[dict]:
                 ax.plot(*zip(*points), style, color=colour(row), linewidth=1.1)
             if logarithmic and all(v > 0 for _, _, points in present for _, v in points):
                 ax.set_yscale("log")
+                ax.yaxis.set_major_formatter(Ticks())
+                ax.yaxis.set_minor_formatter(Ticks())
             if "share" in y:
                 ax.set_ylim(-0.03, 1.03 if "true hazard" not in title else None)
-            ax.xaxis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
+            ax.xaxis.set_major_locator(MaxNLocator(5))
             ax.set_ylabel(y)
             ax.set_xlabel("update")
             panels.append(

@@ -10,7 +10,7 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from ringfence import __version__, algos, hazards, schemas, tasks
+from ringfence import __version__, algos, hazards, recordings, schemas, tasks
 from ringfence.data.origin import regenerated
 from ringfence.errors import UserError
 from ringfence.evaluate import of_last_step
@@ -239,7 +239,7 @@ def _fields(section: Section, k: int) -> list[dict]:
         seen.add(family)
         preset = "" if row.preset == "default" else row.preset
         entry = {"name": f"{row.name} {preset}".strip(), "seed": run.config["seed"]}
-        recorded = (animation.recording(run, variant) for variant in run.results)
+        recorded = (recordings.read(run.path, variant) for variant in run.results)
         kept = next((r for r in recorded if r is not None), None)
         n = run.config["spec"]["n_agents"]
         usable = kept is not None and kept["states"].shape[-1] == 6 * n
@@ -298,10 +298,10 @@ def commands(section: Section, out: Path) -> list[str]:
             split = " --split validation" if row.split == "validation" else ""
             step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
             how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
-            evaluations.setdefault((how,), []).append(shell(str(run.path)))
+            evaluations.setdefault((how,), []).append(shell(run.path))
     lines += [f"ringfence eval {' '.join(dict.fromkeys(paths))} {how}" for (how,), paths in evaluations.items()]
-    roots = dict.fromkeys(shell(str(r.path.parent.parent)) for r in section.runs)
-    lines.append(f"ringfence report {' '.join(roots)} --out {shell(str(out))}")
+    roots = dict.fromkeys(shell(r.path.parent.parent) for r in section.runs)
+    lines.append(f"ringfence report {' '.join(roots)} --out {shell(out)}")
     return lines
 
 

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ringfence import recordings
 from ringfence.envs.film import DRAWN
 from ringfence.errors import UserError
 from ringfence.evaluate import load_job
 from ringfence.files import whole
-from ringfence.report.animation import recording
 from ringfence.runs import Run
 from ringfence.tasks import Task
 from ringfence.types import Env
@@ -66,9 +66,9 @@ def film(run: Run, variant: str) -> Path:
     return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
 
 
-def recorded(run: Run, variant: str) -> dict[str, np.ndarray]:
+def recorded(run: Run, variant: str) -> recordings.Recording:
     """An evaluation's recording; `UserError` where it kept none."""
-    kept = recording(run, variant)
+    kept = recordings.read(run.path, variant)
     if kept is None:
         raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
     return kept
