@@ -299,6 +299,7 @@ def test_ctrl_c_is_not_swallowed():
     code = (
         "import os, signal, time\nfrom ringfence import interrupts\nfrom ringfence.progress import Progress\n"
         "class Last:\n    def __del__(self):\n        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(0.01)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background would ignore it
         "interrupts.listen()\nx = Last()\ndel x\n"
         "try:\n    Progress('work', 2, quiet=True).advance(1)\nexcept KeyboardInterrupt:\n    print('heard')\n"
         "interrupts.listen()\ntry:\n    with interrupts.held():\n        os.kill(os.getpid(), signal.SIGINT)\n"

@@ -1,0 +1,148 @@
+"""Rows of (time, agent) as episodes: one clock, holes cut, a constant team or an agent among its neighbours.
+
+Everything here is NumPy on flat arrays; `tables.py` reads tables and makes stores of what comes out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """R rows on one clock, sorted by segment and step: a segment is one agent without a hole.
+
+    What adds up or holds (`earned`, `cost`) is of the time since the row before.
+    """
+
+    recording: np.ndarray  # (R,) int, whose rows share a clock
+    agent: np.ndarray  # (R,) int
+    segment: np.ndarray  # (R,) int
+    step: np.ndarray  # (R,) int, of dt seconds since the recording's first row
+    state: np.ndarray  # (R, C)
+    action: np.ndarray  # (R, A): the last one told at that time
+    earned: np.ndarray  # (R,): the sum of rewards
+    cost: np.ndarray  # (R,): the largest
+    dt: float  # s
+
+
+def resample(
+    recording: np.ndarray,
+    agent: np.ndarray,
+    time: np.ndarray,
+    state: np.ndarray,
+    action: np.ndarray,
+    reward: np.ndarray,
+    cost: np.ndarray,
+    dt: float,
+    gap: float,
+) -> Tracks:
+    """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), onto steps of `dt` s. States are
+    interpolated, actions held; a hole of more than `gap` s ends a segment."""
+    begins = np.ones(len(time), bool)
+    begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
+    first = np.flatnonzero(begins)
+    last = np.append(first[1:], len(time)) - 1
+    zero = np.full(recording.max() + 1, np.inf)
+    np.minimum.at(zero, recording, time)
+    origin = zero[recording[first]]
+    low = np.ceil((time[first] - origin) / dt - 1e-6).astype(np.int64)
+    high = np.floor((time[last] - origin) / dt + 1e-6).astype(np.int64)
+    count = np.maximum(high - low + 1, 0)
+    segment = np.repeat(np.arange(len(first)), count)
+    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + low[segment]
+
+    # All segments one after another on one axis, so that each is searched and interpolated in one call.
+    spans = time[last] - time[first]
+    shift = np.concatenate([[0.0], np.cumsum(spans + 1.0)[:-1]]) - time[first]
+    axis = time + shift[np.cumsum(begins) - 1]
+    at = np.clip(step * dt + (origin + shift)[segment], axis[first][segment], axis[last][segment])
+    row = np.searchsorted(axis, at + 1e-6 * dt, "right") - 1  # the last one told
+    fresh = np.ones(len(row), bool)
+    fresh[1:] = segment[1:] != segment[:-1]
+    before = np.where(fresh, first[segment] - 1, np.concatenate([[0], row[:-1]]))
+    sums = np.concatenate([[0.0], np.cumsum(reward)])
+    bounds = np.stack([np.minimum(before + 1, row), row + 1], 1).ravel()
+    return Tracks(
+        recording[first][segment],
+        agent[first][segment],
+        segment,
+        step,
+        np.stack([np.interp(at, axis, column) for column in state.T], 1),
+        action[row],
+        sums[row + 1] - sums[before + 1],
+        np.maximum.reduceat(np.append(cost, 0.0), bounds)[::2],
+        dt,
+    )
+
+
+def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int]:
+    """Windows in which the same agents are there: rows (W, N) of `tracks`, of everybody at a time; how many rows each
+    window has; and N, by default the size that most rows belong to."""
+    order = np.lexsort((tracks.agent, tracks.step, tracks.recording))
+    recording, step, segment = (x[order] for x in (tracks.recording, tracks.step, tracks.segment))
+    begins = np.ones(len(order), bool)
+    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
+    first = np.flatnonzero(begins)
+    many = np.diff(np.append(first, len(order)))
+    # Who is there, as one number: two sets of segments share theirs once in 2^64.
+    mark = np.random.default_rng(0).integers(0, 2**63, segment.max() + 1, np.uint64, endpoint=True)[segment]
+    who = np.add.reduceat(mark, first)
+    changes = np.ones(len(first), bool)
+    changes[1:] = (np.diff(who) != 0) | (np.diff(recording[first]) != 0) | (np.diff(step[first]) != 1)
+    window = np.cumsum(changes) - 1
+    rows = np.bincount(window)
+    of = many[np.flatnonzero(changes)]  # agents of each window
+    if size is None:
+        size = int(np.bincount(of, weights=(rows - 1) * of).argmax())
+    chosen = of == size
+    return order[np.repeat(chosen[window], many)].reshape(-1, size), rows[chosen], size
+
+
+def cut(rows: np.ndarray, shortest: int, longest: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """(index of rows, rows of each piece): windows of so many `rows` in pieces of `shortest` to `longest` steps, each
+    of which begins with the row that the one before ends with."""
+    starts = np.cumsum(rows) - rows
+    steps = rows - 1
+    if longest is not None:
+        pieces = np.maximum(-(-steps // longest), 1)
+        number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        starts, steps = np.repeat(starts, pieces) + number * longest, np.repeat(steps, pieces) - number * longest
+        steps = np.minimum(steps, longest)
+    kept = steps >= shortest
+    starts, many = starts[kept], steps[kept] + 1
+    return np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(starts, many), many
+
+
+def nearest(tracks: Tracks, position: np.ndarray, k: int, sight: float) -> np.ndarray:
+    """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sight` m."""
+    order = np.lexsort((tracks.step, tracks.recording))
+    recording, step = tracks.recording[order], tracks.step[order]
+    begins = np.ones(len(order), bool)
+    begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
+    first = np.flatnonzero(begins)
+    many = np.diff(np.append(first, len(order)))
+    found = np.full((len(order), k), -1)
+    by_size = np.argsort(many, kind="stable")  # so that little is padded
+    while len(by_size):
+        most = int(np.searchsorted(np.cumsum(many[by_size] ** 2), CHUNK)) + 1
+        now, by_size = by_size[:most], by_size[most:]
+        width = int(many[now].max())
+        place = first[now, None] + np.arange(width)
+        there = np.arange(width) < many[now, None]
+        rows = np.where(there, order[np.minimum(place, len(order) - 1)], -1)
+        at = np.where(there[..., None], position[rows], np.inf)
+        with np.errstate(invalid="ignore"):
+            far = np.sqrt(((at[:, None] - at[:, :, None]) ** 2).sum(-1))
+        far[:, np.arange(width), np.arange(width)] = np.inf
+        far = np.where(np.isnan(far) | (far > sight), np.inf, far)
+        if width > 1:
+            who = np.argsort(far, -1, kind="stable")[..., : min(k, width - 1)]
+            close = np.isfinite(np.take_along_axis(far, who, -1))
+            theirs = np.where(close, rows[np.arange(len(now))[:, None, None], who], -1)
+            found[rows[there], : theirs.shape[-1]] = theirs[there]
+    return found
