@@ -29,6 +29,7 @@ COMMAND = ("cmd_vx", "cmd_vy", "cmd_wz")
 CLOCK = 1.0  # s; stamps further from the times of recording come from another clock than the recorder's
 JOINTS = 1000  # names of joints that a topic may hold
 DEFINITION = 2**16  # characters of a type's definition
+LARGEST = 1e30  # of any number; a store holds float32
 MOVING = 0.05  # m/s; slower rows do not tell in which frame a twist is
 SHOWN = 8  # topics that a refusal lists
 
@@ -188,7 +189,7 @@ def read_bag(
     columns = {c: np.concatenate([part[c] for part in parts]) for c in ("time", *parts[0])}
     action = tuple(c for c in COMMAND if columns[c].any()) or COMMAND
     if action != COMMAND:
-        notes.append(f"{' and '.join(c for c in COMMAND if c not in action)} is zero in every row, so it is no action")
+        notes.append(f"no action, since zero in every row: {', '.join(c for c in COMMAND if c not in action)}")
     state = tuple(c for c in columns if c not in ("time", "agent", "yaw", "cost", *COMMAND))
     return Bag(columns, state, action, tuple(names), tuple(notes))
 
@@ -415,7 +416,7 @@ def _prefixes(bag: _File, agents: str | Sequence[str], odom: str) -> list[str]:
         if not prefixes or len(set(prefixes)) < len(prefixes):
             raise UserError(f"agents={list(agents)} is empty or names one twice; list every agent's prefix once.")
         return prefixes
-    if "{i}" not in agents and "{" not in agents:
+    if "{" not in agents:
         return _prefixes(bag, [agents], odom)
     if agents.count("{i}") != 1 or "{" in agents.replace("{i}", ""):
         raise UserError(f"agents='{agents}' must hold {{i}} once, and no other braces; write it as '/robot_{{i}}'.")
@@ -503,12 +504,12 @@ def _numbers(topic: Topic, names: Sequence[str]) -> np.ndarray:
 
 
 def _finite(topic: Topic, messages: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
-    bad = np.argwhere(~np.isfinite(values))
+    bad = np.argwhere(~(np.abs(values) <= LARGEST))  # NaN is not, either
     if len(bad):
         row, entry = bad[0]
         raise StoreError(
-            f"{names[entry]} of message {messages[row]} of '{topic.name}' is {values[row, entry]}; all numbers must be "
-            "finite, so cut the bag there or mend its publisher."
+            f"{names[entry]} of message {messages[row]} of '{topic.name}' is {values[row, entry]:g}; all numbers must "
+            f"be finite and within {LARGEST:g}, so cut the bag there or mend its publisher."
         )
 
 
