@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Column, Table
 
-from ringfence import interrupts
+from ringfence import cli_data, interrupts
 from ringfence.errors import UserError, whole_number
 from ringfence.files import writable
 from ringfence.words import terminal
@@ -615,6 +615,7 @@ def bench_export(
 
 DATA = {
     "make": make,
+    **cli_data.COMMANDS,
     "import-omar": import_omar,
     "import-ogmarl": import_ogmarl,
     "import-madiff": import_madiff,

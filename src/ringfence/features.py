@@ -201,13 +201,15 @@ def from_data(
     first_rows: np.ndarray | None = None,
     keep: Iterable[str] = (),
     alike: bool = False,
+    dt: float | None = None,
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
     so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
     `keep`). Where names tell how entries follow from others (`derived`) and the logged steps agree, they do.
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
-    that vary only later on. `first_rows` (E,) are those that episodes begin with.
+    that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
+    agents who are `alike`, where it is known; else it is what the rows tell.
     """
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
@@ -240,8 +242,10 @@ def from_data(
     plain = kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
     if view == "centralized":
         return plain
-    if alike and (dt := _step_of(plain, observations, first_rows)) is not None:
-        return coasting(plain, dt)
+    if alike and not any(f"own.{c}" in plain.names for c in "xyz"):
+        dt = dt or _step_of(plain, observations, first_rows)
+        if dt is not None:
+            return coasting(plain, dt)
     return following(plain, _confirmed(plain, observations, state, first_rows))
 
 
@@ -269,7 +273,7 @@ def _step_of(map: FeatureMap, observations, first_rows, steps: int = 4000) -> fl
     """s between rows, of agents who know velocities and not places: what stands still (`goal.dx`) moves by −dt of
     `own.vx`. None where no entry tells, or nine logged steps in ten do not agree to a twentieth of their change."""
     names = {name: d for d, name in enumerate(map.names)}
-    if any(f"own.{c}" in names for c in "xyz") or len(observations) < 3:
+    if len(observations) < 3:
         return None
     before = np.unique(np.linspace(0, len(observations) - 2, steps).astype(int))
     if first_rows is not None:

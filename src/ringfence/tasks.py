@@ -70,7 +70,7 @@ class Task:
         firsts = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
         keep = hazards.reads(self.hazard, store.n_agents, tuple(names))
         told = store.observations, store.state, tuple(names), tuple(state_names), firsts, keep
-        return features.from_data(view, *told, alike=self.alike)
+        return features.from_data(view, *told, alike=self.alike, dt=store.card.get("dt"))
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
         env = self.env

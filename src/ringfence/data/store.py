@@ -284,6 +284,14 @@ class EpisodeStore:
             None if speed is None else _numbers("speed", speed),
         )
 
+    @classmethod
+    def from_table(cls, table, *, time: str, agent: str, state, **options):
+        """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
+        Parquet file; options as of `ringfence.data.tables.from_table`."""
+        from ringfence.data.tables import from_table
+
+        return from_table(table, time=time, agent=agent, state=state, **options)
+
     # --- disk ---
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
@@ -451,6 +459,8 @@ def complete_card(card: dict) -> dict:
             raise StoreError(
                 f"The card has {name} with {twice[0]!r} twice or unprintable; give every entry its own name."
             )
+    if "dt" in card and not (_is_number(card["dt"]) and card["dt"] > 0):
+        raise StoreError(f"The card has dt={card['dt']!r}; it must be the seconds of a step, a number above 0.")
     if not isinstance(card.get("alike", False), bool):
         raise StoreError(f"The card has alike={card['alike']!r}; it must be true or false.")
     if isinstance(card["hazard"], hazards.Hazard):

@@ -70,6 +70,7 @@ def from_table(
     longest: int | None = None,
     fastest: float = 100.0,
     danger: Hazard | None = None,
+    notes: Sequence[str] = (),
     card: dict | None = None,
 ) -> EpisodeStore:
     """The store of a table with a row per agent and time, in any order of agents; each agent's times increase.
@@ -86,7 +87,8 @@ def from_table(
     agent, who sees the k nearest others within `sight` m; such agents are alike, and a policy plays any number of
     them. Episodes have `shortest` to `longest` steps. `fastest` m/s is more than anything there can do.
 
-    `StoreError` names the first row that cannot be.
+    The card's warnings say what was taken for what, and what was left out, after the `notes` of whoever read the
+    table. `StoreError` names the first row that cannot be (counted from 0, without a header).
     """
     position, speed = ([f"{v}{c}" for c in AXES if f"{v}{c}" in state] for v in ("", "v"))
     _check_sizes(team, neighbours, shortest, longest)
@@ -103,15 +105,13 @@ def from_table(
         raise UserError(f"danger={type(danger).__name__} is not read from a table; give a Separation or a cost column.")
     wanted = [time, agent, *state, *action, *goal, *(c for c in (episode, reward, cost) if c)]
     read = _columns(table, wanted)
-    if action and speed and not position:
-        position = []
     rows = _sorted(read, time, agent, episode)
-    notes: list[str] = []
+    notes = list(notes)
     values = {name: _numbers(read, name)[rows.order] for name in (*state, *action, *goal)}
     told = {name: _numbers(read, c)[rows.order] if c else np.zeros(len(rows.time)) for name, c in
             (("reward", reward), ("cost", cost))}  # fmt: skip
     _check_units(values, rows, position, speed, fastest, notes)
-    step = dt or rows.step
+    step = dt or float(f"{rows.step:.6g}")
     states = np.stack([values[c] for c in (*state, *goal)], 1)
     acts = np.stack([values[c] for c in action], 1) if action else np.zeros((len(rows.time), 1))
     tracks = resample(
@@ -136,6 +136,20 @@ def from_table(
     arrays = build(made, danger, bool(cost), shortest, longest, **how)
     acts = arrays.pop("held") if action else made.accelerations(arrays["rows"])
     return _store(made, arrays, acts, bool(reward), danger, neighbours is not None, card or {})
+
+
+def from_layout(table: Table, layout: str, **options) -> EpisodeStore:
+    """The store of a table in a published format (`LAYOUTS`); options as of `from_table`."""
+    if layout not in LAYOUTS:
+        raise unknown("layout", layout, LAYOUTS)
+    of = LAYOUTS[layout]
+    theirs = {c: of.columns.get(c, c) for c in ("time", "agent", *of.state, *of.action)}
+    read = _columns(table, [*theirs.values(), *(of.corner or ()), *([options["cost"]] if options.get("cost") else [])])
+    columns = read | {ours: read[name] for ours, name in theirs.items()}
+    columns["time"] = _numbers(read, theirs["time"]) * of.time_unit
+    for c, side in zip("xy", of.corner or ()):
+        columns[c] = _numbers(columns, c) + _numbers(read, side) / 2
+    return from_table(columns, time="time", agent="agent", state=of.state, action=of.action, **options)
 
 
 def _check_sizes(team, neighbours, shortest, longest) -> None:

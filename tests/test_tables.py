@@ -1,0 +1,307 @@
+"""Tables of (time, agent) rows as episodes: what comes out is what went in, on one clock."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ringfence
+from ringfence import cli
+from ringfence.data.store import EpisodeStore
+from ringfence.data.tables import from_layout, from_table
+from ringfence.data.tracks import cut, nearest, resample, teams
+from ringfence.errors import UserError
+from ringfence.hazards import CostColumn, Separation
+from tests.quick import QUICK_WORLD
+
+NAMES = dict(time="t", agent="id", episode="run", state=["x", "y", "vx", "vy"], action=["ax", "ay"], cost="hit")
+
+
+def fleet(episodes: int = 6, steps: int = 12, agents: int = 3, dt: float = 0.1, seed: int = 0) -> dict[str, np.ndarray]:
+    """Columns of agents who are always there, sorted by run, time and agent."""
+    rng = np.random.default_rng(seed)
+    shape = (episodes, steps, agents)
+    run, t, who = (x.ravel() for x in np.indices(shape))
+    v = rng.uniform(-1, 1, (*shape, 2))
+    p = rng.uniform(-3, 3, (episodes, 1, agents, 2)) + np.cumsum(v, 1) * dt
+    columns = dict(run=run, t=100.0 * run + t * dt, id=np.array([f"robot{i}" for i in who]))
+    columns |= dict(zip(("x", "y", "vx", "vy"), np.concatenate([p, v], -1).reshape(-1, 4).T))
+    columns |= dict(zip(("ax", "ay", "gx", "gy"), rng.uniform(-1, 1, (len(run), 4)).T))
+    return columns | {"hit": (rng.random(len(run)) < 0.2).astype(float), "paid": rng.normal(size=len(run))}
+
+
+def entry(store: EpisodeStore, name: str) -> np.ndarray:
+    """(T + E, N) of an observation's entry."""
+    return store.observations[..., store.card["observation_names"].index(name)]
+
+
+def test_rows_on_one_clock_come_out_as_they_are():
+    table = fleet()
+    store = from_table(table, **NAMES, reward="paid", goal=["gx", "gy"])
+    assert (store.episodes, store.steps, store.n_agents) == (6, 66, 3) and store.card["dt"] == 0.1
+    grid = {name: x.reshape(6, 12, 3) for name, x in table.items()}
+    for name in ("x", "y", "vx", "vy"):
+        np.testing.assert_allclose(entry(store, f"own.{name}").reshape(6, 12, 3), grid[name], atol=2e-6)
+    x, gx, vy = grid["x"], grid["gx"], grid["vy"]
+    np.testing.assert_allclose(entry(store, "goal.dx").reshape(6, 12, 3), gx - x, atol=1e-5)
+    np.testing.assert_allclose(entry(store, "other1.dx").reshape(6, 12, 3)[..., 0], x[..., 2] - x[..., 0], atol=1e-5)
+    other = entry(store, "other0.dvy").reshape(6, 12, 3)
+    np.testing.assert_allclose(other[..., 2], vy[..., 0] - vy[..., 2], atol=1e-5)
+    np.testing.assert_allclose(store.actions[..., 0].reshape(6, 11, 3), grid["ax"][:, :-1], atol=1e-6)
+    np.testing.assert_allclose(store.rewards.reshape(6, 11, 3), grid["paid"][:, 1:], atol=1e-5)
+    np.testing.assert_array_equal(store.costs.reshape(6, 11, 3), grid["hit"][:, 1:])
+    assert store.truncated.sum() == 6 and not store.terminated.any() and store.hazard == CostColumn()
+
+
+def test_data_frames_files_and_shuffled_agents_are_the_same(tmp_path):
+    import pandas as pd
+
+    table = fleet()
+    frame = pd.DataFrame(table)
+    frame.to_csv(tmp_path / "fleet.csv", index=False)
+    frame.to_parquet(tmp_path / "fleet.parquet")
+    by_agent = frame.sort_values(["id", "run", "t"])
+    whole = from_table(table, **NAMES)
+    for other in (frame, by_agent, tmp_path / "fleet.csv", str(tmp_path / "fleet.parquet")):
+        assert EpisodeStore.from_table(other, **NAMES).content == whole.content
+    import pyarrow
+
+    assert from_table(pyarrow.table(table), **NAMES).content == whole.content
+
+
+def test_uneven_times_are_put_on_one_clock():
+    """Against a loop over rows: states interpolated, actions held, rewards added up, the largest cost."""
+    rng = np.random.default_rng(1)
+    sizes = (40, 25)
+    clocks = [np.sort(rng.uniform(0, 4, n)) for n in sizes]
+    clocks[0][0] = 0.0
+    run, who = np.zeros(sum(sizes), int), np.repeat([0, 1], sizes)
+    time, state = np.concatenate(clocks), rng.normal(size=(sum(sizes), 2))
+    action, reward, cost = (rng.normal(size=(sum(sizes), k)) for k in (3, 1, 1))
+    got = resample(run, who, time, state, action, reward[:, 0], cost[:, 0], 0.25, 10.0)
+    seen = 0
+    for agent in (0, 1):
+        mine = np.flatnonzero(who == agent)
+        rows = np.flatnonzero(got.agent == agent)
+        before = -np.inf
+        for row in rows:
+            at = got.step[row] * 0.25
+            assert time[mine[0]] <= at <= time[mine[-1]]
+            last = mine[time[mine] <= at][-1]
+            for c in range(2):
+                np.testing.assert_allclose(got.state[row, c], np.interp(at, time[mine], state[mine, c]))
+            np.testing.assert_array_equal(got.action[row], action[last])
+            since = mine[(time[mine] > before) & (time[mine] <= at)]
+            np.testing.assert_allclose(got.earned[row], reward[since].sum() if len(since) else 0.0, atol=1e-12)
+            np.testing.assert_allclose(got.cost[row], cost[since].max() if len(since) else cost[last])
+            before, seen = at, seen + 1
+    assert seen == len(got.step) > 25
+
+
+def test_agents_that_come_and_go_make_windows_of_constant_membership():
+    rng = np.random.default_rng(2)
+    there = rng.random((3, 30, 4)) < 0.85
+    run, t, who = (x.ravel()[there.ravel()] for x in np.indices(there.shape))
+    order = np.lexsort((t, who, run))
+    run, t, who = run[order], t[order], who[order]
+    zeros = np.zeros(len(t))
+    tracks = resample(run, who, t * 0.5, np.stack([t, who], 1), zeros[:, None], zeros, zeros, 0.5, 0.75)
+    rows, many, size = teams(tracks, 3)
+    expected = set()
+    for e in range(3):
+        origin = np.flatnonzero(there[e].any(1))[0]
+        for a in range(30):  # maximal windows of the same three
+            team = tuple(np.flatnonzero(there[e, a]))
+            if len(team) != 3 or (a > 0 and tuple(np.flatnonzero(there[e, a - 1])) == team):
+                continue
+            b = a
+            while b + 1 < 30 and tuple(np.flatnonzero(there[e, b + 1])) == team:
+                b += 1
+            expected.add((e, a - origin, b - a + 1, team))
+    got, begin = set(), 0
+    for length in many:
+        window = rows[begin : begin + length]
+        team = tuple(tracks.agent[window[0]].tolist())
+        assert all(tuple(tracks.agent[w].tolist()) == team for w in window)
+        got.add((int(tracks.recording[window[0, 0]]), int(tracks.step[window[0, 0]]), int(length), team))
+        begin += length
+    assert got == expected and len(got) > 5 and size == 3
+    steps = {n: sum(r - 1 for r in teams(tracks, n)[1]) * n for n in (1, 2, 3, 4) if (there.sum(2) == n).any()}
+    assert teams(tracks, None)[2] == max(steps, key=steps.get)
+
+
+def test_long_windows_are_cut_and_short_ones_left_out():
+    index, many = cut(np.array([11, 3, 8]), shortest=3, longest=5)
+    assert many.tolist() == [6, 6, 6]  # 10 steps in two, 2 steps and the rest of 7 are too short
+    assert index.tolist() == [*range(6), *range(5, 11), *range(14, 20)]
+    assert cut(np.array([11, 3]), 1, None)[1].tolist() == [11, 3]
+
+
+def test_neighbours_are_those_who_are_nearest_at_that_time():
+    rng = np.random.default_rng(3)
+    there = rng.random((2, 15, 6)) < 0.7
+    there[:, :, 0] = True
+    run, t, who = (x.ravel()[there.ravel()] for x in np.indices(there.shape))
+    order = np.lexsort((t, who, run))
+    run, t, who = run[order], t[order], who[order]
+    place, zeros = rng.uniform(-2, 2, (len(t), 2)), np.zeros(len(t))
+    tracks = resample(run, who, t * 1.0, place, zeros[:, None], zeros, zeros, 1.0, 100.0)
+    got = nearest(tracks, tracks.state, 3, 2.0)
+    for row in range(len(tracks.step)):
+        same = (tracks.recording == tracks.recording[row]) & (tracks.step == tracks.step[row])
+        same[row] = False
+        far = np.linalg.norm(tracks.state - tracks.state[row], axis=1)
+        wanted = [k for k in np.flatnonzero(same)[np.argsort(far[same])] if far[k] <= 2.0][:3]
+        assert got[row].tolist() == wanted + [-1] * (3 - len(wanted))
+
+
+def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
+    """The whole way: a policy of one agent, its World from the distances, played by seven."""
+    told = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
+    table = fleet(agents=5, steps=20) | {"gx": np.full(600, 1.5), "gy": np.full(600, -0.5)}
+    store = from_table(table, **told, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
+    assert store.n_agents == 1 and store.card["alike"] and store.costs.any() and (store.lengths <= 10).all()
+    far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
+    seen = entry(store, "other0.seen") > 0
+    assert (far[~seen] == 2.5).all() and (far[seen] <= 2.5).all() and 0 < seen.mean() < 1
+    arrived = np.delete(far[:, 0], np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes))
+    np.testing.assert_array_equal(store.costs[:, 0] > 0, arrived < np.float32(0.8))
+    grid = table["x"].reshape(6, 20, 5)
+    progress = -np.diff(np.hypot(1.5 - grid, -0.5 - table["y"].reshape(6, 20, 5)), axis=1)
+    assert np.isclose(store.rewards.sum(), progress[:, :].sum(), atol=1e-2)
+
+    world = ringfence.fit(store, **QUICK_WORLD)
+    assert world.map.dt == 0.1  # as of the table, whatever the few rows tell
+    run = ringfence.train("bc", store, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    pilot = ringfence.Controller(run, agents=7, guard="shield", world=world)
+    acted = pilot.act(np.tile(store.observations[0], (7, 1)), None)
+    assert acted.shape == (7, 2) and np.isfinite(acted).all()
+
+
+def test_velocities_and_accelerations_that_nobody_logged():
+    table = fleet()
+    store = from_table(table, **NAMES | dict(state=["x", "y"], action=()))
+    x = table["x"].reshape(6, 12, 3)
+    v = np.diff(x, axis=1) / 0.1
+    np.testing.assert_allclose(entry(store, "own.vx").reshape(6, 12, 3)[:, 1:], v, atol=1e-4)
+    np.testing.assert_allclose(store.actions[..., 0].reshape(6, 11, 3)[:, 1:], np.diff(v, axis=1) / 0.1, atol=2e-3)
+    assert any("accelerations" in note for note in store.card["warnings"])
+
+
+def test_costs_of_distances_and_of_the_team():
+    table = fleet(agents=2)
+    apart = np.hypot(*(np.diff(table[c].reshape(6, 12, 2))[..., 0] for c in "xy"))
+    store = from_table(table, **NAMES | dict(cost=None), danger=Separation(2.0))
+    np.testing.assert_array_equal(store.costs.reshape(6, 11) > 0, apart[:, 1:] < 2.0)
+    assert any("taken for the team's" in note for note in store.card["warnings"])
+
+
+def test_published_layouts_read_as_they_are(tmp_path):
+    """Two cars of highD's columns, x and y of a box's corner; and INTERACTION's, in milliseconds."""
+    head = "frame,id,x,y,width,height,xVelocity,yVelocity,xAcceleration,yAcceleration,frontSightDistance,laneId"
+    lines = [f"{f},1,{10 + f * 1.2:.3f},4.0,4.0,2.0,30.0,0.0,0.1,0.0,0,2" for f in range(1, 40)]
+    lines += [f"{f},2,{90 - f * 1.0:.3f},8.0,6.0,2.0,-25.0,0.0,0.0,0.2,0,5" for f in range(11, 60)]
+    (tmp_path / "01_tracks.csv").write_text("\n".join([head, *lines]) + "\n")
+    store = from_layout(tmp_path / "01_tracks.csv", "highd", neighbours=1, danger=Separation(5.0))
+    assert store.episodes == 2 and store.card["dt"] == 0.04 and store.actions.shape[2] == 2
+    both = entry(store, "other0.seen")[:, 0] > 0
+    assert both[10:39].all() and not both[:10].any()
+    np.testing.assert_allclose(entry(store, "other0.dx")[10, 0], (90 - 11 + 3) - (10 + 11 * 1.2 + 2), atol=1e-4)
+    np.testing.assert_allclose(entry(store, "other0.dvx")[10, 0], -55.0, atol=1e-4)
+
+    head = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"
+    lines = [f"{i},{f},{f * 100},car,{f * 0.5 + i},{i},5.0,0.0,0.0,4.1,1.8" for i in (1, 2) for f in range(1, 20)]
+    (tmp_path / "vehicle_tracks_000.csv").write_text("\n".join([head, *lines]) + "\n")
+    store = from_layout(tmp_path / "vehicle_tracks_000.csv", "interaction")
+    assert (store.episodes, store.steps, store.n_agents) == (1, 18, 2) and store.card["dt"] == 0.1
+    np.testing.assert_allclose(entry(store, "own.x")[:, 0], np.arange(1, 20) * 0.5 + 1, atol=1e-5)
+    with pytest.raises(UserError, match="No layout.*'hiway'|layout 'hiway'"):
+        from_layout(tmp_path / "01_tracks.csv", "hiway")
+
+
+def broken(**columns):
+    """The fleet's table with some entries changed: name=(row, value)."""
+    table = fleet()
+    for name, (row, value) in columns.items():
+        table[name] = table[name].astype(object if isinstance(value, str) else table[name].dtype)
+        table[name][row] = value
+    return table
+
+
+@pytest.mark.parametrize(
+    ("table", "options", "said"),
+    [
+        (broken(t=(30, -5.0)), {}, r"row 30: t=-5 is earlier than row 27 of the same agent \(id=robot0\); sort"),
+        (broken(t=(30, fleet()["t"][27])), {}, "row 30: .* is the time of row 27 of the same agent"),
+        (broken(x=(7, np.nan)), {}, r"row 7: x is nan \(1 such rows\); fill it, or drop the rows"),
+        (broken(vx=(7, "fast")), {}, "row 7: vx is 'fast', no number"),
+        (broken(x=(40, 300.0)), {}, "row 40: x, y moved at .* m/s since row 37 of the same agent, more than fastest"),
+        (fleet(), {"fastest": 0.01}, "more than fastest=0.01; check the units"),
+        (fleet(), {"state": ["x", "yy"]}, "column of the table.*yy"),
+        (fleet(), {"state": []}, "state names no column"),
+        (fleet(), {"team": 4}, "No 4 agents are together for 5 steps of 0.1 s"),
+        (fleet(steps=4), {}, "together for 5 steps"),
+        (fleet(), {"team": 2, "neighbours": 2}, "give one of them"),
+        (fleet(), {"neighbours": 0}, "neighbours=0 must be a whole number"),
+        (fleet(), {"dt": 0.0}, "dt=0.0 must be a number above 0"),
+        (fleet(), {"goal": ["gx"]}, "goal names 1 columns, the position has 2"),
+        (fleet(), {"danger": CostColumn()}, "danger=CostColumn is not read from a table"),
+        (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0)}, "state holds no x and y"),
+        (fleet(), {"state": ["hit"], "action": ()}, "action names no column"),
+        (broken(hit=(8, -1.0)), {}, "costs holds negative entries"),
+        (fleet() | {"x": np.zeros(3)}, {}, "not of one length"),
+        ({k: v[:0] for k, v in fleet().items()}, {}, "not of one length above 0"),
+        ([1, 2, 3], {}, "The table is a list"),
+        ("nothing.csv", {}, "'nothing.csv' is no file"),
+    ],
+)
+def test_tables_that_cannot_be_are_refused(table, options, said):
+    with pytest.raises(UserError, match=said):
+        from_table(table, **NAMES | options)
+
+
+def test_files_that_are_no_tables_are_refused(tmp_path):
+    for name, content in (("a.parquet", b"PAR1nonsense"), ("a.csv", b'x,y\n1,"2\n3'), ("a.xlsx", b"PK")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(UserError, match="no table that can be read|ends in|column of the table"):
+            from_table(tmp_path / name, **NAMES)
+
+
+def test_units_that_disagree_are_noted():
+    table = fleet()
+    assert not any("times what" in note for note in from_table(table, **NAMES).card["warnings"])
+    table |= {"vx": table["vx"] * 3.6, "vy": table["vy"] * 3.6}
+    assert any("times what positions change by" in note for note in from_table(table, **NAMES).card["warnings"])
+
+
+def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
+    import pandas as pd
+
+    pd.DataFrame(fleet()).to_csv(tmp_path / "fleet.csv", index=False)
+    cli.main(
+        ["data", "import-table", str(tmp_path / "fleet.csv"), "--time", "t", "--agent", "id", "--episode", "run"]
+        + ["--state", "x", "y", "vx", "vy", "--action", "ax", "ay", "--cost", "hit", "--out", str(tmp_path / "f.h5")]
+    )
+    assert "6 episodes, 66 steps" in capsys.readouterr().out
+    assert EpisodeStore.load(tmp_path / "f.h5").content == from_table(fleet(), **NAMES).content
+    cli.main(["data", "info", str(tmp_path / "f.h5")])
+    with pytest.raises(SystemExit):
+        cli.main(["data", "import-table", str(tmp_path / "fleet.csv"), "--state", "x", "--out", str(tmp_path / "g.h5")])
+    assert "column of the table" in capsys.readouterr().err and not (tmp_path / "g.h5").exists()
+
+    from tests.test_bags import command, odometry, write
+
+    logs = []
+    for i in (1, 2):
+        for k in range(60):
+            logs.append(odometry(f"/robot_{i}/odom", 0.1 * k, x=0.05 * k, y=float(i), twist=(0.5, 0.0, 0.0)))
+            logs.append(command(f"/robot_{i}/cmd_vel", 0.1 * k - 0.01, vx=0.5 + 0.001 * k))
+    bag = write(tmp_path / "bag", logs)
+    cli.main(
+        ["data", "import-bag", str(bag), "--agents", "/robot_{i}", "--separation", "1.5", "--longest", "20"]
+        + ["--out", str(tmp_path / "bag.h5")]
+    )
+    store = EpisodeStore.load(tmp_path / "bag.h5")
+    assert (store.n_agents, store.lengths.tolist()) == (2, [20, 20, 19]) and (store.costs == 1).all()
+    np.testing.assert_allclose(entry(store, "own.vx"), 0.5, atol=1e-6)
+    np.testing.assert_allclose(entry(store, "other0.dy")[:, 0], 1.0, atol=1e-6)
