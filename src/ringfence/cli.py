@@ -137,6 +137,35 @@ def import_madiff(
     _imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
 
 
+def import_hdf5(
+    file: Positional[str],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    task: str | None = None,
+    agents: str | None = None,
+    cost_limit: float | None = None,
+    action_low: float | None = None,
+    action_high: float | None = None,
+) -> None:
+    """Import an HDF5 file in DSRL's, D4RL's or Minari's layout, as the logs of one agent or of several.
+
+    Args:
+        file: the HDF5 file, a Minari data set's folder, or the name of one on this machine, e.g. D4RL/door/human-v2.
+        out_file: the store to write.
+        task: a name for the data; that of the file or the data set by default.
+        agents: who sees and moves which columns, as JSON or a JSON file: {"a": {"observation": [0, 1], "action": [0]}}.
+        cost_limit: the cost per episode that reports call safe.
+        action_low: bound of every action entry; Minari's action space tells it by default, else -1.
+        action_high: likewise, else 1.
+    """
+    from ringfence.data.hdf5 import import_hdf5
+
+    target = writable(out_file)
+    if target.exists() and Path(file).exists() and target.samefile(file):
+        raise UserError(f"'{file}' would be overwritten by its own import; give another file with --out.")
+    bounds = {"action_low": action_low, "action_high": action_high}
+    _imported(import_hdf5(file, task=task, agents=agents, cost_limit=cost_limit, **bounds), target)
+
+
 def _limit(speed_limit: float | None, quantile: bool):
     if quantile and speed_limit is not None:
         raise UserError("--quantile and --speed-limit both set the limit; give one of them.")
@@ -423,6 +452,7 @@ def doctor() -> None:
     for package, extra, use in (
         ("tensorboardX", "tensorboard", "TensorBoard logs"),
         ("tensorstore", "vault", "OG-MARL's Vaults"),
+        ("minari", "minari", "Minari's data sets by their names"),
         ("ray", "ray", "benchmarks on a cluster"),
         ("mpe2", "test", "parity tests"),
     ):
@@ -618,6 +648,7 @@ DATA = {
     "import-omar": import_omar,
     "import-ogmarl": import_ogmarl,
     "import-madiff": import_madiff,
+    "import-hdf5": import_hdf5,
     "info": info,
     "train-behaviour": train_behaviour,
 }
