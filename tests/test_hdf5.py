@@ -4,6 +4,8 @@ out among agents, and refused where they contradict themselves."""
 from __future__ import annotations
 
 import json
+import random
+import sys
 import warnings
 
 import gymnasium
@@ -18,6 +20,7 @@ from ringfence.data.columns import read as read_columns
 from ringfence.data.hdf5 import import_hdf5
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
+from tests import corpus
 
 LENGTHS = (5, 3, 7, 2)
 PAIR = {"a": {"observation": [0, 1, 2], "action": [0, 2]}, "b": {"observation": [3, 2], "action": [1]}}
@@ -301,6 +304,18 @@ def test_other_files_are_refused(tmp_path, monkeypatch):
         import_hdf5(good)
 
 
+def test_flipped_bits_are_refused_in_a_sentence_or_read(tmp_path):
+    raw, refused = write(tmp_path / "d.hdf5", recorded(), compression="gzip").read_bytes(), 0
+    for what, content in corpus.broken_bytes(raw, random.Random(2), 200):
+        (tmp_path / "broken.hdf5").write_bytes(content)
+        try:
+            import_hdf5(tmp_path / "broken.hdf5")
+        except UserError as error:
+            assert str(error).isprintable() and str(error).endswith("."), what
+            refused += 1
+    assert refused > 60
+
+
 def test_a_file_that_claims_a_thousand_times_its_size_is_not_unpacked(tmp_path):
     rows = 2_000_000
     with h5py.File(tmp_path / "bomb.hdf5", "w") as f:
@@ -506,7 +521,7 @@ def test_minari_data_that_is_not_here_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     with pytest.raises(StoreError, match="no such Minari data set in .*door/human-v2'; download it with Minari"):
         import_hdf5("D4RL/door/human-v2")
-    monkeypatch.setitem(__import__("sys").modules, "minari.storage", None)
+    monkeypatch.setitem(sys.modules, "minari.storage", None)
     with pytest.raises(StoreError, match=r"pip install 'ringfence\[minari\]'"):
         import_hdf5("D4RL/door/human-v2")
 
@@ -542,6 +557,6 @@ def test_refusals_of_the_command_line(tmp_path, capsys):
     np.testing.assert_array_equal(EpisodeStore.load(out).actions[:, 0], data["actions"])
 
 
-def test_a_refusal_is_a_sentence_for_whoever_called(tmp_path):
-    with pytest.raises(UserError, match="is no regular file"):
+def test_a_device_is_no_file():
+    with pytest.raises(StoreError, match="is no regular file"):
         import_hdf5("/dev/null")
