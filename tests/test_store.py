@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import ringfence.data.store as store_module
+from ringfence.data import arrays
 from ringfence.data.store import ARRAYS, EpisodeStore
 from ringfence.errors import StoreError, UserError
 from ringfence.hazards import CostColumn
@@ -437,7 +437,7 @@ def test_logs_without_costs_and_odd_cards(played):
 
 
 def test_a_file_larger_than_memory_is_refused_before_it_is_read(tmp_path, small_store, monkeypatch):
-    monkeypatch.setattr(store_module, "_memory", lambda: 1000.0)
+    monkeypatch.setattr(arrays, "_memory", lambda: 1000.0)
     with pytest.raises(StoreError, match="GiB of arrays, this machine has 0.0 GiB of memory; take a larger"):
         EpisodeStore.load(small_store.save(tmp_path / "s.h5"))
 

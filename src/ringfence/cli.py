@@ -14,12 +14,10 @@ from rich.table import Column, Table
 
 from ringfence import cli_data, interrupts
 from ringfence.errors import UserError, whole_number
-from ringfence.files import writable
 from ringfence.words import terminal
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
-Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same, and so do --tasks a b and --tasks a --tasks b.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
 Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]
@@ -40,139 +38,6 @@ def tasks() -> None:
         constants = f"{t.return_min:g} to {t.return_max:g}"
         table.add_row(terminal(t.name), danger(t.hazard), f"{t.cost_limit:g}", constants)
     out.print(table)
-
-
-def make(
-    task: Positional[str],
-    size: int | None = None,
-    seed: int = 0,
-    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-    fresh: bool = False,
-) -> None:
-    """Regenerate a task's data set (cached).
-
-    Args:
-        task: its name, as `ringfence tasks` lists it.
-        size: transitions; the full data set by default.
-        seed: of the collection.
-        out_file: write here instead of the cache.
-        fresh: simulate again, whatever the cache holds.
-    """
-    from ringfence import tasks
-    from ringfence.data.make import make
-
-    store, path = make(tasks.get(task), size, seed, out_file, fresh)
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
-
-
-def import_omar(
-    directory: Positional[Path],
-    out_file: Annotated[Path, tyro.conf.arg(name="out")],
-    radius: float | None = None,
-    task: str | None = None,
-) -> None:
-    """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
-
-    Args:
-        directory: e.g. simple_spread/expert/seed_0_data.
-        out_file: the store to write.
-        radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
-        task: a name for the data; that of the tier in the directory's path by default.
-    """
-    from ringfence.data.omar import import_omar
-    from ringfence.hazards import Separation
-
-    if radius is not None and task is None:
-        raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
-    hazard = None if radius is None else Separation(radius, radius / 4)
-    file = writable(out_file)
-    _imported(import_omar(directory, hazard, task), file)
-
-
-def import_ogmarl(
-    vault: Positional[Path],
-    task: Robot,
-    out_file: Annotated[Path, tyro.conf.arg(name="out")],
-    speed_limit: float | None = None,
-    quantile: bool = False,
-    tier: str | None = None,
-) -> None:
-    """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
-
-    Args:
-        vault: e.g. 2halfcheetah.vlt/Good.
-        task: whose robot it is.
-        out_file: the store to write.
-        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
-        quantile: take the limit of the tier's `-quantile` task.
-        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
-    """
-    from ringfence.data.ogmarl import import_vault
-
-    file = writable(out_file)
-    _imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), file)
-
-
-def import_madiff(
-    directory: Positional[Path],
-    task: Robot,
-    out_file: Annotated[Path, tyro.conf.arg(name="out")],
-    speed_limit: float | None = None,
-    quantile: bool = False,
-    tier: str | None = None,
-) -> None:
-    """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
-
-    Args:
-        directory: the one that holds the arrays.
-        task: whose robot it is.
-        out_file: the store to write.
-        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
-        quantile: take the limit of the tier's `-quantile` task.
-        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
-    """
-    from ringfence.data.ogmarl import import_madiff
-
-    file = writable(out_file)
-    _imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
-
-
-def _limit(speed_limit: float | None, quantile: bool):
-    if quantile and speed_limit is not None:
-        raise UserError("--quantile and --speed-limit both set the limit; give one of them.")
-    return "quantile" if quantile else speed_limit
-
-
-def _imported(store, file: Path) -> None:
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True, markup=False)
-    for note in store.card["warnings"]:
-        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
-
-
-def info(file: Positional[Path]) -> None:
-    """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
-    from ringfence.data.audit import audit
-    from ringfence.data.store import EpisodeStore
-
-    report = audit(EpisodeStore.load(file))
-    for name, value in report.facts.items():
-        out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
-    for note in report.notes:
-        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
-    for warning in report.warnings:
-        out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
-
-
-def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
-    """Train MATD3 from scratch and write the behaviour policies and the replay that the package ships.
-
-    Args:
-        out_dir: folder for the files.
-    """
-    from ringfence.data.behaviour import train_tier_policies
-
-    for tier, facts in train_tier_policies(out_dir).items():
-        out.print(f"{tier:16} " + "  ".join(f"{k} {v:.4g}" for k, v in facts.items()), soft_wrap=True)
 
 
 def train(
@@ -423,6 +288,7 @@ def doctor() -> None:
     for package, extra, use in (
         ("tensorboardX", "tensorboard", "TensorBoard logs"),
         ("tensorstore", "vault", "OG-MARL's Vaults"),
+        ("minari", "minari", "Minari's data sets by their names"),
         ("ray", "ray", "benchmarks on a cluster"),
         ("mpe2", "test", "parity tests"),
     ):
@@ -613,15 +479,6 @@ def bench_export(
     print(export_board(folder, format, out_file or folder / f"ranked.{kind}"))
 
 
-DATA = {
-    "make": make,
-    **cli_data.COMMANDS,
-    "import-omar": import_omar,
-    "import-ogmarl": import_ogmarl,
-    "import-madiff": import_madiff,
-    "info": info,
-    "train-behaviour": train_behaviour,
-}
 BENCH = {"status": bench_status, "results": bench_results, "paper-table": bench_paper, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,
@@ -644,7 +501,10 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         if arguments[:1] == ["data"]:
             tyro.extras.subcommand_cli_from_dict(
-                DATA, prog="ringfence data", description="Episode stores: make, import, inspect.", args=arguments[1:]
+                cli_data.COMMANDS,
+                prog="ringfence data",
+                description="Episode stores: make, import, inspect.",
+                args=arguments[1:],
             )
         elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in BENCH:
             tyro.extras.subcommand_cli_from_dict(

@@ -6,12 +6,40 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
 
 from ringfence.errors import UserError
 from ringfence.files import writable
+from ringfence.words import terminal
 
+out = Console(highlight=False)
 Positional = tyro.conf.Positional
+Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
 Out = Annotated[Path, tyro.conf.arg(name="out")]
+
+
+def make(
+    task: Positional[str],
+    size: int | None = None,
+    seed: int = 0,
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    fresh: bool = False,
+) -> None:
+    """Regenerate a task's data set (cached).
+
+    Args:
+        task: its name, as `ringfence tasks` lists it.
+        size: transitions; the full data set by default.
+        seed: of the collection.
+        out_file: write here instead of the cache.
+        fresh: simulate again, whatever the cache holds.
+    """
+    from ringfence import tasks
+    from ringfence.data.make import make
+
+    store, path = make(tasks.get(task), size, seed, out_file, fresh)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
 
 
 def import_table(
@@ -65,7 +93,7 @@ def import_table(
     from ringfence.data.tables import from_layout, from_table
     from ringfence.hazards import Separation
 
-    out = writable(out_file)
+    kept = writable(out_file)
     told = {
         "danger": None if separation is None else Separation(separation, separation / 4),
         **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
@@ -76,9 +104,9 @@ def import_table(
     if layout is not None:
         if state or action or reward or goal or episode:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
-        return imported(from_layout(file, layout, **told), out)
+        return imported(from_layout(file, layout, **told), kept)
     columns = dict(state=state, action=action, reward=reward, goal=goal, episode=episode)
-    imported(from_table(file, time=time, agent=agent, **columns, **told), out)
+    imported(from_table(file, time=time, agent=agent, **columns, **told), kept)
 
 
 def import_bag(
@@ -127,7 +155,7 @@ def import_bag(
     from ringfence.data.tables import from_table
     from ringfence.hazards import Separation
 
-    out = writable(out_file)
+    kept = writable(out_file)
     bag = read_bag(file, agents, odom=odom, cmd=cmd, joints=joints, cost=cost, stamps=stamps, twist=twist)
     store = from_table(
         bag.columns,
@@ -141,18 +169,157 @@ def import_bag(
         notes=bag.notes,
         card={"task": task or file.stem, "provenance": f"bag {file.name}"},
     )
-    imported(store, out)
+    imported(store, kept)
+
+
+def import_omar(
+    directory: Positional[Path],
+    out_file: Out,
+    radius: float | None = None,
+    task: str | None = None,
+) -> None:
+    """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
+
+    Args:
+        directory: e.g. simple_spread/expert/seed_0_data.
+        out_file: the store to write.
+        radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
+        task: a name for the data; that of the tier in the directory's path by default.
+    """
+    from ringfence.data.omar import import_omar
+    from ringfence.hazards import Separation
+
+    if radius is not None and task is None:
+        raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
+    hazard = None if radius is None else Separation(radius, radius / 4)
+    file = writable(out_file)
+    imported(import_omar(directory, hazard, task), file)
+
+
+def import_ogmarl(
+    vault: Positional[Path],
+    task: Robot,
+    out_file: Out,
+    speed_limit: float | None = None,
+    quantile: bool = False,
+    tier: str | None = None,
+) -> None:
+    """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
+
+    Args:
+        vault: e.g. 2halfcheetah.vlt/Good.
+        task: whose robot it is.
+        out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
+    """
+    from ringfence.data.ogmarl import import_vault
+
+    file = writable(out_file)
+    imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), file)
+
+
+def import_madiff(
+    directory: Positional[Path],
+    task: Robot,
+    out_file: Out,
+    speed_limit: float | None = None,
+    quantile: bool = False,
+    tier: str | None = None,
+) -> None:
+    """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
+
+    Args:
+        directory: the one that holds the arrays.
+        task: whose robot it is.
+        out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
+    """
+    from ringfence.data.ogmarl import import_madiff
+
+    file = writable(out_file)
+    imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
+
+
+def import_hdf5(
+    file: Positional[str],
+    out_file: Out,
+    task: str | None = None,
+    agents: str | None = None,
+    cost_limit: float | None = None,
+    action_low: float | None = None,
+    action_high: float | None = None,
+) -> None:
+    """Import an HDF5 file in DSRL's, D4RL's or Minari's layout, as the logs of one agent or of several.
+
+    Args:
+        file: the HDF5 file, a Minari data set's folder, or the name of one on this machine, e.g. D4RL/door/human-v2.
+        out_file: the store to write.
+        task: a name for the data; that of the file or the data set by default.
+        agents: who sees and moves which columns, as JSON or a JSON file: {"a": {"observation": [0, 1], "action": [0]}}.
+        cost_limit: the cost per episode that reports call safe.
+        action_low: bound of every action entry; Minari's action space tells it by default, else -1.
+        action_high: likewise, else 1.
+    """
+    from ringfence.data.hdf5 import import_hdf5
+
+    target = writable(out_file)
+    if target.exists() and Path(file).exists() and target.samefile(file):
+        raise UserError(f"'{file}' would be overwritten by its own import; give another file with --out.")
+    bounds = {"action_low": action_low, "action_high": action_high}
+    imported(import_hdf5(file, task=task, agents=agents, cost_limit=cost_limit, **bounds), target)
+
+
+def _limit(speed_limit: float | None, quantile: bool):
+    if quantile and speed_limit is not None:
+        raise UserError("--quantile and --speed-limit both set the limit; give one of them.")
+    return "quantile" if quantile else speed_limit
 
 
 def imported(store, file: Path) -> None:
     """Keep what was imported, and say what was noted."""
-    from rich.console import Console
-    from rich.markup import escape
-
-    out = Console(highlight=False)
     out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True, markup=False)
     for note in store.card["warnings"]:
         out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
 
 
-COMMANDS = {"import-table": import_table, "import-bag": import_bag}
+def info(file: Positional[Path]) -> None:
+    """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
+    from ringfence.data.audit import audit
+    from ringfence.data.store import EpisodeStore
+
+    report = audit(EpisodeStore.load(file))
+    for name, value in report.facts.items():
+        out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
+    for note in report.notes:
+        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
+    for warning in report.warnings:
+        out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
+
+
+def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
+    """Train MATD3 from scratch and write the behaviour policies and the replay that the package ships.
+
+    Args:
+        out_dir: folder for the files.
+    """
+    from ringfence.data.behaviour import train_tier_policies
+
+    for tier, facts in train_tier_policies(out_dir).items():
+        out.print(f"{tier:16} " + "  ".join(f"{k} {v:.4g}" for k, v in facts.items()), soft_wrap=True)
+
+
+COMMANDS = {
+    "make": make,
+    "import-table": import_table,
+    "import-bag": import_bag,
+    "import-omar": import_omar,
+    "import-ogmarl": import_ogmarl,
+    "import-madiff": import_madiff,
+    "import-hdf5": import_hdf5,
+    "info": info,
+    "train-behaviour": train_behaviour,
+}

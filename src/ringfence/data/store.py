@@ -26,13 +26,15 @@ import h5py
 import numpy as np
 
 from ringfence import hazards, schemas
+from ringfence.data import arrays
 from ringfence.errors import StoreError, UserError
-from ringfence.files import LOOSE, whole
+from ringfence.files import whole
 from ringfence.trees import digest_of
 
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed")
+PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,7 +335,7 @@ class EpisodeStore:
                         "attribute 'card_digest' if you wrote the card yourself."
                     )
                 card = schemas.decode(raw, dict[str, Any])
-                arrays = {name: array[()] for name, array in there.items()}
+                content = {name: array[()] for name, array in there.items()}
         except StoreError:
             raise
         except OSError as error:
@@ -343,7 +345,7 @@ class EpisodeStore:
             told = (str(error).splitlines() or [type(error).__name__])[0]
             raise StoreError(f"'{path}' is damaged or has no card ({told}); make or import it again.") from error
         try:
-            found = cls(**arrays, card=card)
+            found = cls(**content, card=card)
         except UserError as error:
             raise StoreError(f"'{path}': {error}") from None
         if digest is not None and digest != found.content:
@@ -359,18 +361,7 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
     missing = [name for name in ARRAYS if name not in f]
     if missing:
         raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
-    found = {}
-    for name in (n for n in (*ARRAYS, *OPTIONAL) if n in f):
-        array = f[name] if isinstance(f.get(name, getlink=True), h5py.HardLink) else None
-        if array is None or (isinstance(array, h5py.Dataset) and (array.external or array.is_virtual)):
-            raise StoreError(f"'{path}' keeps '{name}' in another file; copy it into the store itself.")
-        if not isinstance(array, h5py.Dataset):
-            raise StoreError(f"'{path}' holds a group where the array '{name}' belongs; make the store again.")
-        if array.dtype.kind not in "biuf":
-            raise StoreError(f"'{path}' holds '{name}' of type {array.dtype}; it must hold numbers.")
-        if array.shape is None or not array.shape:
-            raise StoreError(f"'{path}' holds no array in '{name}'; make the store again.")
-        found[name] = array
+    found = {name: arrays.array(path, f, name) for name in (*ARRAYS, *OPTIONAL) if name in f}
     steps, episodes = found["actions"].shape[0], found["episode_ends"].shape[0]
     rows = {"observations": steps + episodes, "state": steps + episodes, "episode_ends": episodes}
     for name, array in found.items():
@@ -379,16 +370,7 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
                 f"'{path}' holds {array.shape[0]} rows of '{name}' for {steps} steps of {episodes} episodes; make or "
                 "import the store again."
             )
-    size, there = sum(array.nbytes for array in found.values()), path.stat().st_size
-    if size > (memory := _memory()):
-        raise StoreError(
-            f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB of memory; "
-            "take a larger machine, or store fewer episodes."
-        )
-    if size > 4 * there + LOOSE:
-        raise StoreError(
-            f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {there / 2**20:.1f}; store them uncompressed."
-        )
+    arrays.affordable(path, sum(array.nbytes for array in found.values()), PACKED)
     return found
 
 
@@ -410,13 +392,6 @@ def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
     if axes is not None and array.ndim != axes:
         raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
     return array
-
-
-def _memory() -> float:
-    """Bytes of memory, infinite where the system does not say."""
-    names = getattr(os, "sysconf_names", {})
-    known = "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names
-    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")
 
 
 def complete_card(card: dict) -> dict:
