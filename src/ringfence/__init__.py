@@ -20,6 +20,7 @@ _WHERE = {
     "load": "ringfence.evaluate",
     "Controller": "ringfence.evaluate",
     "play": "ringfence.parallel",
+    "record": "ringfence.recorder",
     "World": "ringfence.world",
     "fit": "ringfence.worlds",
     "load_world": "ringfence.worlds:load",

@@ -18,6 +18,7 @@ import numpy as np
 
 from ringfence import algos, features, hazards, recordings, stats, tasks, training, worlds
 from ringfence.each import Each, look
+from ringfence.episodes import given_as
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.files import writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
@@ -408,24 +409,6 @@ class Controller:
             name, there = "observations and state", there + len(state)
         if last >= there:
             raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
-
-
-def given_as(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np.ndarray:
-    """What a controller is given, as numbers of the expected shape; None stands for a width that nobody knows."""
-    letters = "NO" if len(expected) == 2 else "S"
-    wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
-    try:
-        array = np.asarray(value, np.float32)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} is no array of numbers; pass one of shape {wanted}.") from None
-    if array.ndim != len(expected) or any(n not in (None, m) for m, n in zip(array.shape, expected)):
-        raise UserError(f"{name} has shape {array.shape}, this run takes {wanted}; pass what its data holds.")
-    if not np.isfinite(array).all():
-        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
-        raise UserError(
-            f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
-        )
-    return array
 
 
 def load_job(run: Run, agents: int | None = None) -> training.Job:

@@ -137,6 +137,20 @@ class EpisodeStore:
             None if self.speed is None else self.speed[steps],
         )
 
+    def followed_by(self, other: EpisodeStore) -> EpisodeStore:
+        """These episodes and then the other's, of the same agents; the card is this one's."""
+        if (self.state is None) != (other.state is None):
+            raise StoreError("One of the stores holds a global state and the other none; leave it out of both.")
+        costs = [s.costs for s in (self, other)]
+        if costs[0].ndim != costs[1].ndim:  # the team's are everybody's
+            costs = [c if c.ndim == 2 else np.repeat(c[:, None], self.n_agents, 1) for c in costs]
+        told = {name: [getattr(s, name) for s in (self, other)] for name in (*ARRAYS, *OPTIONAL)}
+        told |= {"costs": costs, "episode_ends": [self.episode_ends, other.episode_ends + self.steps]}
+        if len({x.shape[1:] for x in told["observations"]}) > 1 or len({x.shape[1:] for x in told["actions"]}) > 1:
+            raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
+        kept = {name: None if any(x is None for x in both) else np.concatenate(both) for name, both in told.items()}
+        return EpisodeStore(**kept, card=self.card)
+
     def apart(self) -> EpisodeStore:
         """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
         `team` of the card tells how many they were. The global state is nobody's own, so it is left out."""

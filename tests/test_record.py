@@ -1,0 +1,145 @@
+"""Recording anybody's simulator: what it told is what is kept, and an interrupted recording goes on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+from pettingzoo import ParallelEnv
+
+import ringfence
+from ringfence.data.store import EpisodeStore
+from ringfence.envs.pettingzoo import SimpleSpreadParallel
+from ringfence.errors import StoreError, UserError
+from ringfence.progress import Progress
+
+
+class Drift(ParallelEnv):
+    """Two points that are pushed; an episode has 3 to 6 steps, by its seed, and some end by themselves."""
+
+    metadata = {"name": "drift"}
+    possible_agents = ["a", "b"]
+
+    def action_space(self, agent):
+        return Box(-2.0, 2.0, (1,))
+
+    def observation_space(self, agent):
+        return Box(-np.inf, np.inf, (2,))
+
+    def reset(self, seed=None, options=None):
+        chance = np.random.default_rng(seed)
+        self.x, self.t, self.left = chance.normal(size=2), 0, int(chance.integers(3, 7))
+        self.agents = list(self.possible_agents)
+        return self.told(), {a: {} for a in self.agents}
+
+    def told(self):
+        return {a: np.array([self.x[i], self.t], np.float32) for i, a in enumerate(self.possible_agents)}
+
+    def step(self, actions):
+        self.x = self.x + np.array([actions[a][0] for a in self.possible_agents])
+        self.t += 1
+        over, by_itself = self.t == self.left, self.left % 2 == 0
+        both = dict.fromkeys(self.possible_agents)
+        infos = {a: {"cost": float(self.x[i] > 1)} for i, a in enumerate(self.possible_agents)}
+        rewards = {a: float(-abs(self.x[i])) for i, a in enumerate(self.possible_agents)}
+        if over:
+            self.agents = []
+        return (
+            self.told(),
+            rewards,
+            both | dict.fromkeys(both, over and by_itself),
+            dict.fromkeys(both, over and not by_itself),
+            infos,
+        )
+
+
+def lean(observations, state):
+    return 0.5 - 0.2 * observations[:, :1]
+
+
+def test_what_is_told_is_what_is_kept():
+    store = ringfence.record(Drift, lean, episodes=8, seed=5)
+    env, ends = Drift(), np.concatenate([[0], store.episode_ends])
+    for k in range(8):
+        seen, _ = env.reset(seed=5 + k)
+        steps = slice(ends[k], ends[k + 1])
+        rows = store.observations[ends[k] + k : ends[k + 1] + k + 1]
+        np.testing.assert_allclose(rows[0], [seen["a"], seen["b"]])
+        for t in range(store.lengths[k]):
+            seen, rewards, over, _, infos = env.step(dict(zip("ab", lean(rows[t], None))))
+            np.testing.assert_allclose(rows[t + 1], [seen["a"], seen["b"]], atol=1e-6)
+            np.testing.assert_allclose(store.rewards[steps][t], list(rewards.values()), atol=1e-6)
+            np.testing.assert_array_equal(store.costs[steps][t], [infos[a]["cost"] for a in "ab"])
+        assert store.episode_terminated[k] == over["a"] and not env.agents
+    assert set(store.lengths) <= {3, 4, 5, 6} and len(set(store.lengths)) > 1 and store.costs.ndim == 2
+    assert (store.card["action_low"], store.card["action_high"]) == (-2, 2) and store.card["agents"] == ["a", "b"]
+    team = ringfence.record(Drift, lean, episodes=3, cost=lambda infos: 0.5)
+    assert team.costs.ndim == 1 and (team.costs == 0.5).all()
+
+
+def test_an_interrupted_recording_goes_on(tmp_path, monkeypatch):
+    monkeypatch.setattr("ringfence.recorder.EACH", 4)
+    whole = ringfence.record(Drift, None, episodes=11, seed=1)
+    advance, count = Progress.advance, []
+
+    def stops(self, *told):
+        advance(self, *told)
+        count.append(1)
+        if len(count) == 7:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Progress, "advance", stops)
+    with pytest.raises(KeyboardInterrupt):
+        ringfence.record(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
+    assert EpisodeStore.load(tmp_path / "d.h5").episodes == 4
+    again = ringfence.record(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
+    assert len(count) == 14 and again.content == whole.content == EpisodeStore.load(tmp_path / "d.h5").content
+    assert ringfence.record(Drift, None, episodes=5, seed=1, out=tmp_path / "d.h5").episodes == 5
+    with pytest.raises(StoreError, match="holds another recording"):
+        ringfence.record(Drift, lean, episodes=11, seed=1, out=tmp_path / "d.h5")
+    assert np.abs(whole.actions).max() > 1.5
+
+
+def test_states_and_policies_with_a_memory_are_recorded():
+    class Counting:
+        begun = 0
+
+        def reset(self):
+            self.begun += 1
+
+        def act(self, observations, state):
+            assert state is not None
+            return np.zeros((3, 2))
+
+    pilot = Counting()
+    store = ringfence.record(SimpleSpreadParallel, pilot, episodes=2)
+    assert pilot.begun == 2 and store.state is not None and store.lengths.tolist() == [25, 25]
+
+
+def test_simulators_and_policies_that_cannot_be_recorded(tmp_path):
+    class Few(Drift):
+        def action_space(self, agent):
+            return Discrete(5)
+
+    class Unbounded(Drift):
+        def action_space(self, agent):
+            return Box(-np.inf, np.inf, (1,))
+
+    class Silent(Drift):
+        def step(self, actions):
+            seen, *told = super().step(actions)
+            return (seen if self.agents else {}), *told
+
+    for make_env, policy, said in (
+        (Few, lean, "agents need a Box of one axis"),
+        (Unbounded, lean, "and bounded"),
+        (Silent, lean, "tells no observations where an episode ends"),
+        (Drift, lambda o, s: np.zeros((3, 1)), r"actions has shape \(3, 1\)"),
+        (Drift, lambda o, s: np.full((2, 1), np.nan), "takes finite numbers"),
+        (object, lean, "without"),
+    ):
+        with pytest.raises(UserError, match=said):
+            ringfence.record(make_env, policy, episodes=2, out=tmp_path / "x.h5")
+    with pytest.raises(UserError, match="has not ended after 2 steps"):
+        ringfence.record(Drift, lean, episodes=2, longest=2)
+    assert not list(tmp_path.iterdir())
