@@ -12,7 +12,13 @@ from ringfence.guards import GUARDS
 from tests.quick import QUICK_WORLD
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results" / "README.md"]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "CHANGELOG.md",
+    ROOT / "CONTRIBUTING.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "results" / "README.md",
+]
 
 
 def test_the_first_lines_of_python_run(tmp_path, monkeypatch):

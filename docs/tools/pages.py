@@ -1,0 +1,310 @@
+"""What MkDocs asks while it builds the site: the pages that no file holds. One per task, from `ringfence.tasks` and the
+committed results; the Python reference, from docstrings; the changelog and the like, from the repository's root."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections import defaultdict
+from pathlib import Path
+
+import ringfence
+from ringfence import hazards
+from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
+from ringfence.tasks import TASKS, Task
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "results"
+
+# --- the Python reference: pages of modules that belong together ---
+REFERENCE = {
+    "Logs": ("ringfence.data.store", "ringfence.data.make", "ringfence.data.audit"),
+    "Importers": ("ringfence.data.omar", "ringfence.data.ogmarl"),
+    "Danger": ("ringfence.hazards",),
+    "Training": ("ringfence.training", "ringfence.runs"),
+    "Playing": ("ringfence.evaluate", "ringfence.parallel", "ringfence.reference"),
+    "World": ("ringfence.worlds", "ringfence.world"),
+    "Parts of a World": (
+        "ringfence.world.fitting",
+        "ringfence.world.dynamics",
+        "ringfence.world.values",
+        "ringfence.world.barrier",
+    ),
+    "Guards": ("ringfence.guards.policy", "ringfence.guards.guard", "ringfence.guards.danger"),
+    "Planners": ("ringfence.policies",),
+    "Algorithms": (
+        "ringfence.types",
+        "ringfence.algos",
+        "ringfence.algos.bc",
+        "ringfence.algos.returns",
+        "ringfence.algos.td3bc",
+        "ringfence.algos.omar",
+        "ringfence.algos.fisor",
+        "ringfence.algos.icbf",
+        "ringfence.algos.mpc",
+    ),
+    "Tasks": ("ringfence.tasks", "ringfence.features"),
+    "Simulators": ("ringfence.envs", "ringfence.envs.pettingzoo"),
+    "Statistics": ("ringfence.stats",),
+    "Benchmark": ("ringfence.bench",),
+    "Reports": ("ringfence.report",),
+    "Errors and files": ("ringfence.errors", "ringfence.files"),
+}
+# Of an algorithm's module its settings and its values: losses and updates are read in the source.
+VALUES = ("ringfence.algos.", "ringfence.world.fitting")
+
+# --- tasks ---
+# Of a simulator's tasks, in words; of another one the first line of its docstring.
+ABOUT: dict[type, str] = {
+    SimpleSpread: "Agents cover landmarks without touching one another; physics and rewards of OMAR's data "
+    "([protocol](../evaluation.md#simple-spreads-two-integrators), [data](../data.md#simple-spread)).",
+    SafeMuJoCo: "Agents share the joints of one robot that must not run faster than a limit: safety-gymnasium's Safe "
+    "Multi-Agent MuJoCo ([simulator](../data.md#robots-the-simulator), [data](../data.md#halfcheetah-and-ant)).",
+    Crossing: "Discs with momentum find their way through one another, any number of them; each sees and decides for "
+    "itself ([Crossing](../crossing.md)).",
+}
+FILMS = {
+    "halfcheetah_2x3-good": ("rollout.gif", "Left a planner as it is, right one that keeps the limit"),
+    "crossing-hasty": (
+        "crossing.gif",
+        "Sixty-four discs that learned from this data, alone and each guarded by itself",
+    ),
+}
+SUITES = (
+    "simple_spread",
+    "mujoco",
+    "guards",
+    "guards-mujoco",
+    "own-sight",
+    "own-sight-mujoco",
+    "crossing",
+    "crossing-guards",
+    "crossing-teams",
+)
+NAMED = ("algorithm", "variant", "guard", "danger", "sight", "agents")  # what a row of a table is called by
+# Pages that stand outside docs/, and their places on the site.
+OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "results/README.md": "results.md"}
+
+
+def on_config(config):
+    """The navigation's sections that are made here."""
+    nav = {title: pages for entry in config["nav"] for title, pages in entry.items()}
+    nav["Tasks"] += ["tasks/README.md"]
+    nav["Tasks"] += [{group: [f"tasks/{t.name}.md" for t in found]} for group, found in groups().items()]
+    nav["Reference"] += ["reference/README.md", *({title: _place(title)} for title in REFERENCE)]
+    nav["About"] += [{"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}, {"Results": "results.md"}]
+    return config
+
+
+def on_files(files, config):
+    """Adds the pages themselves."""
+    from mkdocs.structure.files import File
+
+    for place, text in pages().items():
+        files.append(File.generated(config, place, content=text))
+    return files
+
+
+def pages() -> dict[str, str]:
+    """Every page that no file of docs/ holds, by its place there."""
+    made = {"tasks/README.md": _tasks(), "reference/README.md": _names()}
+    made |= {f"tasks/{task.name}.md": task_page(task) for task in TASKS.values()}
+    made |= {_place(title): _modules(title, modules) for title, modules in REFERENCE.items()}
+    return made | {place: from_root(ROOT / file) for file, place in OUTSIDE.items()}
+
+
+def from_root(file: Path) -> str:
+    """A page that stands outside docs/, its links as from within: those to pages of docs/ lead there, those to other
+    files, which the site does not hold, become the file's name."""
+
+    def turned(found: re.Match) -> str:
+        words, target = found.groups()
+        if "://" in target or target.startswith("#"):
+            return found[0]
+        path, hash, place = target.partition("#")
+        there = Path(os.path.normpath(file.parent / path)).relative_to(ROOT)
+        if str(there) in OUTSIDE:
+            return f"[{words}]({OUTSIDE[str(there)]}{hash}{place})"
+        if there.parts[0] == "docs":
+            return f"[{words}]({there.relative_to('docs')}{hash}{place})"
+        return words if words.strip("`") == str(there) else f"{words} (`{there}`)"
+
+    return re.sub(r"(?<!!)\[([^\]]*)\]\(([^)\s]+)\)", turned, file.read_text())
+
+
+def _place(title: str) -> str:
+    return f"reference/{title.lower().replace(' ', '-')}.md"
+
+
+def _names() -> str:
+    """The first page of the reference: what `import ringfence` offers."""
+    page = {module: _place(title) for title, modules in REFERENCE.items() for module in modules}
+    lines = ["# Python reference", "", "What `import ringfence` offers, loaded on first use:", ""]
+    lines += ["| name | lives in |", "|---|---|"]
+    for name, where in ringfence._WHERE.items():
+        module, _, other = where.partition(":")
+        module = module if module in page else getattr(ringfence, name).__module__
+        there = Path(page[module]).name
+        lines.append(f"| [`ringfence.{name}`]({there}#{module}.{other or name}) | [`{module}`]({there}#{module}) |")
+    lines += ["", "The rest, by what it is for. Axis letters and shapes: [`ringfence.types`](algorithms.md).", ""]
+    lines += ["| page | modules |", "|---|---|"]
+    for title, modules in REFERENCE.items():
+        lines.append(f"| [{title}]({Path(_place(title)).name}) | " + ", ".join(f"`{m}`" for m in modules) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _modules(title: str, modules: tuple[str, ...]) -> str:
+    parts = [f"# {title}"]
+    for module in modules:
+        told = f"::: {module}"
+        if module.startswith(VALUES):
+            told += "\n    options:\n      filters: ['^Config$', '^Settings$', '^[A-Z][A-Z0-9_]+$']"
+        parts.append(told)
+    return "\n\n".join(parts) + "\n"
+
+
+def _tasks() -> str:
+    lines = [
+        "# Tasks",
+        "",
+        "A task is a simulator, a definition of danger, a data tier, and the constants of its table.",
+    ]
+    lines += ["`ringfence tasks` prints this list; one page each, made from the code and the committed results.", ""]
+    for group, found in groups().items():
+        lines += [f"## {group}", "", "| task | danger | cost limit | return 0 to 1 |", "|---|---|---|---|"]
+        for t in found:
+            constants = f"{t.return_min:g} to {t.return_max:g}"
+            lines.append(f"| [{t.name}]({t.name}.md) | {danger(t.hazard)} | {t.cost_limit:g} | {constants} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def groups() -> dict[str, list[Task]]:
+    """Tasks by simulator and, where it has several, by limit."""
+    found = defaultdict(list)
+    for task in TASKS.values():
+        words = " ".join(re.findall("[A-Z][a-z]+", type(task.env).__name__))
+        found[f"Robots, {task.protocol} limits" if task.protocol else words].append(task)
+    return dict(found)
+
+
+def danger(hazard: hazards.Hazard) -> str:
+    """A hazard in words."""
+    if isinstance(hazard, hazards.SpeedLimit):
+        return f"a speed above {hazard.limit:g} m/s"
+    if isinstance(hazard, hazards.Separation):
+        return f"two centres nearer than {hazard.radius:g} m"
+    return str(hazard)
+
+
+def task_page(task: Task) -> str:
+    """What a task is, how its data are made and learned from, and what the committed results say of it."""
+    env = task.env
+    ends = "; a fall ends it" if env.terminates else ""
+    facts = {
+        "danger": danger(task.hazard),
+        "as a formula": f"`{task.hazard}`",
+        "cost limit l": f"{task.cost_limit:g} per episode",
+        "normalised return": f"(r − {_signed(task.return_min)}) / ({task.return_max:g} − {_signed(task.return_min)})",
+        "team": f"{env.n_agents} agents, each with {env.action_dim} action entries between {task.action_low:g} and "
+        f"{task.action_high:g}",
+        "each observes": f"{env.observation_dim} entries",
+        "global state": f"{len(env.state_names)} entries",
+        "episode": f"{env.episode_length} steps{ends}",
+        "data tier": task.tier,
+        "full data set": f"{task.transitions:,} steps of the team",
+    }
+    if task.published_return:
+        mean, deviation = task.published_return
+        spread = "" if deviation is None else f" ± {deviation:g}"
+        facts["public data set"] = f"return {mean:g}{spread}"
+    facts |= _logged(task)
+    lines = [f"# {task.name}", "", ABOUT.get(type(env)) or env.__doc__.splitlines()[0], ""]
+    if task.name in FILMS:
+        picture, words = FILMS[task.name]
+        lines += [f"![{words}](../images/{picture})", "", f"*{words}.*", ""]
+    lines += ["| what | here |", "|---|---|", *(f"| {k} | {v} |" for k, v in facts.items()), ""]
+    lines += ["## Make, learn, play", "", *_commands(task), "", *_rows(task)]
+    return "\n".join(lines) + "\n"
+
+
+def _signed(x: float) -> str:
+    return f"({x:g})".replace("-", "−") if x < 0 else f"{x:g}"
+
+
+def _commands(task: Task) -> list[str]:
+    guard = "adapt" if task.protocol else "shield"  # a limit that may be exceeded sometimes, or contact
+    told = {
+        f"ringfence data make {task.name}": "the data set, seeded and cached",
+        f"ringfence fit {task.name}": "its World; prints the card",
+        f"ringfence train bc {task.name}": "a policy; prints its run folder",
+        f"ringfence eval runs/{task.name} --guard {guard}": "played on the test resets under a guard",
+        f"ringfence report runs/{task.name}": "report.html",
+    }
+    wide = max(map(len, told)) + 3
+    return ["```text", *(f"{command:{wide}}# {words}" for command, words in told.items()), "```"]
+
+
+def _logged(task: Task) -> dict[str, str]:
+    """What results/data.csv tells of the full data set."""
+    with open(RESULTS / "data.csv") as file:
+        row = next((r for r in csv.DictReader(file) if r["task"] == task.name), None)
+    if row is None:
+        return {}
+    mean, spread, low, high = (float(row[f"return_{k}"]) for k in ("mean", "std", "min", "max"))
+    found = {
+        "its episodes": f"{int(row['episodes']):,}, of {float(row['steps_mean']):.0f} steps in the mean",
+        "their return": f"{mean:.2f} ± {spread:.2f}, from {low:.2f} to {high:.2f}",
+        "their cost": f"{float(row['cost_mean']):.3g} per episode; {100 * float(row['unsafe']):.1f} % of the episodes "
+        "have any",
+    }
+    if row["return_ceiling"]:
+        found["return ceiling"] = (
+            f"{float(row['return_ceiling']):.0f} within the limit, unless faster than all this data"
+        )
+    return found
+
+
+def _rows(task: Task) -> list[str]:
+    """The committed results, a table for each suite that played the task."""
+    lines = []
+    for suite in SUITES:
+        found = defaultdict(list)
+        with open(RESULTS / suite / "table.csv") as file:
+            for row in csv.DictReader(file):
+                if row["task"] == task.name:
+                    found[tuple(row[name] for name in NAMED)].append(row)
+        if not found:
+            continue
+        lines += [f"### `results/{suite}`", ""]
+        heads = ["who", "guard", "return", "normalised", "cost", "avoidable", "with any cost"]
+        heads += ["fell"] * task.env.terminates + ["seeds"]
+        lines += ["| " + " | ".join(heads) + " |", "|---|---|" + "---:|" * (len(heads) - 2)]
+        lines += [*(_row(names, rows, task.env.terminates) for names, rows in found.items()), ""]
+    if not lines:
+        return []
+    said = (
+        "Means over seeds, as `table.csv` has them; one seed compares no methods. Intervals, ranks and what the rows "
+    )
+    said += "say: [tables](../tables.md), [the grid](../benchmark.md), [who does what](../attribution.md)."
+    return ["## Results", "", said, "", *lines]
+
+
+def _row(names: tuple[str, ...], rows: list[dict], falls: bool) -> str:
+    algorithm, variant, guard, source, sight, agents = names
+    reference = variant == "reference"
+    who = algorithm if reference else f"`{algorithm}` `{variant}`"
+    who += f", {agents} agents" if agents else ""
+    how = "–" if guard == "none" else f"{guard}, {source}" + ", own sight" * (sight == "own")
+    cells = [f"{_mean(rows, key):.2f}" for key in ("return_mean", "return_norm")]
+    cells += [f"{_mean(rows, key):.3g}" for key in ("cost_mean", "avoidable_cost")]
+    rates = ["violation_rate", *["termination_rate"] * falls]
+    cells += [f"{100 * _mean(rows, key):.3g} %" for key in rates]  # 1 of 5000 must not read as none
+    return f"| {who} | {how} | " + " | ".join(cells) + f" | {'' if reference else len(rows)} |"
+
+
+def _mean(rows: list[dict], key: str) -> float:
+    """Of the seeds that tell it; older rows may not."""
+    told = [float(row[key]) for row in rows if row[key]]
+    return sum(told) / len(told) if told else float("nan")

@@ -1,0 +1,124 @@
+"""What the documentation quotes is what the code says; the pages that are made while the site is built are whole."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import ringfence
+from ringfence.tasks import TASKS
+
+ROOT = Path(__file__).resolve().parent.parent
+TOOLS = ROOT / "docs" / "tools"
+FEW = 14  # letters that a string of the code must have for a quote to be recognised by it
+
+
+def load(name: str):
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", TOOLS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def said(node: ast.AST) -> str | None:
+    """A pattern of what a string of the code may come to."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        parts = [re.escape(node.value)]
+        letters = len(node.value)
+    elif isinstance(node, ast.JoinedStr):
+        parts = [re.escape(v.value) if isinstance(v, ast.Constant) else ".*" for v in node.values]
+        letters = sum(len(v.value) for v in node.values if isinstance(v, ast.Constant))
+    else:
+        return None
+    return "".join(parts) if letters >= FEW else None
+
+
+@pytest.fixture(scope="module")
+def sayings():
+    trees = (ast.parse(file.read_text()) for file in (ROOT / "src" / "ringfence").rglob("*.py"))
+    found = {said(node) for tree in trees for node in ast.walk(tree)} - {None}
+    return re.compile("|".join(f"(?:{pattern})" for pattern in sorted(found)))
+
+
+def test_errors_are_quoted_as_the_code_prints_them(sayings):
+    quotes = re.findall(r"^> (.*)$", (ROOT / "docs" / "errors.md").read_text(), re.M)
+    assert len(quotes) >= 15
+    for quote in quotes:
+        assert sayings.fullmatch(quote), quote
+    assert not sayings.fullmatch("The moon is no regular file of this store; choose another planet and try it again.")
+
+
+def test_the_citation_is_of_this_version():
+    told = dict(re.findall(r"^(\w+): (.*)$", (ROOT / "CITATION.cff").read_text(), re.M))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert told["version"] == project["version"] == ringfence.__version__
+    assert told["license"] == project["license"]
+    assert f"## {ringfence.__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_every_task_has_a_page_with_its_results():
+    pages = load("pages").pages()
+    for name, task in TASKS.items():
+        page = pages[f"tasks/{name}.md"]
+        assert f"# {name}\n" in page and f"ringfence data make {name}" in page
+        assert f"| cost limit l | {task.cost_limit:g} per episode |" in page
+        assert "| behaviour data | – |" in page
+        assert f"({name}.md)" in pages["tasks/README.md"]
+    pattern = r"^\| `bc` `default\+shield-learned`, 8 agents .*\| 5 \|$"
+    (row,) = re.findall(pattern, pages["tasks/crossing-hasty.md"], re.M)
+    assert "| 0.0002 | 0.0002 | 0.02 % |" in row  # docs/crossing.md has the same row
+    for name in ringfence.__all__:
+        assert f"`ringfence.{name}`" in pages["reference/README.md"]
+
+
+def test_pages_of_the_root_lead_into_the_site():
+    tools = load("pages")
+    made = tools.pages()
+    for place in tools.OUTSIDE.values():
+        targets = re.findall(r"\]\(([^)#\s]+)", made[place])
+        assert targets
+        for target in targets:
+            assert target in made or (ROOT / "docs" / target).exists(), f"{place} leads to {target}"
+    assert "](results.md)" in made["contributing.md"]
+
+
+def test_links_to_what_the_site_does_not_hold_become_names(tmp_path):
+    tools = load("pages")
+    (copy := tmp_path / "PAGE.md").write_text("[the store](src/ringfence/data/store.py) and [x](docs/data.md#rules)")
+    tools.ROOT = tmp_path
+    assert tools.from_root(copy) == "the store (`src/ringfence/data/store.py`) and [x](data.md#rules)"
+
+
+BUILT = """<html><head><link rel="stylesheet" href="{style}"></head><body><h1 id="top">x</h1>{body}</body></html>"""
+
+
+@pytest.mark.parametrize(
+    ("style", "body", "wrong"),
+    [
+        ("own.css", "<p>fine, <a href='#top'>here</a></p>", None),
+        ("https://fonts.example/a.css", "", "from outside"),
+        ("own.css", "<script src='//cdn.example/a.js'></script>", "from outside"),
+        ("absent.css", "", "not there"),
+        ("own.css", "<a href='#nowhere'>x</a>", "no such place"),
+        ("own.css", "<a href='absent.html'>x</a>", "not there"),
+        ("own.css", "<p>a table\n| a | b |\n|---|---|\n| 1 | 2 |</p>", "Markdown as text"),
+        ("own.css", "<p>a list\n* one\n* two</p>", "Markdown as text"),
+        ("url.css", "", "from outside"),
+    ],
+)
+def test_a_site_is_looked_at(tmp_path, style, body, wrong):
+    (tmp_path / "own.css").write_text("p { color: red; }")
+    if style == "url.css":
+        (tmp_path / style).write_text("@font-face { src: url(https://fonts.example/a.woff2); }")
+    (tmp_path / "index.html").write_text(BUILT.format(style=style, body=body))
+    found = load("check").problems(tmp_path)
+    assert (not found) if wrong is None else any(wrong in line for line in found), found
+
+
+def test_an_empty_site_is_no_site(tmp_path):
+    assert "make docs" in load("check").problems(tmp_path)[0]
