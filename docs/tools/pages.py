@@ -20,10 +20,16 @@ RESULTS = ROOT / "results"
 # --- the Python reference: pages of modules that belong together ---
 REFERENCE = {
     "Logs": ("ringfence.data.store", "ringfence.data.make", "ringfence.data.audit"),
-    "Importers": ("ringfence.data.omar", "ringfence.data.ogmarl"),
+    "Importers": (
+        "ringfence.data.tables",
+        "ringfence.data.bags",
+        "ringfence.data.hdf5",
+        "ringfence.data.omar",
+        "ringfence.data.ogmarl",
+    ),
     "Danger": ("ringfence.hazards",),
     "Training": ("ringfence.training", "ringfence.runs"),
-    "Playing": ("ringfence.evaluate", "ringfence.parallel", "ringfence.reference"),
+    "Playing": ("ringfence.evaluate", "ringfence.parallel", "ringfence.recorder", "ringfence.reference"),
     "World": ("ringfence.worlds", "ringfence.world"),
     "Parts of a World": (
         "ringfence.world.fitting",
