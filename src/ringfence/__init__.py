@@ -21,6 +21,7 @@ _WHERE = {
     "Controller": "ringfence.evaluate",
     "play": "ringfence.parallel",
     "record": "ringfence.recorder",
+    "judge": "ringfence.judging",
     "World": "ringfence.world",
     "fit": "ringfence.worlds",
     "load_world": "ringfence.worlds:load",

@@ -14,6 +14,7 @@ from rich.table import Column, Table
 
 from ringfence import cli_data, interrupts
 from ringfence.errors import UserError, whole_number
+from ringfence.files import writable
 from ringfence.words import terminal
 
 out = Console(highlight=False)
@@ -89,6 +90,7 @@ def fit(
     sight: Literal["all", "own"] | None = None,
     set: Assignments = [],  # noqa: B006
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    report: Path | None = None,
 ) -> None:
     """Fit the World of a task's data or of a store, and print its card: what can be foreseen, how well, where not.
 
@@ -101,13 +103,21 @@ def fit(
             own view (always so of agents who are alike).
         set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
         out_file: keep the World in a file, too, for `ringfence eval --world`.
+        report: write the card as an HTML page: are these logs enough?
     """
     from ringfence import world, worlds
 
-    made = worlds.fit(_store(data), seed=seed, sight=sight, quiet=False, **_assignments(set))
+    report = None if report is None else writable(report)
+    store = _store(data)
+    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **_assignments(set))
     out.print(str(made.card), soft_wrap=True, markup=False)
     if out_file is not None:
         print(world.save(made, out_file))
+    if report is not None:
+        from ringfence.data.audit import audit
+        from ringfence.report.judge_page import build_judgement
+
+        print(build_judgement(report, made.card, audit(store)))
 
 
 def evaluate(
@@ -245,6 +255,55 @@ FLAGS = (
     "replan",
     "execution",
 )
+
+
+def judge(
+    run: Positional[Path],
+    data: Positional[str],
+    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
+    danger: Literal["learned", "formula", "both"] | None = None,
+    world: Path | None = None,
+    planner: Literal["plain", "climbing", "steady"] = "plain",
+    states: int = 3000,
+    transitions: int = 20_000,
+    updates: int = 3000,
+    seed: int = 0,
+    report: Path | None = None,
+) -> None:
+    """Judge a policy by logs alone, without a simulator: what it would do there, where that leads, what it is worth.
+
+    Args:
+        run: folder of a trained run.
+        data: a store of its task, best one that it was not trained on (or a task, whose data set is regenerated).
+        guard: as for `ringfence eval`.
+        danger: what the guard knows danger by.
+        world: the World that guards; the one that judges is fitted to `data`.
+        planner: as for `ringfence eval`.
+        states: logged states that it is asked in.
+        transitions: logged steps that Q evaluation learns from.
+        updates: of the evaluation.
+        seed: of what is drawn, and of the judging World (seed + 1).
+        report: write an HTML page.
+    """
+    from ringfence import judging, worlds
+    from ringfence.data.audit import audit
+    from ringfence.report.judge_page import build_judgement
+
+    report = None if report is None else writable(report)
+    (found,) = _runs([run])[:1]
+    store = _store(data)
+    how = {k: v for k, v in (("danger", danger), ("world", world)) if v is not None}
+    how |= {} if guard == "none" else {"guard": guard}
+    judging.check(found, store)
+    by = worlds.fit(store, seed=seed + 1, quiet=False)
+    told = judging.judge(
+        found, store, judge_world=by, states=states, transitions=transitions, updates=updates, planner=planner,
+        seed=seed, quiet=False, **how,
+    )  # fmt: skip
+    for line in judging.words(told):
+        out.print(line, soft_wrap=True, markup=False)
+    if report is not None:
+        print(build_judgement(report, by.card, audit(store), told))
 
 
 def report(
@@ -486,6 +545,7 @@ COMMANDS = {
     "train": train,
     "eval": evaluate,
     "bench": bench,
+    "judge": judge,
     "report": report,
     "demo": demo,
     "doctor": doctor,

@@ -1,0 +1,90 @@
+"""How well logs alone tell what a simulator would: every policy of a suite, judged by logs that it was not trained on,
+beside what it did in the simulator.
+
+    ringfence bench guards --out DIR         # policies with their checkpoints
+    python benchmarks/judge.py DIR           # writes results/judging.csv and docs/judging.md; 30 s a policy and guard
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+
+import numpy as np
+from readme import put
+from scipy.stats import spearmanr
+
+from ringfence import tasks, worlds
+from ringfence.data.make import make
+from ringfence.files import whole
+from ringfence.judging import judge
+from ringfence.runs import Run
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "judging.csv"
+EPISODES, LOGS_SEED = 2000, 7  # of the logs that judge
+NUMBERS = ("foreseen_unsafe", "not_surely_safe", "return", "cost", "unknown", "apart")
+HEAD = ("task", "algorithm", "variant", "seed", "true_return", "true_cost", *NUMBERS)
+# What each number is to tell, and whether more of it is to mean more of that.
+TELLS = {
+    "foreseen_unsafe": ("true_cost", "share of states from which danger is foreseen"),
+    "not_surely_safe": ("true_cost", "share of states that are not surely safe"),
+    "cost": ("true_cost", "fitted Q evaluation of cost"),
+    "return": ("true_return", "fitted Q evaluation of return"),
+    "unknown": ("true_cost", "share of states where the World does not know"),
+    "apart": ("true_cost", "distance from the logged actions"),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?")
+    parser.add_argument("--tasks", nargs="*")
+    parser.add_argument("--seeds", type=int, default=1)
+    args = parser.parse_args()
+    rows = list(csv.DictReader(OUT.open())) if OUT.exists() else []
+    done = {tuple(r[k] for k in HEAD[:4]) for r in rows}
+    for cell in sorted((args.folder / "cells").glob("*/*/seed-*")) if args.folder else []:
+        run = Run(cell)
+        told = run.config
+        if (args.tasks and told["task"] not in args.tasks) or told["seed"] >= args.seeds or not run.checkpoints():
+            continue
+        task = tasks.get(told["task"])
+        store = make(task, EPISODES * task.env.episode_length, LOGS_SEED)[0]
+        world = worlds.fit(store, seed=1)
+        for variant, result in run.results.items():
+            key = (told["task"], told["algorithm"], variant, str(told["seed"]))
+            if key in done or result.get("sight") == "own":
+                continue
+            how = {"planner": result["planner"]}
+            if result["guard"] != "none":
+                how |= {"guard": result["guard"], "danger": result["danger"]}
+            found = judge(run, store, judge_world=world, compare=False, **how)
+            numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
+            truth = [result["return_mean"], result["avoidable_cost"]]
+            rows.append(dict(zip(HEAD, map(str, (*key, *(f"{v:.5g}" for v in (*truth, *numbers)))))))
+            print(*rows[-1].values(), flush=True)
+            with whole(OUT) as temporary, temporary.open("w") as f:
+                writer = csv.DictWriter(f, HEAD, lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(rows)
+    put("docs/judging.md", "ranks", ranks(rows))
+
+
+def ranks(rows: list[dict]) -> str:
+    """A line per number, a column per task: Spearman's correlation with what the simulator says."""
+    names = list(dict.fromkeys(r["task"] for r in rows))
+    heads = [f"{name} ({sum(r['task'] == name for r in rows)} rows)" for name in names]
+    lines = ["| number | is to rank | " + " | ".join(heads) + " |", "|---" * (2 + len(names)) + "|"]
+    for number, (truth, words) in TELLS.items():
+        cells = []
+        for name in names:
+            x, y = (np.array([float(r[k]) for r in rows if r["task"] == name]) for k in (number, truth))
+            rank = spearmanr(x, y).statistic
+            cells.append("–" if np.isnan(rank) else f"{rank:.2f}")
+        lines.append(f"| {words} | {'cost' if truth == 'true_cost' else 'return'} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
