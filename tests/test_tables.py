@@ -8,7 +8,7 @@ import pytest
 import ringfence
 from ringfence import cli
 from ringfence.data.store import EpisodeStore
-from ringfence.data.tables import from_layout, from_table
+from ringfence.data.tables import from_layout, from_table, observe
 from ringfence.data.tracks import cut, nearest, resample, teams
 from ringfence.errors import UserError
 from ringfence.hazards import CostColumn, Separation
@@ -70,7 +70,7 @@ def test_data_frames_files_and_shuffled_agents_are_the_same(tmp_path):
 
 
 def test_uneven_times_are_put_on_one_clock():
-    """Against a loop over rows: states interpolated, actions held, rewards added up, the largest cost."""
+    """Against a loop over rows: states interpolated, what was told up to half a row later held or added up."""
     rng = np.random.default_rng(1)
     sizes = (40, 25)
     clocks = [np.sort(rng.uniform(0, 4, n)) for n in sizes]
@@ -79,19 +79,19 @@ def test_uneven_times_are_put_on_one_clock():
     time, state = np.concatenate(clocks), rng.normal(size=(sum(sizes), 2))
     action, reward, cost = (rng.normal(size=(sum(sizes), k)) for k in (3, 1, 1))
     got = resample(run, who, time, state, action, reward[:, 0], cost[:, 0], 0.25, 10.0)
-    seen = 0
+    seen, late = 0, 0.499 * min(0.25, np.median(np.concatenate([np.diff(c) for c in clocks])))
     for agent in (0, 1):
         mine = np.flatnonzero(who == agent)
         rows = np.flatnonzero(got.agent == agent)
         before = -np.inf
         for row in rows:
             at = got.step[row] * 0.25
-            assert time[mine[0]] <= at <= time[mine[-1]]
-            last = mine[time[mine] <= at][-1]
+            assert time[mine[0]] - 0.0125 <= at <= time[mine[-1]] + 0.0125
+            last = mine[time[mine] <= at + late][-1]
             for c in range(2):
                 np.testing.assert_allclose(got.state[row, c], np.interp(at, time[mine], state[mine, c]))
             np.testing.assert_array_equal(got.action[row], action[last])
-            since = mine[(time[mine] > before) & (time[mine] <= at)]
+            since = mine[(time[mine] > before + late) & (time[mine] <= at + late)]
             np.testing.assert_allclose(got.earned[row], reward[since].sum() if len(since) else 0.0, atol=1e-12)
             np.testing.assert_allclose(got.cost[row], cost[since].max() if len(since) else cost[last])
             before, seen = at, seen + 1
@@ -243,10 +243,16 @@ def broken(**columns):
         (fleet(steps=4), {}, "together for 5 steps"),
         (fleet(), {"team": 2, "neighbours": 2}, "give one of them"),
         (fleet(), {"neighbours": 0}, "neighbours=0 must be a whole number"),
+        (fleet(), {"gap": 0.05}, "gap=0.05 is less than the 0.1 s between"),
+        (fleet(), {"longest": 3}, "longest=3 steps are fewer than shortest=5"),
+        (fleet(), {"state": "x y"}, "state='x y' is one word"),
+        (fleet(), {"state": ["x", "x", "y"]}, "names the column 'x' twice"),
+        (fleet(), {"danger": Separation(1.0)}, "cost and danger both say"),
+        (broken(run=(4, 3)) | {"id": np.array([None, *fleet()["id"][1:]], object)}, {}, "row 0: id is missing"),
         (fleet(), {"dt": 0.0}, "dt=0.0 must be a number above 0"),
         (fleet(), {"goal": ["gx"]}, "goal names 1 columns, the position has 2"),
-        (fleet(), {"danger": CostColumn()}, "danger=CostColumn is not read from a table"),
-        (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0)}, "state holds no x and y"),
+        (fleet(), {"danger": CostColumn(), "cost": None}, "danger=CostColumn is not read from a table"),
+        (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0), "cost": None}, "state holds no x and y"),
         (fleet(), {"state": ["hit"], "action": ()}, "action names no column"),
         (broken(hit=(8, -1.0)), {}, "costs holds negative entries"),
         (fleet() | {"x": np.zeros(3)}, {}, "not of one length"),
@@ -261,9 +267,12 @@ def test_tables_that_cannot_be_are_refused(table, options, said):
 
 
 def test_files_that_are_no_tables_are_refused(tmp_path):
-    for name, content in (("a.parquet", b"PAR1nonsense"), ("a.csv", b'x,y\n1,"2\n3'), ("a.xlsx", b"PK")):
+    odd = ("a.parquet", b"PAR1nonsense"), ("a.csv", b'x,y\n1,"2\n3'), ("a.xlsx", b"PK"), ("b.csv", b"t,t\n1,2\n")
+    for name, content in odd:
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(UserError, match="no table that can be read|ends in|column of the table"):
+        with pytest.raises(
+            UserError, match="no table that can be read|ends in|column of the table|twice, or no header"
+        ):
             from_table(tmp_path / name, **NAMES)
 
 
@@ -271,7 +280,50 @@ def test_units_that_disagree_are_noted():
     table = fleet()
     assert not any("times what" in note for note in from_table(table, **NAMES).card["warnings"])
     table |= {"vx": table["vx"] * 3.6, "vy": table["vy"] * 3.6}
-    assert any("times what positions change by" in note for note in from_table(table, **NAMES).card["warnings"])
+    assert any("vx is 3.6 times what x changes by" in note for note in from_table(table, **NAMES).card["warnings"])
+    swapped = fleet() | {"vx": fleet()["vy"], "vy": -fleet()["vx"]}
+    notes = from_table(swapped, **NAMES).card["warnings"]
+    assert sum("times what" in note for note in notes) == 2
+
+
+def test_clocks_that_jitter_change_nothing_that_was_told():
+    """Rows a few milliseconds early or late keep their own step."""
+    table = fleet(steps=30)
+    chance = np.random.default_rng(5)
+    late = table | {"t": table["t"] + chance.uniform(-0.02, 0.02, len(table["t"]))}
+    exact, got = from_table(table, **NAMES), from_table(late, **NAMES, dt=0.1)
+    assert got.steps >= 0.9 * exact.steps
+    for store in (exact, got):
+        near = np.abs(store.actions[:, :, 0][:, :, None] - table["ax"][None, None]) < 1e-6
+        assert near.any(-1).all()  # every action is one that was told
+    grid = {name: x.reshape(6, 30, 3) for name, x in table.items()}
+    begin, held, cost = 0, 0, 0
+    for run, steps in enumerate(got.lengths):
+        mine = slice(begin, begin + steps)
+        shifts = [k for k in range(30 - steps) if np.allclose(got.actions[mine, :, 0], grid["ax"][run, k : k + steps])]
+        assert len(shifts) == 1
+        told = grid["hit"][run, shifts[0] + 1 : shifts[0] + 1 + steps]
+        np.testing.assert_array_equal(got.costs[mine], told)
+        begin, held, cost = begin + steps, held + 1, cost + told.sum()
+    assert held == 6 and cost > 0 and any("off the clock" in n for n in from_table(late, **NAMES).card["warnings"])
+
+
+@pytest.mark.parametrize("how", [{}, {"neighbours": 2, "sight": 2.5}])
+def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
+    table = fleet(agents=3)
+    store = from_table(table, **NAMES, goal=["gx", "gy"], **how)
+    now = {c: table[c].reshape(6, 12, 3)[2, 5] for c in ("x", "y", "vx", "vy", "gx", "gy")}
+    seen = observe(store.card, {c: now[c] for c in ("x", "y", "vx", "vy")}, {"x": now["gx"], "y": now["gy"]})
+    logged = (
+        store.observations[2 * 12 + 5]
+        if not how
+        else np.stack([store.observations[(2 * 3 + i) * 12 + 5, 0] for i in range(3)])
+    )
+    np.testing.assert_allclose(seen, logged, atol=2e-5)
+    with pytest.raises(UserError, match="The logs observe 'own.vx'"):
+        observe(store.card, {c: now[c] for c in ("x", "y", "vy")}, {"x": now["gx"], "y": now["gy"]})
+    with pytest.raises(UserError, match="give one number per agent"):
+        observe(store.card, {"x": now["x"][:2], "y": now["y"]})
 
 
 def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):

@@ -27,6 +27,7 @@ _WHERE = {
     "load_world": "ringfence.worlds:load",
     "guard": "ringfence.guards",
     "build_report": "ringfence.report",
+    "UserError": "ringfence.errors",
 }
 __all__ = list(_WHERE)
 

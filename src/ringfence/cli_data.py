@@ -88,7 +88,7 @@ def import_table(
         shortest: steps of an episode, at least.
         longest: steps of an episode, at most; longer ones are cut.
         fastest: m/s that nothing there can do.
-        task: a name for the data; the file's by default.
+        task: a name for the data; that of the store's file by default.
     """
     from ringfence.data.tables import from_layout, from_table
     from ringfence.hazards import Separation
@@ -99,7 +99,7 @@ def import_table(
         **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
         "fastest": fastest,
         "cost": cost,
-        "card": {"task": task or file.stem, "provenance": f"table {file.name}"},
+        "card": {"task": task or kept.stem, "provenance": f"table {file.name}"},
     }
     if layout is not None:
         if state or action or reward or goal or episode:
@@ -149,7 +149,7 @@ def import_bag(
         longest: steps of an episode, at most; longer ones are cut.
         stamps: take the times in headers; --no-stamps takes those of recording.
         twist: frame of the odometry's velocities, child (ROS's rule) or world.
-        task: a name for the data; the file's by default.
+        task: a name for the data; that of the store's file by default.
     """
     from ringfence.data.bags import read_bag
     from ringfence.data.tables import from_table
@@ -167,7 +167,7 @@ def import_bag(
         danger=None if separation is None else Separation(separation, separation / 4),
         **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
         notes=bag.notes,
-        card={"task": task or file.stem, "provenance": f"bag {file.name}"},
+        card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
     )
     imported(store, kept)
 
@@ -281,7 +281,9 @@ def _limit(speed_limit: float | None, quantile: bool):
 
 def imported(store, file: Path) -> None:
     """Keep what was imported, and say what was noted."""
-    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {store.save(file)}", soft_wrap=True, markup=False)
+    each = f" of {store.card['dt']:g} s" if "dt" in store.card else ""
+    told = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
+    out.print(told, soft_wrap=True, markup=False)
     for note in store.card["warnings"]:
         out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -42,10 +43,14 @@ def record(
     and seed goes on from there. `longest` steps without an end are refused. `card` adds fields to the store's.
     """
     whole_number("episodes", episodes, 1), whole_number("seed", seed, 0, 2**31), whole_number("longest", longest, 1)
+    if not callable(make_env):
+        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
     file = None if out is None else writable(out)
     env = make_env()
     check(env, "action_space")
     name = getattr(policy, "__qualname__", type(policy).__name__) if policy is not None else "uniform"
+    if code := getattr(policy, "__code__", None):  # two lambdas have one name
+        name += "-" + hashlib.blake2b(code.co_code + repr(code.co_consts).encode(), digest_size=3).hexdigest()
     told = {"simulator": type(env).__name__, "policy": name, "first_seed": seed}
     done = _before(file, told, episodes)
     if done is not None and done.episodes >= episodes:
@@ -74,7 +79,13 @@ def _played(env, shown: Shape, act, seed: int, cost, longest: int, low: float, h
     while episode.running:
         shape = (len(episode.agents), width)
         action = chance.uniform(low, high, shape) if act is None else act(episode.seen, episode.state)
-        acted.append(np.clip(given_as("actions", action, shape), low, high))
+        action = given_as("actions", action, shape)
+        if (action < low - 1e-4 * (high - low)).any() or (action > high + 1e-4 * (high - low)).any():
+            raise UserError(
+                f"The policy gave actions from {action.min():.4g} to {action.max():.4g}, the action space is from "
+                f"{low:g} to {high:g}; clip or scale them."
+            )
+        acted.append(np.clip(action, low, high))
         episode.step(acted[-1], cost)
         episode.charge(0.0)
         if not episode.showed_end:

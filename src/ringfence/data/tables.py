@@ -8,6 +8,7 @@ follows from what (docs/data.md).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,14 +92,22 @@ def from_table(
     table. `StoreError` names the first row that cannot be (counted from 0, without a header).
     """
     position, speed = ([f"{v}{c}" for c in AXES if f"{v}{c}" in state] for v in ("", "v"))
+    for name, given in (("state", state), ("action", action), ("goal", goal)):
+        if isinstance(given, str):
+            raise UserError(f"{name}='{given}' is one word; give a list of columns.")
+        if twice := [c for c in given if list(given).count(c) > 1]:
+            raise UserError(f"{name} names the column '{twice[0]}' twice; name it once.")
     _check_sizes(team, neighbours, shortest, longest)
     for name, value in (("dt", dt), ("gap", gap), ("sight", sight), ("fastest", fastest)):
         if value is not None and not (isinstance(value, int | float) and 0 < value < np.inf):
-            raise UserError(f"{name}={value} must be a number above 0.")
+            raise UserError(f"{name}={value!r} must be a number above 0.")
     if not state:
         raise UserError("state names no column; name those that say where an agent is and how it moves.")
     if goal and len(goal) != len(position):
-        raise UserError(f"goal names {len(goal)} columns, the position has {len(position)} ({', '.join(position)}).")
+        raise UserError(
+            f"goal names {len(goal)} columns, the position has {len(position)}; state must hold as many of x, y, z, "
+            "under these names."
+        )
     if (neighbours is not None or danger is not None) and len(position) < 2:
         raise UserError("state holds no x and y, which neighbours and distances are told by; rename these columns.")
     if not isinstance(danger, Separation | None):
@@ -112,12 +121,39 @@ def from_table(
             (("reward", reward), ("cost", cost))}  # fmt: skip
     _check_units(values, rows, position, speed, fastest, notes)
     step = dt or float(f"{rows.step:.6g}")
+    gap = gap or GAP * max(step, rows.step)
+    if gap < rows.step:
+        raise UserError(
+            f"gap={gap:g} is less than the {rows.step:g} s between an agent's rows; every row would be cut off."
+        )
+    if cost and danger is not None:
+        raise UserError("cost and danger both say what a step costs; give one of them.")
+    clock = (
+        rows.time
+        - np.minimum.reduceat(rows.time, np.flatnonzero(np.diff(rows.recording, prepend=-1)))[
+            np.unique(rows.recording, return_inverse=True)[1]
+        ]
+    ) / step
+    off = np.abs(clock - np.round(clock))
+    if dt is None and (far := float(np.quantile(off, 0.99))) > 0.01:
+        notes.append(
+            f"rows are up to {far:.2g} of a step of {step:g} s off the clock: states are interpolated, actions, costs "
+            "and rewards are those told nearest to a step"
+        )
+    if action and (big := max(np.abs(values[c]).max() for c in action)) > 10 * (
+        usual := max(np.quantile(np.abs(values[c]), 0.99) for c in action)
+    ):
+        notes.append(
+            f"the largest action is {big:.4g}, 99 % are below {usual:.4g}: all are learned in units of the largest"
+        )
+    if len(position) < 2:
+        notes.append("state holds no x and y, so nobody is told where others are relative to oneself")
     states = np.stack([values[c] for c in (*state, *goal)], 1)
     acts = np.stack([values[c] for c in action], 1) if action else np.zeros((len(rows.time), 1))
     tracks = resample(
         rows.recording, rows.agent, rows.time, states, acts, told["reward"], told["cost"], step, gap or GAP * step
     )
-    made = _Made(tracks, tuple(state), tuple(position), tuple(speed), bool(goal), notes)
+    made = _Made(tracks, tuple(state), tuple(position), tuple(speed), bool(goal), notes, rows.agents)
     if not action and not made.axes:
         raise UserError(
             "action names no column, and state holds no x or vx to tell accelerations by; name the actions."
@@ -152,13 +188,62 @@ def from_layout(table: Table, layout: str, **options) -> EpisodeStore:
     return from_table(columns, time="time", agent="agent", state=of.state, action=of.action, **options)
 
 
+def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
+    """(N, O) what agents observe now, as in the store of a table with this `card`: for a policy at run time.
+
+    `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
+    `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
+    are alike, any number in any order.
+    """
+    names = card.get("observation_names") or ()
+    columns = {name: np.asarray(x, np.float64) for name, x in state.items()}
+    aims = {name: np.asarray(x, np.float64) for name, x in (goal or {}).items()}
+    sizes = {x.shape for x in (*columns.values(), *aims.values())}
+    if len(sizes) != 1 or len(next(iter(sizes))) != 1:
+        raise UserError(f"state and goal hold arrays of shapes {sorted(sizes)}; give one number per agent of each.")
+    (n,) = next(iter(sizes))
+    axes = [c for c in AXES if c in columns]
+    slots = 1 + max((int(m[1]) for name in names if (m := re.match(r"other(\d+)\.", name))), default=-1)
+    near = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    there = np.ones((n, slots), bool)
+    reach = float(card.get("sight", np.inf))
+    if card.get("alike"):
+        zero = np.zeros(n, int)
+        place = np.stack([columns[c] for c in axes], 1)
+        now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, card.get("dt", 1.0))
+        near = nearest(now, place, slots, reach)
+        there = near >= 0
+    elif n != slots + 1:
+        raise UserError(f"state tells of {n} agents, the logs of {slots + 1}; give all of them.")
+
+    def entry(name: str) -> np.ndarray:
+        whose, _, what = name.partition(".")
+        plain = what[1:] if what[:1] == "d" and what[1:] in columns else what
+        if whose == "goal" and plain in aims:
+            return aims[plain] - columns[plain]
+        if whose == "own" and what in columns:
+            return columns[what]
+        if whose.startswith("other"):
+            j = int(whose[5:])
+            if what == "seen":
+                return there[:, j].astype(float)
+            if plain in columns:
+                theirs = columns[plain][near[:, j]] - columns[plain] * (plain != what)
+                return np.where(there[:, j], theirs, reach if plain == axes[0] else 0.0)
+        raise UserError(f"The logs observe '{name}', which state and goal do not tell; add it.")
+
+    return np.stack([entry(name) for name in names], 1).astype(np.float32)
+
+
 def _check_sizes(team, neighbours, shortest, longest) -> None:
     if team is not None and neighbours is not None:
         raise UserError("team and neighbours both say who an episode is of; give one of them.")
     for name, value in (("team", team), ("neighbours", neighbours), ("longest", longest)):
         if value is not None:
             whole_number(name, value, 1, 10**6)
-    whole_number("shortest", shortest, 1, longest or 10**9)
+    whole_number("shortest", shortest, 1)
+    if longest is not None and longest < shortest:
+        raise UserError(f"longest={longest} steps are fewer than shortest={shortest}; give a shorter 'shortest', too.")
 
 
 # --- reading ---
@@ -215,7 +300,10 @@ def _file(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
         if kind == ".csv":
             import pyarrow.csv
 
-            table = pa.csv.read_csv(path)
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
+                head = file.readline(2**20)
+            between = max(",;\t|", key=head.count)  # the first of those that separate as often
+            table = pa.csv.read_csv(path, parse_options=pa.csv.ParseOptions(delimiter=between))
         else:
             import pyarrow.parquet
 
@@ -227,6 +315,8 @@ def _file(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
                 table = file.read([c for c in wanted if c in there]) if set(wanted) <= there else file.read()
     except (pa.ArrowException, OSError) as error:
         raise StoreError(f"'{path}' is no table that can be read ({str(error).splitlines()[0]}).") from None
+    if twice := [name for name in table.column_names if table.column_names.count(name) > 1]:
+        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
     return {name: table.column(name).to_numpy() for name in table.column_names}
 
 
@@ -235,6 +325,8 @@ def _numbers(columns: dict[str, np.ndarray], name: str) -> np.ndarray:
     column = columns[name]
     if column.dtype.kind == "M":
         return (column - column.min()) / np.timedelta64(1, "s")
+    if column.dtype.kind == "m":
+        return column / np.timedelta64(1, "s")
     try:
         numbers = column.astype(np.float64)
     except (TypeError, ValueError):
@@ -267,11 +359,12 @@ class _Rows:
     agent: np.ndarray  # (M,)
     time: np.ndarray  # (M,) s
     step: float  # s, between rows of an agent, in the median
+    agents: np.ndarray  # names, by number
 
 
 def _sorted(read: dict[str, np.ndarray], time: str, agent: str, episode: str | None) -> _Rows:
     clock = _numbers(read, time)
-    who = np.unique(_words(read, agent), return_inverse=True)[1]
+    agents, who = np.unique(_words(read, agent), return_inverse=True)
     run = np.zeros(len(clock), int) if episode is None else np.unique(_words(read, episode), return_inverse=True)[1]
     order = np.lexsort((np.arange(len(clock)), who, run))  # an agent's rows in the order of the table
     recording, owner, clock = run[order], who[order], clock[order]
@@ -289,14 +382,18 @@ def _sorted(read: dict[str, np.ndarray], time: str, agent: str, episode: str | N
             )
     if not same.any():
         raise StoreError(f"No agent has two rows; check that {agent} tells agents and {time} their times.")
-    return _Rows(order, recording, owner, clock, float(np.median(passed[same])))
+    return _Rows(order, recording, owner, clock, float(np.median(passed[same])), agents)
 
 
 def _words(read: dict[str, np.ndarray], name: str) -> np.ndarray:
     column = read[name]
     if column.dtype.kind == "f" and not np.isfinite(column).all():
         raise StoreError(f"row {int(np.flatnonzero(~np.isfinite(column))[0])}: {name} is missing; fill or drop it.")
-    return column.astype(str) if column.dtype.kind == "O" else column
+    if column.dtype.kind == "O":
+        if missing := [k for k, x in enumerate(column) if x is None or x != x]:
+            raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
+        return column.astype(str)
+    return column
 
 
 def _check_units(values, rows: _Rows, position: list[str], speed: list[str], fastest: float, notes: list[str]) -> None:
@@ -315,13 +412,23 @@ def _check_units(values, rows: _Rows, position: list[str], speed: list[str], fas
             f"{int(rows.order[k])} of the same agent, more than fastest={fastest:g}; check the units of positions (m) "
             "and times (s), or drop the row."
         )
-    known = [c for c in position if f"v{c}" in speed]
-    if known:
-        logged = np.linalg.norm(np.stack([values[f"v{c}"] for c in known], 1), axis=1)[:-1]
-        real = np.linalg.norm(moved[:, [position.index(c) for c in known]], axis=1)
-        moving = same & (real > 0.1 * max(real.max(), 1e-9)) & (logged > 0)
-        if moving.any() and not 0.67 < (ratio := float(np.median(logged[moving] / real[moving]))) < 1.5:
-            notes.append(f"velocities are {ratio:.3g} times what positions change by: check their units and axes")
+    usual = same & (fast <= np.quantile(fast[same], 0.99))  # a row that jumped says nothing of the others
+    for k, c in enumerate(position):
+        if f"v{c}" not in speed:
+            continue
+        real, v = moved[usual, k], values[f"v{c}"]
+        ends = v[:-1][usual], v[1:][usual], (v[:-1] + v[1:])[usual] / 2  # simulators differ in which one moves things
+        logged = max(ends, key=lambda u: abs(float((real * u).sum())) / max(float(np.linalg.norm(u)), 1e-12))
+        ratio = float((real * logged).sum() / max((real**2).sum(), 1e-12))
+        if (real != 0).any() and not 0.67 < ratio < 1.5:
+            notes.append(f"v{c} is {ratio:.3g} times what {c} changes by: check its unit, sign, axis and frame")
+    if speed:
+        most = max(float(np.linalg.norm(np.stack([values[c] for c in speed], 1), axis=1).max()), 1e-9)
+        if (jumps := np.flatnonzero(fast > 5 * most)).size and jumps.size < 0.01 * len(fast):
+            notes.append(
+                f"row {int(rows.order[jumps[0] + 1])} and {jumps.size - 1} others moved more than five times as fast "
+                "as any velocity says: positions jump there, or no column tells recordings apart"
+            )
 
 
 # --- making ---
@@ -335,6 +442,7 @@ class _Made:
     speed: tuple[str, ...]
     goal: bool
     notes: list[str]
+    agents: np.ndarray  # their names
 
     @property
     def axes(self) -> list[str]:
@@ -388,6 +496,10 @@ def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, lon
     share = 1 - len(np.unique(kept)) / len(t.step)
     if share > 0.001:
         made.notes.append(f"{100 * share:.1f} % of the rows are left out: other than {n} agents, or too short a time")
+    lost = sorted(set(np.unique(t.agent)) - set(np.unique(t.agent[kept])))
+    if lost:
+        named = ", ".join(str(made.agents[k]) for k in lost[:5]) + (", ..." if len(lost) > 5 else "")
+        made.notes.append(f"agents that are in no episode, so that nobody will see them: {named}")
     moving = made.moving() if made.axes else np.zeros((len(t.step), 0))
     names, parts = _own(made, moving, with_place=True)
     own = np.concatenate(parts, 1)[kept]

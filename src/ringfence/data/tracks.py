@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
 
 
@@ -42,7 +43,8 @@ def resample(
     gap: float,
 ) -> Tracks:
     """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), onto steps of `dt` s. States are
-    interpolated, actions held; a hole of more than `gap` s ends a segment."""
+    interpolated; actions, rewards and costs belong to the step that they are told nearest to, and actions are held. A
+    hole of more than `gap` s ends a segment."""
     begins = np.ones(len(time), bool)
     begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
     first = np.flatnonzero(begins)
@@ -50,8 +52,8 @@ def resample(
     zero = np.full(recording.max() + 1, np.inf)
     np.minimum.at(zero, recording, time)
     origin = zero[recording[first]]
-    low = np.ceil((time[first] - origin) / dt - 1e-6).astype(np.int64)
-    high = np.floor((time[last] - origin) / dt + 1e-6).astype(np.int64)
+    low = np.ceil((time[first] - origin) / dt - EARLY).astype(np.int64)
+    high = np.floor((time[last] - origin) / dt + EARLY).astype(np.int64)
     count = np.maximum(high - low + 1, 0)
     segment = np.repeat(np.arange(len(first)), count)
     step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + low[segment]
@@ -61,7 +63,11 @@ def resample(
     shift = np.concatenate([[0.0], np.cumsum(spans + 1.0)[:-1]]) - time[first]
     axis = time + shift[np.cumsum(begins) - 1]
     at = np.clip(step * dt + (origin + shift)[segment], axis[first][segment], axis[last][segment])
-    row = np.searchsorted(axis, at + 1e-6 * dt, "right") - 1  # the last one told
+    # The last one told: clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
+    inside = np.diff(time)[~begins[1:]]
+    late = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
+    row = np.searchsorted(axis, step * dt + (origin + shift)[segment] + late, "right") - 1
+    row = np.clip(row, first[segment], last[segment])
     fresh = np.ones(len(row), bool)
     fresh[1:] = segment[1:] != segment[:-1]
     before = np.where(fresh, first[segment] - 1, np.concatenate([[0], row[:-1]]))
@@ -97,6 +103,8 @@ def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int
     window = np.cumsum(changes) - 1
     rows = np.bincount(window)
     of = many[np.flatnonzero(changes)]  # agents of each window
+    if size is None and not (rows > 1).any():
+        return np.zeros((0, 1), int), np.zeros(0, int), 1
     if size is None:
         size = int(np.bincount(of, weights=(rows - 1) * of).argmax())
     chosen = of == size
