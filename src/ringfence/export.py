@@ -128,42 +128,33 @@ def step_of(job: Job, policy: Policy) -> Step:
         return {"action": step.action[0]} | info, jax.tree.leaves(memory)
 
     key, seen = jax.random.key(0), list(given.values())
-    traced = jax.make_jaxpr(act)(key, seen, leaves)
-    told, _ = jax.eval_shape(act, key, seen, leaves)
-    shapes: list[jax.ShapeDtypeStruct] = []
+    traced, (told, _) = jax.make_jaxpr(act, return_shape=True)(key, seen, leaves)
+    drawn = _draws(traced.jaxpr)
 
-    def sized(e, _) -> Array:
-        aval = e.outvars[0].aval
-        shapes.append(jax.ShapeDtypeStruct(aval.shape, aval.dtype))
-        return jnp.zeros(aval.shape, aval.dtype)
-
-    jax.eval_shape(lambda *x: _played(traced, x, _How(sized)), key, *seen, *leaves)
-
-    def undrawn(*x: Array) -> list[Array]:
+    def undrawn(key: Key, *x: Array) -> list[Array]:
         """The action with noise given instead of drawn."""
-        noise = iter(x[len(seen) : len(seen) + len(shapes)])
-        rest = (*x[: len(seen)], *x[len(seen) + len(shapes) :])
-        return _played(traced, (key, *rest), _How(lambda *_: next(noise), simpler=True))
+        noise, first = iter(x[len(seen) :]), x[: len(seen)]
+        return _played(traced, (key, *first, *x[len(x) - len(leaves) :]), _How(lambda *_: next(noise), simpler=True))
 
-    inputs = [(name, x) for name, x in given.items()] + [(f"noise.{k}", x) for k, x in enumerate(shapes)]
+    inputs = [(name, x) for name, x in given.items()] + [(f"noise.{k}", x) for k, x in enumerate(drawn)]
     inputs += [(f"memory.{name}", x) for name, x in zip(named, leaves)]
     outputs = [*told, *(f"next.{name}" for name in named)]
-    flat = jax.make_jaxpr(undrawn)(*(x for _, x in inputs))
-    kept, used = _needed(flat.jaxpr, len(told), [f"memory.{name}" for name in named], [name for name, _ in inputs])
-    at = len(inputs) - len(leaves)
-    still = [after is before for after, before in zip(flat.jaxpr.outvars[len(told) :], flat.jaxpr.invars[at:])]
-    used -= {f"memory.{name}" for name, stays in zip(named, still) if stays}  # what never changes is a constant
-    if wrong := next((e for e in kept if any(map(_is_key, e.invars))), None):
+    flat = jax.make_jaxpr(undrawn)(key, *(x for _, x in inputs))
+    kept, used = _needed(flat.jaxpr, len(told), named, ["key", *(name for name, _ in inputs)])
+    if "key" in used:
         raise UserError(
-            f"This policy draws more than normal noise ('{wrong.primitive.name}'), which no file holds; play it with "
+            "This policy draws more than normal noise, and a file holds nothing that draws; play it with "
             "ringfence.Controller."
         )
+    at = len(inputs) - len(leaves)
+    still = [after is before for after, before in zip(flat.jaxpr.outvars[len(told) :], flat.jaxpr.invars[1 + at :])]
+    used -= {f"memory.{name}" for name, stays in zip(named, still) if stays}  # what never changes is a constant
     used_out = [k for k, name in enumerate(outputs) if k < len(told) or f"memory.{name[5:]}" in used]
     places = [k for k, (name, _) in enumerate(inputs) if name in used]
 
     same: dict[tuple, Any] = {}  # arrays that are alike are kept once
     constants = [
-        x if _is_key(v) else same.setdefault((v.aval.shape, str(v.aval.dtype), np.asarray(x).tobytes()), x)
+        same.setdefault((v.aval.shape, str(v.aval.dtype), np.asarray(x).tobytes()), x)
         for v, x in zip(flat.jaxpr.constvars, flat.consts)
     ]
 
@@ -171,7 +162,7 @@ def step_of(job: Job, policy: Policy) -> Step:
         whole = [None] * at + list(leaves)
         for k, value in zip(places, x):
             whole[k] = value
-        known = dict(zip(flat.jaxpr.constvars, constants)) | dict(zip(flat.jaxpr.invars, whole))
+        known = dict(zip(flat.jaxpr.constvars, constants)) | dict(zip(flat.jaxpr.invars[1:], whole))
         value = lambda v: v.val if isinstance(v, core.Literal) else known[v]  # noqa: E731
         for e in kept:
             out = e.primitive.bind(*map(value, e.invars), **e.params)
@@ -179,15 +170,15 @@ def step_of(job: Job, policy: Policy) -> Step:
         return [value(flat.jaxpr.outvars[k]) for k in used_out]
 
     def draw(key: Key) -> list[Array]:
-        drawn: list[Array] = []
+        noise: list[Array] = []
 
         def keep(e, given: list) -> Array:
-            drawn.append(e.primitive.bind(*given, **e.params)[0])
-            return drawn[-1]
+            noise.append(e.primitive.bind(*given, **e.params)[0])
+            return noise[-1]
 
         zeros = [jnp.zeros(x.shape, x.dtype) for x in seen]
         _played(traced, (key, *zeros, *leaves), _How(keep))
-        return drawn
+        return noise
 
     avals = flat.out_avals
     return Step(
@@ -204,6 +195,22 @@ def step_of(job: Job, policy: Policy) -> Step:
 
 def _is_key(var) -> bool:
     return jax.dtypes.issubdtype(getattr(var.aval, "dtype", np.float32), jax.dtypes.prng_key)
+
+
+def _draws(jaxpr) -> list[jax.ShapeDtypeStruct]:
+    """The normal numbers that a program draws, in the order of `_played`."""
+    found = []
+    for e in jaxpr.eqns:
+        keyed, name = any(map(_is_key, e.invars)), e.primitive.name
+        if keyed and e.params.get("name") == "_normal":
+            found.append(jax.ShapeDtypeStruct(e.outvars[0].aval.shape, e.outvars[0].aval.dtype))
+        elif keyed and name in CALLS:
+            found += _draws(_inside(e).jaxpr)
+        elif keyed and name == "scan":
+            found += _draws(e.params["jaxpr"].jaxpr) * e.params["length"]
+        elif keyed and name == "cond":
+            found += [x for branch in e.params["branches"] for x in _draws(branch.jaxpr)]
+    return found
 
 
 @dataclass(frozen=True)
@@ -349,7 +356,9 @@ def _needed(jaxpr, told: int, memory: list[str], inputs: list[str]) -> tuple[lis
     while True:
         wanted = {v for v in jaxpr.outvars[:told] if not isinstance(v, core.Literal)}
         wanted |= {
-            v for v, name in zip(jaxpr.outvars[told:], memory) if name in used and not isinstance(v, core.Literal)
+            v
+            for v, name in zip(jaxpr.outvars[told:], memory)
+            if f"memory.{name}" in used and not isinstance(v, core.Literal)
         }
         kept = []
         for e in reversed(jaxpr.eqns):
@@ -414,7 +423,12 @@ def _write_stablehlo(made: Step, told: dict[str, Any], file: Path) -> None:
     from jax import export as jax_export
 
     checks = [jax_export.DisabledSafetyCheck.platform()]
-    program = jax_export.export(jax.jit(made.call), platforms=["cpu"], disabled_checks=checks)(*made.avals)
+    frames = jax.config.jax_traceback_in_locations_limit
+    jax.config.update("jax_traceback_in_locations_limit", 0)  # whose lines of code these were is nobody's business
+    try:
+        program = jax_export.export(jax.jit(made.call), platforms=["cpu"], disabled_checks=checks)(*made.avals)
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", frames)
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         for name, content in (
             ("metadata.json", json.dumps(told, indent=1).encode()),
