@@ -11,6 +11,7 @@
 #include <random>
 #include <sstream>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 using Shape = std::vector<int64_t>;
@@ -42,7 +43,8 @@ int main(int argc, char** argv) {
     std::vector<float> given{std::istream_iterator<float>(initial), {}};
     for (size_t k = 0; k < values.size() && !given.empty(); ++k) values[k] = given[given.size() > 1 ? k : 0];
     ins.push_back(name), shapes[name] = tensor.GetShape();
-    if (tensor.GetElementType() == ONNX_TENSOR_ELEMENT_DATA_TYPE_INT32) counts[name].assign(values.begin(), values.end());
+    const bool whole = tensor.GetElementType() == ONNX_TENSOR_ELEMENT_DATA_TYPE_INT32;
+    if (whole) counts[name].assign(values.begin(), values.end());
     else numbers[name] = values;
   }
   for (size_t i = 0; i < session.GetOutputCount(); ++i) outs.push_back(session.GetOutputNameAllocated(i, heap).get());
@@ -58,18 +60,27 @@ int main(int argc, char** argv) {
       const Shape& shape = shapes[name];
       if (name == "observations" || name == "state") for (float& x : numbers[name]) std::cin >> x;
       if (name.rfind("noise.", 0) == 0) for (float& x : numbers[name]) x = normal(random);
-      if (counts.count(name)) values.push_back(Ort::Value::CreateTensor<int32_t>(cpu, counts[name].data(), counts[name].size(), shape.data(), shape.size()));
-      else values.push_back(Ort::Value::CreateTensor<float>(cpu, numbers[name].data(), numbers[name].size(), shape.data(), shape.size()));
+      const auto wrap = [&](auto& x) {
+        using Number = typename std::decay_t<decltype(x)>::value_type;
+        values.push_back(Ort::Value::CreateTensor<Number>(cpu, x.data(), x.size(), shape.data(), shape.size()));
+      };
+      if (counts.count(name)) wrap(counts[name]);
+      else wrap(numbers[name]);
     }
     const auto found = session.Run(Ort::RunOptions{}, in.data(), values.data(), in.size(), out.data(), out.size());
     for (size_t i = 0; i < outs.size(); ++i) {
       const size_t many = found[i].GetTensorTypeAndShapeInfo().GetElementCount();
       if (outs[i] == "action") {
-        for (size_t k = 0; k < many; ++k) std::cout << found[i].GetTensorData<float>()[k] << (k + 1 < many ? ' ' : '\n');
+        const float* x = found[i].GetTensorData<float>();
+        for (size_t k = 0; k < many; ++k) std::cout << x[k] << (k + 1 < many ? ' ' : '\n');
       } else if (outs[i].rfind("next.", 0) == 0) {
         const std::string name = "memory." + outs[i].substr(5);
-        if (counts.count(name)) counts[name].assign(found[i].GetTensorData<int32_t>(), found[i].GetTensorData<int32_t>() + many);
-        else numbers[name].assign(found[i].GetTensorData<float>(), found[i].GetTensorData<float>() + many);
+        const auto keep = [&](auto& x) {
+          const auto* first = found[i].template GetTensorData<typename std::decay_t<decltype(x)>::value_type>();
+          x.assign(first, first + many);
+        };
+        if (counts.count(name)) keep(counts[name]);
+        else keep(numbers[name]);
       }
     }
   }

@@ -233,7 +233,6 @@ def _played(program: core.ClosedJaxpr, arguments: Sequence[Any], how: _How) -> l
 
     for e in jaxpr.eqns:
         given, name = [value(v) for v in e.invars], e.primitive.name
-
         keyed = any(map(_is_key, e.invars))
         if keyed and e.params.get("name") == "_normal":
             out = [how.draw(e, given)]
@@ -264,11 +263,10 @@ def _computed(e, given: list, how: _How) -> list[Array]:
 
 def _picked(e, given: list) -> Array | None:
     """What a gather or scatter at known places gives, as entries picked from a flat array, which every runtime does at
-    once; None where the places are not known, lie outside or are added to more than once."""
+    once; None where the places are not known or what is read lies outside."""
     x, places, *more = given
     if isinstance(places, jax.core.Tracer) or not any(isinstance(v, jax.core.Tracer) for v in given):
         return None
-
     if x.size + sum(v.size for v in more) >= 2**24 or not jnp.issubdtype(x.dtype, jnp.number):
         return None  # float32 counts no farther
 
