@@ -207,6 +207,9 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)  # as if it were not installed
     with pytest.raises(UserError, match=r"pip install 'ringfence\[export\]'"):
         exporting.export(run, tmp_path / "x.onnx")
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(UserError, match="run pip install flatbuffers"):
+        exporting.export(run, tmp_path / "x", "stablehlo")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["both", "file"]
 
 

@@ -87,8 +87,7 @@ def export(
     if format not in FORMATS:
         raise unknown("format", str(format), FORMATS)
     file = writable(out)
-    if format == "onnx":
-        _converter()
+    _converter() if format == "onnx" else _packer()
     run, how = Run.of(run), asked(planner, **options)
     job, policy = load(run, step, planner, **options)
     made = step_of(job, policy)
@@ -418,8 +417,7 @@ def _short(x: np.ndarray) -> Any:
 def _write_stablehlo(made: Step, told: dict[str, Any], file: Path) -> None:
     """A ZIP of three: `metadata.json`, `policy.mlirbc` (the portable StableHLO program, for any runtime that reads it)
     and `policy.jax` (the same for `jax.export.deserialize`). Nothing in it depends on a platform."""
-    from jax import export as jax_export
-
+    jax_export = _packer()
     checks = [jax_export.DisabledSafetyCheck.platform()]
     frames = jax.config.jax_traceback_in_locations_limit
     jax.config.update("jax_traceback_in_locations_limit", 0)  # whose lines of code these were is nobody's business
@@ -487,6 +485,16 @@ def _swept(graph) -> set[str]:
     del graph.initializer[:]
     graph.initializer.extend(kept)
     return read
+
+
+def _packer():
+    """`jax.export`, which packs programs with flatbuffers, a package that JAX does not ask for itself."""
+    try:
+        import flatbuffers  # noqa: F401
+        from jax import export as jax_export
+    except ImportError:
+        raise UserError("StableHLO is packed by flatbuffers, which is missing; run pip install flatbuffers.") from None
+    return jax_export
 
 
 def _converter() -> tuple[Callable, Callable]:
