@@ -30,6 +30,8 @@ REFERENCE = {
     "Danger": ("ringfence.hazards",),
     "Training": ("ringfence.training", "ringfence.runs"),
     "Playing": ("ringfence.evaluate", "ringfence.parallel", "ringfence.recorder", "ringfence.reference"),
+    "Judging": ("ringfence.judging",),
+    "Export": ("ringfence.export",),
     "World": ("ringfence.worlds", "ringfence.world"),
     "Parts of a World": (
         "ringfence.world.fitting",

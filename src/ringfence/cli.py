@@ -223,6 +223,65 @@ def evaluate(
         sys.exit(2)
 
 
+def export(
+    run: Positional[Path],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    format: Literal["onnx", "stablehlo"] = "onnx",
+    step: int | None = None,
+    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
+    danger: Literal["learned", "formula", "both"] | None = None,
+    sight: Literal["all", "own"] | None = None,
+    agents: int | None = None,
+    world: Path | None = None,
+    planner: Literal["plain", "climbing", "steady"] = "plain",
+    plans: int | None = None,
+    margin: float | None = None,
+    rows: int | None = None,
+    steps: int | None = None,
+    sampler: str | None = None,
+    guidance: float | None = None,
+    target: float | None = None,
+    temperature: float | None = None,
+    replan: int | None = None,
+    execution: str | None = None,
+    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
+) -> None:
+    """Write a trained policy, guard included, as one file that needs neither Python nor this library.
+
+    Args:
+        run: a run folder.
+        out_file: the file to write.
+        format: onnx, for onnxruntime and the like, needs the extra `ringfence[export]`; stablehlo needs nothing.
+        step: of the checkpoint that is written; the last one by default.
+        guard: as in `ringfence eval`, as are all that follow.
+        danger: how the guard knows it: learned, formula or both.
+        sight: all or own.
+        agents: who play, where they are alike; the file is of that many.
+        world: a file of `ringfence fit --out`, needed for data of your own.
+        planner: plain, climbing or steady.
+        plans: asked for by the guard.
+        margin: kept from danger.
+        rows: foreseen and judged.
+        steps: of the sampler.
+        sampler: ddim, ddpm or dpm++.
+        guidance: ω of classifier-free guidance.
+        target: return condition, as a normal score.
+        temperature: scale of the first noise.
+        replan: steps for which a plan is followed.
+        execution: centralized or decentralized.
+        set: any other option of planner or guard, e.g. --set shield=20.
+    """
+    given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}
+    given |= _options(_assignments(set), given)
+    found = _runs([run])
+    if len(found) > 1:
+        raise UserError(f"'{run}' holds {len(found)} runs, and a file is of one; name it, e.g. {found[0].path}.")
+    from ringfence.export import export as write
+
+    told = dict(planner=planner, guard=guard, danger=danger, sight=sight, agents=agents, world=world)
+    print(write(found[0], out_file, format, step, **told, **given))
+
+
 def _options(assigned: dict[str, str], given: dict) -> dict[str, str]:
     """What --set says of planner and guard; refused where a flag said it already, or where it is an option of
     neither."""
@@ -349,6 +408,7 @@ def doctor() -> None:
         ("tensorstore", "vault", "OG-MARL's Vaults"),
         ("minari", "minari", "Minari's data sets by their names"),
         ("ray", "ray", "benchmarks on a cluster"),
+        ("jax2onnx", "export", "policies as ONNX files"),
         ("mpe2", "test", "parity tests"),
     ):
         try:
@@ -544,6 +604,7 @@ COMMANDS = {
     "fit": fit,
     "train": train,
     "eval": evaluate,
+    "export": export,
     "bench": bench,
     "judge": judge,
     "report": report,

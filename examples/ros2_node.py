@@ -1,0 +1,110 @@
+"""A policy that `ringfence export RUN --out policy.onnx` wrote, on N robots under ROS 2, without this library.
+
+    python ros2_node.py policy.onnx robot0 robot1 robot2       # /robot0/odom, /robot0/goal -> /robot0/cmd_vel, ...
+
+Needs rclpy, onnxruntime and NumPy. Everything is read in one frame, and an action is taken for a velocity (m/s) in it:
+change `command` where yours is something else. Nothing is sent before every robot was heard and has a goal.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+
+import numpy as np
+import onnxruntime
+
+PERIOD = 0.1  # s between actions: that of the logs
+
+
+class Pilot:
+    """The file at run time: memory is carried from step to step, noise is drawn."""
+
+    def __init__(self, file: str, seed: int = 0):
+        self.session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+        self.told = json.loads(self.session.get_modelmeta().custom_metadata_map["ringfence"])
+        self.rng = np.random.default_rng(seed)
+        self.info: dict[str, float] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        inputs = {x["name"]: x for x in self.told["inputs"]}
+        fill = lambda x, value: np.broadcast_to(np.asarray(value, x["dtype"]), x["shape"]).copy()  # noqa: E731
+        self.memory = {name: fill(inputs[name], value) for name, value in self.told["initial"].items()}
+
+    def act(self, observations, state=None, cost: float = np.nan) -> np.ndarray:
+        """(N, A) from (N, O), (S,) and what the last step cost, where anybody knows."""
+        given = {"observations": observations, "state": state, "cost": cost, **self.memory}
+        draw = lambda x: self.rng.standard_normal(x["shape"])  # noqa: E731
+        feed = {
+            x["name"]: np.asarray(given[x["name"]] if x["name"] in given else draw(x), x["dtype"])
+            for x in self.told["inputs"]
+        }
+        names = [x["name"] for x in self.told["outputs"]]
+        out = dict(zip(names, self.session.run(names, feed)))
+        self.memory = {f"memory.{k[5:]}": v for k, v in out.items() if k.startswith("next.")}
+        self.info = {k[5:]: v.item() for k, v in out.items() if k.startswith("info.")}
+        return out["action"]
+
+
+def observed(names: list[str], place: np.ndarray, speed: np.ndarray, goal: np.ndarray) -> np.ndarray:
+    """(N, O) what every robot sees, by the logs' names (own.vx, goal.dx, other0.dy, other1.dvx); arrays are (N, 2)."""
+    n, rows = len(place), []
+    for i in range(n):
+        others = [j for j in range(n) if j != i]
+        row = []
+        for name in names:
+            told = re.fullmatch(r"(own|goal|other)(\d*)\.(d?)(v?)([xy])", name)
+            if told is None:
+                raise SystemExit(f"The policy reads '{name}', which odometry does not tell; compute it in observed().")
+            who, number, apart, fast, axis = told.groups()
+            axis, table = "xy".index(axis), speed if fast else place
+            there = goal[i, axis] if who == "goal" else table[others[int(number)] if who == "other" else i, axis]
+            row.append(there - table[i, axis] if apart else there)
+        rows.append(row)
+    return np.asarray(rows, np.float32)
+
+
+def main(file: str, robots: list[str]) -> None:
+    import rclpy
+    from geometry_msgs.msg import PointStamped, Twist
+    from nav_msgs.msg import Odometry
+    from rclpy.node import Node
+
+    class Team(Node):
+        def __init__(self):
+            super().__init__("ringfence")
+            self.pilot, nowhere = Pilot(file), np.full((len(robots), 2), np.nan)
+            self.place, self.speed, self.goal = nowhere, nowhere.copy(), nowhere.copy()
+            self.senders = [self.create_publisher(Twist, f"/{name}/cmd_vel", 1) for name in robots]
+            for i, name in enumerate(robots):
+                self.create_subscription(Odometry, f"/{name}/odom", lambda m, i=i: self.heard(m, i), 1)
+                self.create_subscription(PointStamped, f"/{name}/goal", lambda m, i=i: self.sent(m, i), 1)
+            self.create_timer(PERIOD, self.step)
+
+        def heard(self, m: Odometry, i: int) -> None:
+            self.place[i] = m.pose.pose.position.x, m.pose.pose.position.y
+            self.speed[i] = m.twist.twist.linear.x, m.twist.twist.linear.y
+
+        def sent(self, m: PointStamped, i: int) -> None:
+            self.goal[i] = m.point.x, m.point.y
+
+        def step(self) -> None:
+            if np.isfinite([self.place, self.speed, self.goal]).all():
+                seen = observed(self.pilot.told["names"]["observations"], self.place, self.speed, self.goal)
+                for sender, action in zip(self.senders, self.pilot.act(seen)):
+                    sender.publish(self.command(action))
+
+        def command(self, action: np.ndarray) -> Twist:
+            told = Twist()
+            told.linear.x, told.linear.y = map(float, action[:2])
+            return told
+
+    rclpy.init()
+    rclpy.spin(Team())
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2:])

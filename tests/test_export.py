@@ -1,0 +1,276 @@
+"""Policies as files: what the file does is what the controller does, whoever plays it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import sys
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence import evaluate, training
+from ringfence import export as exporting
+from ringfence.cli import main
+from ringfence.errors import UserError
+from ringfence.policies import Constant
+from tests.quick import QUICK_WORLD
+
+SHIELD = dict(guard="shield", rows=1, shield=3, margin=4.0)
+FULL = dict(guard="full", rows=1, shield=1, refine=2, starts=3, plans=1)
+STEPS = 12
+
+
+@pytest.fixture(scope="module")
+def run(small_store, tmp_path_factory):
+    """Cloning of the small store."""
+    out = tmp_path_factory.mktemp("runs")
+    return training.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=out)[0]
+
+
+@pytest.fixture(scope="module")
+def planner(small_store, tmp_path_factory):
+    """A diffusion planner of the small store."""
+    changes = dict(steps=2, batch=8, width=16, depth=1, diffusion_steps=10)
+    out = tmp_path_factory.mktemp("runs")
+    return training.train("madiff", small_store, changes=changes, world=QUICK_WORLD, quiet=True, out=out)[0]
+
+
+def played(run, store, noisy: bool = False, **options) -> list[tuple[dict, dict]]:
+    """What a controller is given along some steps of the logs, with the noise that it draws, and what it tells."""
+    controller = evaluate.Controller(run, **options)
+    draw = exporting.step_of(controller.job, controller.policy).draw if noisy else lambda key: []
+    key, steps = jax.random.key(0), []
+    for t in range(STEPS):
+        seen, state, cost = store.observations[t], store.state[t], (None, 0.0, 1.0)[t % 3]
+        action = controller.act(seen, state, cost)
+        key, now = jax.random.split(key)
+        given = {"observations": seen, "state": state, "cost": np.array(np.nan if cost is None else cost, np.float32)}
+        given |= {f"noise.{k}": np.asarray(x) for k, x in enumerate(draw(now))}
+        told = {f"info.{k}": v for k, v in controller.info.items() if np.ndim(v) == 0}
+        steps.append((given, {"action": action} | told))
+    return steps
+
+
+def apart(call, told: dict, steps: list[tuple[dict, dict]]) -> float:
+    """The largest difference between what a file gives, with a memory of its own, and what the controller did; `call`
+    takes arrays by name and gives arrays by name."""
+    inputs = {x["name"]: x for x in told["inputs"]}
+    memory = {k: np.full(inputs[k]["shape"], v, inputs[k]["dtype"]) for k, v in told["initial"].items()}
+    largest = 0.0
+    for given, expected in steps:
+        out = call({name: (given | memory)[name] for name in inputs})
+        assert [*out] == [x["name"] for x in told["outputs"]]
+        memory = {f"memory.{k[5:]}": np.asarray(v) for k, v in out.items() if k.startswith("next.")}
+        for name, value in expected.items():
+            ours, value = np.asarray(out[name]), np.asarray(value)
+            assert ours.shape == value.shape and ours.dtype == value.dtype
+            largest = max(largest, np.abs(ours.astype(float) - value.astype(float)).max())
+    return float(largest)
+
+
+def of_stablehlo(file: Path):
+    """(call, told) of a StableHLO file, read by JAX alone."""
+    with zipfile.ZipFile(file) as packed:
+        told, program = (
+            json.loads(packed.read("metadata.json")),
+            jax.export.deserialize(bytearray(packed.read("policy.jax"))),
+        )
+        assert packed.read("policy.mlirbc") == program.mlir_module_serialized
+    assert program.nr_devices == 1 and not program.uses_global_constants
+    names = [x["name"] for x in told["outputs"]]
+    call = jax.jit(program.call)
+    return lambda given: dict(zip(names, call(*given.values()))), told
+
+
+def of_onnx(file: Path):
+    """(call, told) of an ONNX file, read by onnxruntime alone."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    told = json.loads(session.get_modelmeta().custom_metadata_map["ringfence"])
+    assert [x.name for x in session.get_inputs()] == [x["name"] for x in told["inputs"]]
+    assert [tuple(x.shape) for x in session.get_inputs()] == [tuple(x["shape"]) for x in told["inputs"]]
+    names = [x.name for x in session.get_outputs()]
+    return lambda given: dict(zip(names, session.run(names, given))), told
+
+
+def test_cloning(run, small_store, tmp_path):
+    steps = played(run, small_store)
+    file = exporting.export(run, tmp_path / "a.stablehlo", "stablehlo")
+    call, told = of_stablehlo(file)
+    assert [x["name"] for x in told["inputs"]] == ["observations"] and apart(call, told, steps) <= 1e-6
+    assert told["task"] == "simple_spread-random" and told["action_low"] == -1 and len(told["names"]["state"]) == 18
+    assert exporting.export(run, tmp_path / "again", "stablehlo").read_bytes() == file.read_bytes()
+    with zipfile.ZipFile(file) as packed:
+        assert not any(b".py" in packed.read(name) for name in packed.namelist())  # nobody's paths
+    pytest.importorskip("jax2onnx")
+    assert apart(*of_onnx(exporting.export(run, tmp_path / "a.onnx")), steps) <= 1e-5
+
+
+def test_a_shield(run, small_store, small_world, tmp_path, capsys):
+    """Its rounds of correction are a loop that ends when nothing is missing. It remembers nothing, so the file does
+    not either."""
+    pytest.importorskip("jax2onnx")
+    from ringfence import world as worlds_files
+
+    kept = worlds_files.save(small_world, tmp_path / "w.safetensors")
+    words = ["--guard", "shield", "--rows", "1", "--margin", "4", "--set", "shield=3", "--world", str(kept)]
+    main(["export", str(run.path), "--out", str(tmp_path / "s.onnx"), *words])
+    assert capsys.readouterr().out.strip().endswith("s.onnx")
+    call, told = of_onnx(tmp_path / "s.onnx")
+    assert [x["name"] for x in told["inputs"]] == ["observations", "state"] and not told["initial"]
+    assert told["variant"].startswith("default+shield-learned") and told["guard_options"]["margin"] == 4.0
+    steps = played(run, small_store, world=small_world, **SHIELD)
+    assert apart(call, told, steps) <= 1e-5
+    assert any(expected["info.infeasible"] for _, expected in steps), "there was something to correct"
+
+
+def test_memory_costs_and_noise(run, small_store, small_world, tmp_path):
+    """Refining loops over Adam's steps, the margin follows costs, the last plan is moved on."""
+    options = {**FULL, "world": small_world}
+    steps = played(run, small_store, noisy=True, **options)
+    call, told = of_stablehlo(exporting.export(run, tmp_path / "full", "stablehlo", **options))
+    names = [x["name"] for x in told["inputs"]]
+    assert names == ["observations", "state", "cost", "noise.0", "memory.age", "memory.last", "memory.margin"]
+    assert apart(call, told, steps) <= 1e-5
+    pytest.importorskip("jax2onnx")
+    file = exporting.export(run, tmp_path / "full.onnx", **options)
+    assert apart(*of_onnx(file), steps) <= 1e-4
+    import onnx
+
+    flat = {x.key: x.value for x in onnx.load(file).metadata_props}
+    assert float(flat["initial.memory.margin"]) == told["initial"]["memory.margin"] == 1.0
+
+
+def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_path):
+    options = {"steps": 2, "sampler": "ddpm"}
+    steps = played(planner, small_store, noisy=True, **options)
+    call, told = of_stablehlo(exporting.export(planner, tmp_path / "p", "stablehlo", **options))
+    assert sum(x["name"].startswith("noise.") for x in told["inputs"]) == 3  # the first noise, and one for every step
+    assert apart(call, told, steps) <= 1e-5
+    pytest.importorskip("jax2onnx")
+    assert apart(*of_onnx(exporting.export(planner, tmp_path / "p.onnx", **options)), steps) <= 1e-5
+
+
+def test_a_followed_plan_is_remembered(planner, small_store, tmp_path):
+    options = {"steps": 2, "replan": 3}
+    call, told = of_stablehlo(exporting.export(planner, tmp_path / "p", "stablehlo", **options))
+    assert {"memory.plan", "memory.age"} <= {x["name"] for x in told["inputs"]}
+    assert apart(call, told, played(planner, small_store, noisy=True, **options)) <= 1e-5
+
+
+def test_agents_who_are_alike(own_store, tmp_path):
+    """Learned of three of them, without states; a file is of as many as are asked for."""
+    card = {k: own_store.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
+    costs = np.repeat(own_store.costs[:, None], 3, 1)
+    store = dataclasses.replace(own_store, costs=costs, card=card)
+    run = training.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
+    call, told = of_stablehlo(exporting.export(run, tmp_path / "5", "stablehlo", agents=5))
+    assert told["inputs"] == [{"name": "observations", "shape": [5, 14], "dtype": "float32"}] and told["n_agents"] == 5
+    assert told["names"] == {"observations": list(own_store.card["observation_names"])} and told["sight"] == "own"
+    seen = own_store.observations[:5, 0]
+    action = evaluate.Controller(run, agents=5).act(seen)
+    np.testing.assert_allclose(call({"observations": seen})["action"], action, atol=1e-6)
+
+
+def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("jax2onnx")
+    (tmp_path / "file").write_text("mine")
+    out = ["--out", str(tmp_path / "x.onnx")]
+    both = tmp_path / "both"
+    for name in "ab":
+        (both / name).mkdir(parents=True)
+        (both / name / "config.json").write_text("{}")
+    for words, said in (
+        ([str(run.path), "--out", str(tmp_path)], "is no regular file"),
+        ([str(run.path), "--out", str(tmp_path / "file" / "x")], "is a file, no folder"),
+        ([str(run.path), "--out", ""], "names no file"),
+        ([str(tmp_path / "nowhere"), *out], "does not exist"),
+        ([str(both), *out], "holds 2 runs"),
+        ([str(both / "a"), *out], "config.json"),
+        ([str(run.path), *out, "--guard", "shield"], "needs the World of its data"),
+        ([str(run.path), *out, "--set", "shild=3"], "did you mean 'shield'"),
+        ([str(run.path), *out, "--format", "tflite"], "invalid choice"),
+        ([str(run.path), *out, "--step", "99"], "holds no checkpoint of step 99"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            main(["export", *words])
+        told = capsys.readouterr()
+        assert stop.value.code == 2 and said in told.err + told.out, words
+    with pytest.raises(UserError, match="Unknown format 'onx'; did you mean 'onnx'"):
+        exporting.export(run, tmp_path / "x", "onx")
+    monkeypatch.setitem(sys.modules, "jax2onnx", None)  # as if it were not installed
+    with pytest.raises(UserError, match=r"pip install 'ringfence\[export\]'"):
+        exporting.export(run, tmp_path / "x.onnx")
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(UserError, match="run pip install flatbuffers"):
+        exporting.export(run, tmp_path / "x", "stablehlo")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["both", "file"]
+
+
+def test_what_cannot_be_exported_is_named(run, tmp_path):
+    job, _ = evaluate.load(run)
+    with pytest.raises(UserError, match="draws more than normal noise"):
+        exporting.step_of(job, Constant(job.spec, random=True))
+    pytest.importorskip("jax2onnx")
+    one, two = (exporting.Entry(name, (3,), "float32") for name in ("observations", "action"))
+    there = jax.ShapeDtypeStruct((3,), "float32")
+    odd = exporting.Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [])
+    with pytest.raises(UserError, match="cannot be written as ONNX .*pure_callback.*; write it as StableHLO"):
+        exporting.as_onnx(odd)
+
+
+def test_known_places_are_picked_exactly():
+    """Gathers and scatters at places that are known become picks; repeated, left-out and outer places included."""
+    x, put = jax.random.normal(jax.random.key(0), (4, 5)), jax.random.normal(jax.random.key(1), (4, 3))
+    at = np.array([3, 0, 3])
+
+    def odd(x, put):
+        rows = jnp.array([2, 9, 2])
+        return [
+            x[:, at],
+            x.at[:, np.array([4, 1, 0])].set(put),
+            x.at[:, at].add(put),
+            x.at[rows].add(put.T[:, 0:1], mode="drop"),
+            jax.grad(lambda x: (x[:, at] ** 2).sum())(x),
+        ]
+
+    program = jax.make_jaxpr(odd)(x, put)
+    plain = lambda *a: exporting._played(program, a, exporting._How(lambda *_: None, simpler=True))  # noqa: E731
+    names = {e.primitive.name for e in jax.make_jaxpr(plain)(x, put).jaxpr.eqns}
+    assert not any("scatter" in name for name in names)
+    for ours, theirs in zip(jax.jit(plain)(x, put), odd(x, put)):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
+
+
+def test_the_node_plays_the_file(run, small_store, small_world, tmp_path):
+    """The example for ROS 2 without ROS: what it makes of the file is what the controller does."""
+    pytest.importorskip("jax2onnx")
+    pytest.importorskip("onnxruntime")
+    file = Path(__file__).parents[1] / "examples" / "ros2_node.py"
+    spec = importlib.util.spec_from_file_location("ros2_node", file)
+    node = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(node)  # without rclpy, which main() alone needs
+    options = {**SHIELD, "adapt": 0.1, "world": small_world}
+    main_file = exporting.export(run, tmp_path / "p.onnx", **options)
+    pilot, controller = node.Pilot(str(main_file)), evaluate.Controller(run, **options)
+    for episode in range(2):
+        pilot.reset(), controller.reset()
+        for t in range(3):
+            seen, state = small_store.observations[episode * 26 + t], small_store.state[episode * 26 + t]
+            cost = (None, 1.0, 1.0)[t]
+            told = np.nan if cost is None else cost
+            np.testing.assert_allclose(pilot.act(seen, state, told), controller.act(seen, state, cost), atol=1e-5)
+            assert pilot.info["infeasible"] == controller.info["infeasible"]
+    place, speed, goal = (np.arange(4.0).reshape(2, 2) + k for k in (0, 10, 100))
+    names = ["own.x", "own.vy", "goal.dx", "other0.dx", "other0.dvy", "other0.y"]
+    np.testing.assert_array_equal(
+        node.observed(names, place, speed, goal), [[0, 11, 100, 2, 2, 3], [2, 13, 100, -2, -2, 1]]
+    )
+    with pytest.raises(SystemExit, match="reads 'lidar3', which odometry does not tell"):
+        node.observed(["lidar3"], place, speed, goal)
