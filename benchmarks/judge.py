@@ -24,9 +24,12 @@ from ringfence.runs import Run
 OUT = Path(__file__).resolve().parent.parent / "results" / "judging.csv"
 EPISODES, LOGS_SEED = 2000, 7  # of the logs that judge
 NUMBERS = ("foreseen_unsafe", "not_surely_safe", "return", "cost", "unknown", "apart")
-HEAD = ("task", "algorithm", "variant", "seed", "true_return", "true_cost", *NUMBERS)
+PLAYED = {"played_return": "return", "played_danger": "danger"}
+HEAD = ("task", "algorithm", "variant", "seed", "true_return", "true_cost", *PLAYED, *NUMBERS)
 # What each number is to tell, and whether more of it is to mean more of that.
 TELLS = {
+    "played_return": ("true_return", "return, played in the World of the logs"),
+    "played_danger": ("true_cost", "dangerous steps, played in the World of the logs"),
     "foreseen_unsafe": ("true_cost", "share of states from which danger is foreseen"),
     "not_surely_safe": ("true_cost", "share of states that are not surely safe"),
     "cost": ("true_cost", "fitted Q evaluation of cost"),
@@ -61,6 +64,7 @@ def main() -> None:
                 how |= {"guard": result["guard"], "danger": result["danger"]}
             found = judge(run, store, judge_world=world, compare=False, **how)
             numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
+            numbers = [found["played"][k]["mean"] for k in PLAYED.values()] + numbers
             truth = [result["return_mean"], result["avoidable_cost"]]
             rows.append(dict(zip(HEAD, map(str, (*key, *(f"{v:.5g}" for v in (*truth, *numbers)))))))
             print(*rows[-1].values(), flush=True)

@@ -138,13 +138,7 @@ def test_memory_costs_and_noise(run, small_store, small_world, tmp_path):
     names = [x["name"] for x in told["inputs"]]
     assert names == ["observations", "state", "cost", "noise.0", "memory.age", "memory.last", "memory.margin"]
     assert apart(call, told, steps) <= 1e-5
-    pytest.importorskip("jax2onnx")
-    file = exporting.export(run, tmp_path / "full.onnx", **options)
-    assert apart(*of_onnx(file), steps) <= 1e-4
-    import onnx
-
-    flat = {x.key: x.value for x in onnx.load(file).metadata_props}
-    assert float(flat["initial.memory.margin"]) == told["initial"]["memory.margin"] == 1.0
+    assert told["initial"]["memory.margin"] == 1.0
 
 
 def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_path):

@@ -58,7 +58,7 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
         rows, spread = guard.foreseen(present, plan[:, None])
         return guard.missing(present, guard.danger.along(rows, spread)[:, 0], margin).sum((1, 2))
 
-    assert (missing(guard.shielded(present, plan, margin)) >= missing(plan) - 1e-5).all()
+    assert (missing(eqx.filter_jit(guard.shielded)(present, plan, margin)) >= missing(plan) - 1e-5).all()
 
 
 def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
@@ -66,8 +66,9 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
     guard = make(small_world, bound, shield=4)
     plan = jax.random.uniform(jax.random.key(6), (45, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.linspace(-1.0, 3.0, 45)
-    several = guard.shielded(present[:45], plan, margin)
-    each = [guard.shielded(present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
+    several = eqx.filter_jit(guard.shielded)(present[:45], plan, margin)
+    few = eqx.filter_jit(guard.shielded)
+    each = [few(present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
     np.testing.assert_allclose(several, jnp.concatenate(each), atol=1e-4)
     moved = (several != plan).any((1, 2, 3))
     assert 0 < moved.sum() < 45
@@ -77,7 +78,7 @@ def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, refine=10, starts=4, care=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
     worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
-    better = guard.refined(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros(64))
+    better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros(64))
     assert (worth(better) > worth(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts = guard.started(plan, last, jax.random.key(0))[0]
@@ -92,7 +93,7 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
     plan = jnp.stack([jnp.full((64, 3, 3, 2), v) for v in (0.0, 0.95)], 1)
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts, low, high = guard.started(plan, last, jax.random.key(0))
-    better = guard.refined(present, starts, low, high, jnp.zeros(64))
+    better = eqx.filter_jit(guard.refined)(present, starts, low, high, jnp.zeros(64))
     for found in (starts, better):
         near = [jnp.abs(found - plan[:, k : k + 1]).max((2, 3, 4)) <= 0.1 + 1e-6 for k in range(2)]
         np.testing.assert_array_equal(jnp.argmax(jnp.stack(near), 0)[0], [0, 1, 0, 0, 1, 0])
@@ -104,7 +105,7 @@ def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
     guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(shield=10, bound=0.1))
     plan = jnp.full((64, 3, 3, 2), 0.95)
-    kept = guard.shielded(present, plan, jnp.full(64, 9.0))
+    kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full(64, 9.0))
     moved = jnp.abs(kept - plan)
     assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
     far = make(small_world, bound, shield=10).shielded(present, plan, jnp.full(64, 9.0))
@@ -126,8 +127,9 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
     last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3)), jax.random.key(0)
     here = world.map(seen, None)
-    a = guard.decide(here, plan, last, margin, key)
-    b = guard.decide(here.at[:, 1].add(0.3), plan.at[..., 1, :].set(0.9), last, margin.at[:, 1].set(2.0), key)
+    decide = eqx.filter_jit(guard.decide)
+    a = decide(here, plan, last, margin, key)
+    b = decide(here.at[:, 1].add(0.3), plan.at[..., 1, :].set(0.9), last, margin.at[:, 1].set(2.0), key)
     np.testing.assert_allclose(a.plan[..., 0, :], b.plan[..., 0, :], atol=1e-6)
     np.testing.assert_allclose(a.plan[..., 2, :], b.plan[..., 2, :], atol=1e-6)
     assert a.chosen.shape == (16, 3)

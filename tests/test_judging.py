@@ -12,9 +12,11 @@ import ringfence
 from ringfence import cli, hazards, judging, training, worlds
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
+from ringfence.judging.logs import Logs
+from ringfence.judging.worth import worth
 from tests.quick import QUICK_WORLD
 
-QUICK = dict(states=100, transitions=400, updates=20, members=2)
+QUICK = dict(states=100, transitions=400, updates=20, members=2, episodes=8, steps=5)
 
 
 @pytest.fixture(scope="module")
@@ -44,12 +46,10 @@ def run(logs, tmp_path_factory):
 @pytest.mark.parametrize("action", [0.6, -0.4])
 def test_fitted_q_evaluation_finds_what_an_action_is_worth(logs, world, action):
     """The reward is the action, so whoever always takes the same earns it for ever: a / (1 − γ)."""
-    told = judging._Logs(logs, world)
+    told = Logs(logs, world)
     steps, starts = np.arange(logs.steps), told.starts
     always = np.full((len(steps), 2, 1), action, np.float32)
-    found = judging._worth(
-        told, steps, always, starts, always[: len(starts)], "", jax.random.key(0), 3, 1500, 0.8, True
-    )
+    found = worth(told, steps, always, starts, always[: len(starts)], "", jax.random.key(0), 3, 1500, 0.8, True)
     assert abs(found["return"]["mean"] - action / 0.2) < 0.4
     assert found["return"]["low"] < found["return"]["mean"] < found["return"]["high"]
     right = {-0.4: 0, 0.6: 1}[action]  # who drifts right pays, who drifts left does not
@@ -62,13 +62,13 @@ def test_a_judgement_says_what_the_policy_does(run, logs, world):
     other = dataclasses.replace(logs.select(np.arange(60) < 40))
     guarded = worlds.fit(logs, seed=0, **QUICK_WORLD)
     beside = worlds.fit(other, seed=1, **QUICK_WORLD)
-    told = ringfence.judge(run, other, judge_world=beside, guard="shield", world=guarded, **QUICK)
+    told = ringfence.judge(run, other, judge_world=beside, guard="shield", world=guarded, shield=1, **QUICK)
     assert not told["trained_on"] and told["logs"]["episodes"] == 40
     for name in ("steps_in", "infeasible", "strange", "unknown", "foreseen_unsafe", "not_surely_safe"):
         assert 0 <= told[name] <= 1
     assert told["episodes_not_surely_safe"] <= told["episodes_upper"] <= 1
     assert told["not_surely_safe"] >= told["foreseen_unsafe"]
-    again = ringfence.judge(run, other, judge_world=beside, guard="shield", world=guarded, **QUICK)
+    again = ringfence.judge(run, other, judge_world=beside, guard="shield", world=guarded, shield=1, **QUICK)
     assert again == told
     assert any("the guard steps in" in line for line in judging.words(told))
 

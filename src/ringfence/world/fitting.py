@@ -155,7 +155,9 @@ def _fitted(
     danger = None
     if label is not None:
         bad = [moved, hashlib.blake2b(label.tobytes(), digest_size=8).hexdigest()]
-        now = parts.get("label", bad, blank.barrier, lambda key: _label(told, blank.barrier, acts, s, key, quiet))
+        now = parts.get(
+            "label", bad, blank.barrier, lambda key: _label(told, _blank_barrier(map, s), acts, s, key, quiet)
+        )
         danger = parts.get(
             "future",
             bad,
@@ -346,11 +348,19 @@ def _label(
 
 
 def _blank(map: features.FeatureMap, spec: Spec, s: Settings) -> World:
-    """Zeros in the shapes of a World."""
-    acts = dynamics.blank_dynamics(map, spec.action_dim, s.members, s.dynamics_width)
-    worth = values.blank_values(map, spec.action_dim, s.discount, s.sight == "own")
-    danger = cbf.blank_barrier(map, s.barrier_width, s.both_ends, s.distances) if s.barrier else None
-    return World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
+    """The shapes of a World; nothing is computed, since programs for so many small arrays take seconds to compile."""
+
+    def shapes() -> World:
+        acts = dynamics.blank_dynamics(map, spec.action_dim, s.members, s.dynamics_width)
+        worth = values.blank_values(map, spec.action_dim, s.discount, s.sight == "own")
+        danger = _blank_barrier(map, s) if s.barrier else None
+        return World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
+
+    return eqx.filter_eval_shape(shapes)
+
+
+def _blank_barrier(map: features.FeatureMap, s: Settings) -> cbf.Barrier:
+    return cbf.blank_barrier(map, s.barrier_width, s.both_ends, s.distances)
 
 
 def _shape_in_words(barrier: cbf.Barrier | None) -> str:

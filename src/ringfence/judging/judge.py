@@ -1,5 +1,5 @@
 """A policy judged by logs alone, without a simulator: what it would do in logged states, where that leads as a World of
-these logs foresees it, and what it is worth by fitted Q evaluation.
+these logs foresees it, and what it is worth, by fitted Q evaluation and played in that World.
 
 Nobody grades himself: the World that judges is fitted to the logs that are given, with a seed of its own, and is not
 the one that guards. How far each number can be believed, on tasks whose truth is known: docs/judging.md.
@@ -11,11 +11,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import t as student
 
 from ringfence import evaluate, normalise, stats, worlds
 from ringfence.data.store import EpisodeStore
@@ -23,19 +21,16 @@ from ringfence.each import Each
 from ringfence.errors import UserError, whole_number
 from ringfence.guards import Danger
 from ringfence.guards.policy import Guarded, held
-from ringfence.nets.mlp import MLP
-from ringfence.normalise import varying
-from ringfence.optim import regress
+from ringfence.judging.logs import Logs
+from ringfence.judging.played import played
+from ringfence.judging.worth import worth
 from ringfence.runs import Run
 from ringfence.training import Job
 from ringfence.types import Array, Key
-from ringfence.windows import WindowData
 from ringfence.world import World
 
 AT_ONCE = 512  # states that a policy is asked about together
 CHANGED = 0.05  # of the actions' range of 2: what counts as stepping in
-WIDTH = 64  # units of each of the evaluation's 2 hidden layers
-SLOW = 0.05  # rate at which the copy that targets are read from follows
 
 
 def judge(
@@ -49,6 +44,8 @@ def judge(
     members: int = 5,
     discount: float = 0.95,
     ahead: int = 3,
+    episodes: int = 256,
+    steps: int = 100,
     planner: str = "plain",
     compare: bool = True,
     seed: int = 0,
@@ -63,6 +60,8 @@ def judge(
     interval is Student's; `compare` evaluates what the logs did, too. Policies are asked with an empty memory: plans
     under way and adapted margins are not there.
 
+    In `episodes` of up to `steps` steps it is played in the judging World, with its memory (`played`; 0 episodes: not).
+
     Keys: `return`, `cost` and `return_of_logs`, `cost_of_logs`: {mean, low, high}, discounted sums from the logged
     starts; `foreseen_unsafe`: share of safe logged states from which danger is foreseen within `ahead` steps, and of
     logs; `not_surely_safe`: share from which the foreseen margin is below the calibrated one, that all but `missed` of
@@ -73,6 +72,8 @@ def judge(
     """
     for name, value in (("states", states), ("transitions", transitions), ("updates", updates), ("ahead", ahead)):
         whole_number(name, value, 1)
+    whole_number("episodes", episodes, 0)
+    whole_number("steps", steps, 1)
     whole_number("members", members, 2, 100)
     if not 0 <= discount < 1:
         raise UserError(f"discount={discount} must be from 0 to below 1.")
@@ -84,7 +85,7 @@ def judge(
     if not (judging.card["data"]["content"] == store.content and judging.spec.action_dim == store.actions.shape[2]):
         raise UserError("judge_world is of other logs; leave it out, and one is fitted to these.")
     logs = job.task.logs(store)
-    told = _Logs(logs, judging)
+    told = Logs(logs, judging)
     ask = _asker(policy, logs, judging, job, ahead, seed)
 
     rng = np.random.default_rng(seed)
@@ -101,16 +102,22 @@ def judge(
         **_conduct(told, picked, found, judging),
         **_dangers(told, picked, found, judging, ahead),
     }
-    steps = rng.choice(logs.steps, min(transitions, logs.steps), replace=False)
-    starts = rng.permutation(told.starts)[:2000]
-    after, first = ask(told.row[steps] + 1)["action"], ask(starts)["action"]
     key = jax.random.key(seed)
-    result |= _worth(told, steps, after, starts, first, "", key, members, updates, discount, quiet)
+    needs_state = logs.state is not None and job.widths[1] > 0
+    result["played"] = (
+        played(policy, told, logs, judging, needs_state, jax.random.fold_in(key, 1), episodes, steps)
+        if episodes
+        else None
+    )
+    learned = rng.choice(logs.steps, min(transitions, logs.steps), replace=False)
+    starts = rng.permutation(told.starts)[:2000]
+    after, first = ask(told.row[learned] + 1)["action"], ask(starts)["action"]
+    result |= worth(told, learned, after, starts, first, "", key, members, updates, discount, quiet)
     if not compare:
         return result
-    logged = told.actions[np.minimum(steps + 1, told.last_step[steps])]
+    logged = told.actions[np.minimum(learned + 1, told.last_step[learned])]
     begun = told.actions[told.step_of_start[np.searchsorted(told.starts, starts)]]
-    return result | _worth(told, steps, logged, starts, begun, "_of_logs", key, members, updates, discount, quiet)
+    return result | worth(told, learned, logged, starts, begun, "_of_logs", key, members, updates, discount, quiet)
 
 
 def words(told: dict[str, Any]) -> list[str]:
@@ -123,6 +130,15 @@ def words(told: dict[str, Any]) -> list[str]:
         lines.append(
             f"{what}, discounted by {told['discount']:g}: {mine['mean']:.4g} ({mine['low']:.4g} to {mine['high']:.4g})"
             + beside
+        )
+    if (mine := told["played"]) is not None:
+        dangerous = mine["danger"] and (
+            f", {mine['danger']['mean']:.3g} dangerous steps (the logs {mine['danger_of_logs']:.3g})"
+        )
+        lines.append(
+            f"played for {mine['steps']} steps in the World of these logs: return {mine['return']['mean']:.4g} "
+            f"({mine['return']['low']:.4g} to {mine['return']['high']:.4g}; the logs {mine['return_of_logs']:.4g})"
+            f"{dangerous or ''}; it does not know {100 * mine['lost']:.2g} % of the way"
         )
     if told["foreseen_unsafe"] is not None:
         lines.append(
@@ -149,21 +165,6 @@ def check(run: Run, store: EpisodeStore) -> None:
         raise UserError(
             f"The run is of '{told['task']}', the logs are of '{store.card['task']}'; judge it by logs of its own task."
         )
-
-
-class _Logs:
-    """The logs in the judging World's view: actions in [−1, 1], rewards and costs of the team."""
-
-    def __init__(self, logs: EpisodeStore, world: World):
-        arrays = WindowData(logs, world.map).arrays
-        self.x, self.actions = arrays["features"], np.asarray(arrays["actions"])
-        self.row = np.arange(logs.steps) + logs.episode_of_step  # of the state that a step begins in
-        self.rewards, self.costs = logs.rewards.mean(1), logs.team_costs.astype(np.float32)
-        self.terminated, self.episode = logs.terminated, logs.episode_of_step
-        self.step_of_start = np.concatenate([[0], logs.episode_ends[:-1]])
-        self.starts = self.step_of_start + np.arange(logs.episodes)
-        self.joint = world.map.joint
-        self.last_step = np.repeat(logs.episode_ends - 1, logs.lengths)
 
 
 def _asker(policy, logs: EpisodeStore, world: World, job: Job, ahead: int, seed: int) -> Callable:
@@ -201,7 +202,7 @@ def _asker(policy, logs: EpisodeStore, world: World, job: Job, ahead: int, seed:
     return ask
 
 
-def _conduct(told: _Logs, picked: np.ndarray, found: dict, world: World) -> dict[str, float | None]:
+def _conduct(told: Logs, picked: np.ndarray, found: dict, world: World) -> dict[str, float | None]:
     """What it does in logged states, beside what was done."""
     logged, done = told.actions[picked], found["action"]
     spread = jax.jit(lambda d, x, a: d.step(x, a)[1].max(-1))
@@ -216,7 +217,7 @@ def _conduct(told: _Logs, picked: np.ndarray, found: dict, world: World) -> dict
     }
 
 
-def _dangers(told: _Logs, picked: np.ndarray, found: dict, world: World, ahead: int) -> dict[str, Any]:
+def _dangers(told: Logs, picked: np.ndarray, found: dict, world: World, ahead: int) -> dict[str, Any]:
     """Where its plans lead from logged states that are not unsafe already, beside where the logs went on to."""
     if world.barrier is None:
         return {"foreseen_unsafe": None}
@@ -252,82 +253,3 @@ def _dangers(told: _Logs, picked: np.ndarray, found: dict, world: World, ahead: 
 
 def _quantiles(x: np.ndarray) -> list[float]:
     return [round(float(v), 3) for v in np.quantile(x, np.linspace(0, 1, 41))]
-
-
-class _Q(eqx.Module):
-    """Q of the team, the mean over agents of networks that read an agent's view and action (of a body: everybody's);
-    two outputs, return and cost."""
-
-    net: MLP
-    joint: bool = eqx.field(static=True)
-
-    def __call__(self, x: Array, action: Array) -> Array:
-        if self.joint:
-            x, action = x[..., :1, :], action.reshape(*action.shape[:-2], 1, -1)
-        return self.net(jnp.concatenate([x, action], -1)).mean(-2)
-
-
-def _worth(
-    told: _Logs,
-    steps: np.ndarray,
-    after: np.ndarray,
-    starts: np.ndarray,
-    first: np.ndarray,
-    name: str,
-    key: Key,
-    members: int,
-    updates: int,
-    discount: float,
-    quiet: bool,
-) -> dict[str, dict[str, float]]:
-    """Fitted Q evaluation (Le et al. 2019) of discounted return and cost: y = r + γ Q̄(s', a'), where a' is what is
-    judged does in s', and Q̄ follows slowly. Each member learns from episodes drawn with replacement."""
-    x = np.asarray(told.x)
-    flat = x[told.row[steps]].reshape(-1, x.shape[-1]).astype(np.float64)
-    mean, scale = flat.mean(0), varying(flat.std(0), flat.mean(0))
-    view = lambda rows: jnp.asarray((x[rows] - mean) / scale, jnp.float32)  # noqa: E731
-    earned = np.stack([told.rewards[steps], told.costs[steps]], -1).astype(np.float64)
-    usual = np.stack([earned.mean(0), np.maximum(earned.std(0), 1e-6)])
-    goal = (earned - usual[0]) / usual[1] * (1 - discount)  # so that Q is of the order of 1
-    over = told.terminated[steps]
-    n, a = after.shape[1:]
-    kn, kw, kr = jax.random.split(key, 3)
-    sizes = (x.shape[-1] + (n * a if told.joint else a), WIDTH, WIDTH, 2)
-    nets = jax.vmap(lambda k: _Q(MLP(k, sizes, linear=True), told.joint))(jax.random.split(kn, members))
-    episodes, which = np.unique(told.episode[steps], return_inverse=True)
-    weight = np.random.default_rng(int(jax.random.bits(kw))).poisson(1.0, (len(episodes), members))[which]
-    data = (
-        view(told.row[steps]),
-        jnp.asarray(told.actions[steps]),
-        view(told.row[steps] + 1),
-        jnp.asarray(after),
-        jnp.asarray(goal, jnp.float32),
-        jnp.asarray(~over, jnp.float32),
-        jnp.asarray(weight, jnp.float32),
-    )
-
-    def loss(both, data, pick: Array) -> Array:
-        fast, slow = both
-        now, acted, then, next_action, earned, goes_on, weight = (d[pick] for d in data)
-        q = jax.vmap(lambda f: f(now, acted))(fast)  # (members, batch, 2)
-        ahead = jax.lax.stop_gradient(jax.vmap(lambda f: f(then, next_action))(slow))
-        # What ends for good earns nothing more, and nothing is −mean in these units.
-        nothing = jnp.asarray(-usual[0] / usual[1], jnp.float32)
-        target = earned + discount * jnp.where(goes_on[:, None] > 0, ahead, nothing)
-        return (weight.T[..., None] * (q - target) ** 2).mean()
-
-    def follow(both):
-        fast, slow = both
-        return fast, jax.tree.map(lambda f, s: s + SLOW * (f - s), fast, slow)
-
-    label = "" if quiet else f"what {'the logs are' if name else 'the policy is'} worth"
-    fast, _ = regress(loss, (nets, nets), data, len(steps), kr, updates, 256, 1e-3, label, after=follow)
-    of = jax.jit(lambda fast, x, a: jax.vmap(lambda f: f(x, a).mean(0))(fast))
-    told_of = np.asarray(of(fast, view(starts), jnp.asarray(first)), np.float64)  # (members, 2)
-    value = (told_of * usual[1] + usual[0]) / (1 - discount)
-    out = {}
-    for k, what in enumerate(("return", "cost")):
-        half = student.ppf(0.975, members - 1) * value[:, k].std(ddof=1)
-        middle = float(value[:, k].mean())
-        out[what + name] = {"mean": middle, "low": middle - float(half), "high": middle + float(half)}
-    return out
