@@ -13,6 +13,9 @@ from ringfence import evaluate, hazards, tasks, training, worlds
 from ringfence.errors import UserError
 from ringfence.guards import Danger, Guard, GuardOptions
 from ringfence.guards.guard import pick
+from ringfence.guards.policy import build
+from ringfence.policies import Constant
+from ringfence.world import Card
 from tests.quick import QUICK_WORLD
 
 
@@ -101,6 +104,25 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
     assert jnp.abs(better - starts).max() > 0.05
 
 
+@pytest.mark.parametrize(
+    "avoided, options, future",
+    [
+        ([0.2, 0.2, 0.9], {}, True),
+        ([0.2, 0.6, 0.9], {}, False),
+        ([0.2, 0.2, 0.9], {"rows": 7}, False),
+        ([0.2, 0.2, 0.9], {"future": False}, False),
+    ],
+)
+def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, options, future):
+    """Where three rows come too late, the value of danger judges the last one, unless something else is asked for."""
+    card = Card({"barrier": {"avoidable": {"before": [1, 3, 15], "avoided": avoided, "rows": 15}}})
+    world = dataclasses.replace(small_world, card=card)
+    for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
+                   ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip
+        assert policy.guard.danger.future == policy.guard.options.future == future
+    assert not build(Constant(world.spec), world, None, "shield", "learned", {}, **options).guard.options.future
+
+
 def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
     guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(shield=10, bound=0.1))
@@ -154,9 +176,6 @@ def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
 
 
 def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
-    from ringfence.guards.policy import build
-    from ringfence.policies import Constant
-
     policy = build(Constant(small_world.spec), small_world, hazards.Separation(), "adapt", "formula")
     seen, state = small_store.observations[:2], small_store.state[:2]
     memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))

@@ -346,7 +346,8 @@ def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job,
     if how.guarded:
         sight = worlds.sight_of(job.task, how.sight)
         world = worlds.for_guard(run, sight, how.world, read=world, quiet=False)
-        policy = build(policy, world, job.hazard.hazard, how.guard, how.danger, job.task.guard, **how.given)
+        usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
+        policy = build(policy, world, job.hazard.hazard, how.guard, how.danger, usual, **how.given)
     return job, policy, at
 
 

@@ -44,7 +44,7 @@ def judge(
     members: int = 5,
     discount: float = 0.95,
     ahead: int = 3,
-    episodes: int = 256,
+    episodes: int = 128,
     steps: int = 100,
     planner: str = "plain",
     compare: bool = True,
