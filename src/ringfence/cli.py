@@ -223,6 +223,23 @@ def evaluate(
         sys.exit(2)
 
 
+def get(
+    names: Positional[tuple[str, ...]] = (), out_folder: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs")
+) -> None:
+    """Trained policies that come with the package, to be evaluated, filmed and played at once; without a name, which.
+
+    Args:
+        names: e.g. crossing-hasty/icbf.
+        out_folder: where their run folders go.
+    """
+    from ringfence import zoo
+
+    if not names:
+        print(*zoo.names(), sep="\n")
+    for run in [zoo.get(name, out_folder) for name in names]:
+        print(run.path)
+
+
 def export(
     run: Positional[Path],
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
@@ -604,6 +621,7 @@ COMMANDS = {
     "fit": fit,
     "train": train,
     "eval": evaluate,
+    "get": get,
     "export": export,
     "bench": bench,
     "judge": judge,

@@ -17,6 +17,7 @@ from ringfence.world import load as load_world
 from ringfence.world.fitting import fit_view
 
 WORLD = "world.safetensors"  # in a run folder: the World that training read
+GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
 
 
 def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Settings:
@@ -97,6 +98,8 @@ def for_guard(
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, sight)
         return world
+    if (run.path / GUARD).exists() and (kept := load(run.path / GUARD)).alone == (sight == "own"):
+        return kept
     if read is not None or (run.path / WORLD).exists():
         found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.

@@ -406,12 +406,15 @@ def _kept_world(file: Path, map: features.FeatureMap) -> World | None:
         return None
 
 
-def save(world: World, path: str | Path) -> Path:
-    """Write one file, whole or not at all: arrays, and the card as its metadata."""
+def save(
+    world: World, path: str | Path, kept: Callable[[np.ndarray, str], np.ndarray] = lambda array, name: array
+) -> Path:
+    """Write one file, whole or not at all: arrays, as `kept` makes them, and the card as its metadata."""
     path = Path(path)
     about = {"map": features.to_dict(world.map), "spec": dataclasses.asdict(world.spec), "card": world.card.told}
     with whole(path) as temporary:
-        save_file(named_arrays(world), temporary, {"ringfence_world": json.dumps(about)})
+        arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
+        save_file(arrays, temporary, {"ringfence_world": json.dumps(about)})
     return path
 
 

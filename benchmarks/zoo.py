@@ -1,0 +1,97 @@
+"""Makes the trained policies that come with the package (zoo/) of benchmark cells, and plays both beside each other.
+
+ringfence bench guards --tasks simple_spread-expert --out A       # likewise guards-mujoco, crossing-guards
+python benchmarks/zoo.py --pack A B C     # writes src/ringfence/zoo/TASK
+python benchmarks/zoo.py                  # plays them; writes results/zoo.csv and docs/start.md's table
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import tempfile
+from pathlib import Path
+
+from readme import put
+
+from ringfence import evaluate, worlds, zoo
+from ringfence.files import whole
+from ringfence.runs import Run
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "zoo.csv"
+CELLS = {
+    "simple_spread-expert/bc": "bc",
+    "simple_spread-expert/icbf": "icbf-split",
+    "halfcheetah_2x3-good/bc": "bc-mujoco",
+    "halfcheetah_2x3-good/icbf": "icbf-mujoco",
+    "crossing-hasty/bc": "bc",
+    "crossing-hasty/icbf": "icbf-split",
+}
+EPISODES = {"simple_spread-expert": 200, "halfcheetah_2x3-good": 20, "crossing-hasty": 200}
+GUARDS = {"simple_spread-expert": "shield", "halfcheetah_2x3-good": "adapt", "crossing-hasty": "shield"}
+HEAD = ("policy", "guard", "episodes", "return", "cost", "violation_rate", "return_before", "cost_before", "kib")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--pack", type=Path, nargs="*", default=[])
+    folders = parser.parse_args().pack
+    before = {(r["policy"], r["guard"]): r for r in csv.DictReader(OUT.open())} if OUT.exists() else {}
+    for name, cell in CELLS.items():
+        task = name.split("/")[0]
+        for run in (Run(p) for f in folders for p in (f / "cells" / task / cell).glob("seed-0-*")):
+            read = worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
+            print(*zoo.put(run, name, read, worlds.for_guard(run)))
+            for guard in ("none", GUARDS[task]):
+                found = [r for r in run.results.values() if _is(r, guard)]
+                before[name, guard] = {
+                    "return_before": f"{found[0]['return_mean']:.5g}" if found else "",
+                    "cost_before": f"{found[0]['cost_mean']:.4g}" if found else "",
+                }
+    rows = []
+    with tempfile.TemporaryDirectory() as there:
+        for name in zoo.names():
+            task, run = name.split("/")[0], zoo.get(name, there)
+            planner = "steady" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "plain"
+            for guard in ("none", GUARDS[task]):
+                told = evaluate.evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
+                files = [zoo.FOLDER / f"{name}.safetensors", zoo.FOLDER / f"{name}-world.safetensors"]
+                old = before.get((name, guard), {})
+                rows.append(
+                    {
+                        "policy": name,
+                        "guard": guard,
+                        "episodes": EPISODES[task],
+                        "return": f"{told['return_mean']:.5g}",
+                        "cost": f"{told['cost_mean']:.4g}",
+                        "violation_rate": f"{told['violation_rate']:.4g}",
+                        "return_before": old.get("return_before", ""),
+                        "cost_before": old.get("cost_before", ""),
+                        "kib": round(sum(f.stat().st_size for f in files if f.exists()) / 1024),
+                    }
+                )
+                print(rows[-1], flush=True)
+    with whole(OUT) as temporary, temporary.open("w") as f:
+        writer = csv.DictWriter(f, HEAD, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    put("docs/start.md", "zoo", table(rows))
+
+
+def _is(result: dict, guard: str) -> bool:
+    """Whether a cell's result is of this guard, as the zoo plays it."""
+    return (
+        result["guard"] == guard and result["danger"] in ("none", "learned") and result["sight"] in (None, "all", "own")
+    )
+
+
+def table(rows: list[dict]) -> str:
+    lines = ["| policy | guard | return | cost | before it was halved |", "|---|---|---|---|---|"]
+    for r in rows:
+        old = f"{r['return_before']}, {r['cost_before']}" if r["return_before"] else "–"
+        lines.append(f"| {r['policy']} | {r['guard']} | {r['return']} | {r['cost']} | {old} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
