@@ -16,8 +16,11 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("JAX_COMPILATION_CACHE_
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
-# Worlds that tests fit are not the user's.
-os.environ["RINGFENCE_HOME"] = tempfile.mkdtemp(prefix="ringfence-home-")
+# Worlds that tests fit are not the user's; workers share those of the process that began them.
+os.environ["RINGFENCE_TESTS_HOME"] = os.environ.get("RINGFENCE_TESTS_HOME") or tempfile.mkdtemp(
+    prefix="ringfence-home-"
+)
+os.environ["RINGFENCE_HOME"] = os.environ["RINGFENCE_TESTS_HOME"]
 
 import jax
 import numpy as np
@@ -31,11 +34,11 @@ from ringfence.envs import SimpleSpread
 
 def pytest_unconfigure(config):
     """Leave nothing in the folder for temporary files; workers share the cache of the process that began them."""
-    made = [os.environ["RINGFENCE_HOME"]]
-    if "ringfence-tests-" in (shared := os.environ["JAX_COMPILATION_CACHE_DIR"]) and not hasattr(config, "workerinput"):
-        made.append(shared)
-    for folder in made:
-        shutil.rmtree(folder, ignore_errors=True)
+    if hasattr(config, "workerinput"):
+        return
+    for name, ours in (("RINGFENCE_TESTS_HOME", "ringfence-home-"), ("JAX_COMPILATION_CACHE_DIR", "ringfence-tests-")):
+        if ours in os.environ[name]:
+            shutil.rmtree(os.environ[name], ignore_errors=True)
 
 
 @pytest.fixture(scope="session")

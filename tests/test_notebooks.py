@@ -1,0 +1,32 @@
+"""The notebooks run, cell by cell, with small numbers in the cell of parameters."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import matplotlib
+import pytest
+
+from ringfence.guards import GUARDS
+from tests.quick import QUICK_WORLD
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"steps": 4, "width": 16}, "RUNS": 40, "EPISODES": 60, "PLAYED": 2}
+SMALL["JUDGE"] = dict(states=100, transitions=400, updates=20, members=2, episodes=8, steps=5)
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda f: f.stem)
+def test_it_runs(file, tmp_path, monkeypatch, capsys):
+    matplotlib.use("Agg")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(EXAMPLES))
+    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
+    space: dict = {}
+    for cell in json.loads(file.read_text())["cells"]:
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"{file.name}, {cell['id']}", "exec"), space)
+        if "parameters" in cell["metadata"].get("tags", ()):
+            assert {k for k in SMALL if k in space}, "the cell names what can be made smaller"
+            space |= {k: v for k, v in SMALL.items() if k in space}
+    assert capsys.readouterr().out
