@@ -590,6 +590,22 @@ def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, ab
             training.make_job(name, task, None, {"view": "decentralized"}, store)
 
 
+def test_the_cards_cost_limit_is_what_learners_keep(absolute, played):
+    """Of own data; a setting overrides it, and those who keep no limit are as they were."""
+    store = absolute(played["costs"])
+    told = dataclasses.replace(store, card={**store.card, "cost_limit": 7.0})
+    for name, field, usual in (("bc-safe", "cost_limit", 0.0), ("ma-td3bc-lag", "limit", 1.0)):
+        kept = [
+            getattr(training.make_job(name, tasks.from_store(s), None, changes, s).config, field)
+            for s, changes in ((store, {}), (told, {}), (told, {field: 3.0}))
+        ]
+        assert kept == [usual, 7.0, 3.0]
+    assert training.make_job("bc", tasks.from_store(told), None, {}, told).config.cost_limit is None
+    none = dataclasses.replace(store, card={**store.card, "cost_limit": 0.0})
+    with pytest.raises(UserError, match=r"limit=0.0 must be positive; .* the data's card \(cost_limit\) unless"):
+        training.make_job("ma-td3bc-lag", tasks.from_store(none), None, {}, none)
+
+
 def test_costs_that_were_never_filled_in_are_refused_by_those_who_learn_from_them(absolute):
     store = absolute(None)
     task = tasks.from_store(store)

@@ -90,7 +90,9 @@ def make_job(
     preset = preset or a.preset_for(task.presets)
     if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
-    config = build_config(a.Config, {**a.presets[preset], **changes}, a.name)
+    own = task.env is None and store is not None and a.limit is not None and "cost_limit" in store.card
+    told = {a.limit: float(store.card["cost_limit"])} if own else {}
+    config = build_config(a.Config, {**a.presets[preset], **told, **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
     reads = a.reads(config)

@@ -130,6 +130,7 @@ class Algorithm:
     # config -> settings of the World that training reads, if it reads one
     needs: Callable[[Any], dict[str, Any] | None] = lambda config: None
     of_world: Callable[[Any, Any], dict[str, PyTree]] | None = None  # (world, config) -> state["world"]
+    limit: str | None = None  # the config field that is a limit of the cost per episode: own data's card fills it
     revision: int = 1  # raised when the same settings come to train another policy; config.json tells it
 
     def preset_for(self, wanted: tuple[str, ...]) -> str:

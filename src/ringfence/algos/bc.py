@@ -141,4 +141,5 @@ BC_SAFE = replace(
     BC,
     name="bc-safe",
     presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, "steps": 20_000}},
+    limit="cost_limit",
 )

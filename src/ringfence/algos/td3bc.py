@@ -63,7 +63,10 @@ def check(config: Config, hazard: BoundHazard) -> None:
     if config.delay < 1:
         raise UserError(f"delay={config.delay} must be at least 1.")
     if config.limit <= 0:
-        raise UserError(f"limit={config.limit} must be positive; it is a cost per episode.")
+        raise UserError(
+            f"limit={config.limit} must be positive; it is a cost per episode, that of the data's card (cost_limit) "
+            "unless another is set: --set limit=1."
+        )
 
 
 def reads(config: Config) -> Literal["costs", "nothing"]:
@@ -212,4 +215,5 @@ MA_TD3BC_LAG = replace(
         name: {"lagrange": True, "multiplier_max": 10.0, **MA_TD3BC.presets[name]}
         for name in ("default", "random", "mujoco")
     },
+    limit="limit",
 )
