@@ -590,6 +590,26 @@ def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, ab
             training.make_job(name, task, None, {"view": "decentralized"}, store)
 
 
+@pytest.mark.parametrize("name", ["bc", "ma-td3bc", "fisor"])
+def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
+    """What an agent has not is the middle of the bounds, whoever learned it."""
+    store = absolute(played["costs"])
+    store.card["action_sizes"] = [2, 1, 2]
+    store = dataclasses.replace(store)
+    told = {k: v for k, v in TINY[name].items() if k != "steps"} | {"view": "centralized"}
+    job = training.make_job(name, tasks.from_store(store), None, told, store)
+    assert job.spec.action_sizes == (2, 1, 2) and type(job.spec).of(json.loads(json.dumps(job.spec.told()))) == job.spec
+    state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
+    state = jax.tree.map(lambda x: x + 0.1 if x.dtype == jnp.float32 else x, state)  # as if it had learned
+    policy = evaluate.make_policy(job, state, {})
+    seen, whole = store.observations[:4], store.state[:4]
+    action = np.asarray(policy.act(policy.start(4), seen, whole, jax.random.key(0))[1].action)
+    assert (action[:, 1, 1] == 0).all() and (np.abs(action[:, [0, 2]]) > 0).all() and (action[:, 1, 0] != 0).all()
+    store.card["action_sizes"] = [2, 3, 2]
+    with pytest.raises(UserError, match=r"action_sizes=\[2, 3, 2\]; it must say for each of the 3 agents .* 1 to 2"):
+        dataclasses.replace(store)
+
+
 def test_the_cards_cost_limit_is_what_learners_keep(absolute, played):
     """Of own data; a setting overrides it, and those who keep no limit are as they were."""
     store = absolute(played["costs"])

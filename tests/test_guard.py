@@ -194,6 +194,17 @@ def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, pre
     np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
 
 
+def test_entries_of_actions_that_an_agent_has_not_stay_where_they_are(small_world):
+    """Whatever is proposed, climbed or corrected; the others of the same agent move."""
+    spec = dataclasses.replace(small_world.spec, action_sizes=(2, 1, 2))
+    world = dataclasses.replace(small_world, spec=spec)
+    pilot = ringfence.guard(
+        lambda *_: np.full((3, 2), 0.3), world, guard="full", rows=2, refine=2, starts=3, plans=1, shield=2, margin=9.0
+    )
+    acted = pilot.act(*(np.zeros(k, np.float32) for k in ((3, 18), 18)))
+    assert acted[1, 1] == 0 and (np.abs(np.delete(acted.ravel(), 3) - 0.3) > 1e-4).all()
+
+
 def test_the_smaller_of_both(small_world, bound, present):
     rows, spread = jnp.stack([present, present], 1)[:, None], jnp.zeros((64, 1, 1, 3))
     told = {s: Danger(small_world, s, bound, False).along(rows, spread) for s in ("formula", "learned", "both")}

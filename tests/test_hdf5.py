@@ -160,6 +160,7 @@ def test_a_map_shares_the_columns_out(tmp_path, how):
     np.testing.assert_array_equal(store.rewards, np.repeat(data["rewards"][:, None], 2, 1))
     assert store.costs.shape == (17,)
     assert store.card["agents"] == ["a", "b"] and store.card["columns"] == PAIR
+    assert store.card["action_sizes"] == [2, 1]
     assert store.card["warnings"] == [
         "agents of different sizes are filled up at the end: 'b' has 2 of 3 observation entries, 'b' has 1 of 2 "
         "action entries"
@@ -170,7 +171,7 @@ def test_what_is_filled_up_lies_within_the_bounds(tmp_path):
     data = recorded()
     data["actions"] = data["actions"] + 2.5
     store = import_hdf5(write(tmp_path / "d.hdf5", data), agents=PAIR, action_low=1.5, action_high=3.5)
-    assert (store.actions[:, 1, 1] == 1.5).all() and (store.card["action_low"], store.card["action_high"]) == (1.5, 3.5)
+    assert (store.actions[:, 1, 1] == 2.5).all() and (store.card["action_low"], store.card["action_high"]) == (1.5, 3.5)
 
 
 def one(**changes):

@@ -424,7 +424,7 @@ def load_job(run: Run, agents: int | None = None) -> training.Job:
     fields = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
     if lacking := sorted(fields - set(told["spec"])):
         raise UserError(f"'{run.path / 'config.json'}' has a spec without '{lacking[0]}'; train the run again.")
-    spec = Spec(**{**told["spec"], "feature_names": tuple(told["spec"]["feature_names"])})
+    spec = Spec.of(told["spec"])
     if told["feature_map"] is None:
         # Danger is what the run's data said it is, as in training.
         task = tasks.simulated(told["task"], hazards.from_dict(told["hazard"]))

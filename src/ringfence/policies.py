@@ -245,7 +245,7 @@ class Direct(eqx.Module):
 
 def from_unit(action: Array, spec: Spec) -> Array:
     """Actions in [−1, 1], as everything learns them, in the task's bounds."""
-    return normalise.from_unit(action, spec.action_low, spec.action_high)
+    return normalise.from_unit(spec.own(action), spec.action_low, spec.action_high)
 
 
 class Constant(eqx.Module):

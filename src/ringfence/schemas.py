@@ -41,6 +41,7 @@ class Spec(TypedDict, total=False):
     action_high: float
     episode_length: Positive
     alike: bool
+    action_sizes: list[Positive] | None
 
 
 class Map(TypedDict):

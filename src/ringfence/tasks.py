@@ -81,7 +81,9 @@ class Task:
         else:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
         n = 1 if self.alike else n
-        return Spec(self.name, n, a, feature_map.names, self.action_low, self.action_high, length, self.alike)
+        sizes = None if env is not None else store.card.get("action_sizes")
+        names, bounds = feature_map.names, (self.action_low, self.action_high)
+        return Spec(self.name, n, a, names, *bounds, length, self.alike, sizes and tuple(sizes))
 
 
 # OMAR's constants (Pan et al. 2022, as printed by MADIFF): a random and an expert policy's return.

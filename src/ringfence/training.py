@@ -64,7 +64,7 @@ class Job:
             "preset": self.preset,
             "config": dataclasses.asdict(self.config),
             "task": self.task.name,
-            "spec": dataclasses.asdict(self.spec),
+            "spec": self.spec.told(),
             "hazard": hazards.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "widths": None if self.task.env is not None else list(self.widths),

@@ -7,10 +7,11 @@ D feature, A action, K diffusion steps.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
+import numpy as np
 
 Array = jax.Array
 Key = jax.Array
@@ -69,6 +70,22 @@ class Spec:
     action_high: float
     episode_length: int
     alike: bool = False  # of agents who are alike and see for themselves: of a team of one (each.py)
+    action_sizes: tuple[int, ...] | None = None  # entries that each agent's action has, where not all have action_dim
+
+    @classmethod
+    def of(cls, told: dict[str, Any]) -> Spec:
+        """What `told` gave."""
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in told.items()})
+
+    def told(self) -> dict[str, Any]:
+        """As JSON holds it; what is the same for nearly all data is left out."""
+        return {k: v for k, v in asdict(self).items() if k != "action_sizes" or v is not None}
+
+    def own(self, action: Array) -> Array:
+        """Actions (..., N, A) in [−1, 1] with 0 where an agent has no such entry."""
+        if self.action_sizes is None:
+            return action
+        return action * (np.arange(self.action_dim) < np.array(self.action_sizes)[:, None])
 
     @property
     def feature_dim(self) -> int:

@@ -121,7 +121,9 @@ def start(networks, targets: tuple[str, ...], optimiser: Optimiser, frozen: PyTr
 
 def make_actor(key: Key, spec: Spec, width: int) -> MLP:
     """One tanh-bounded actor per agent, two hidden layers, starting near the middle of the action range."""
-    return MLP(key, (spec.feature_dim, width, width, spec.action_dim), groups=spec.n_agents, final_scale=3e-3)
+    return MLP(
+        key, (spec.feature_dim, width, width, spec.action_dim), groups=spec.n_agents, final_scale=3e-3, acts=spec
+    )
 
 
 def act(actor: MLP, x: Array) -> Array:

@@ -58,7 +58,7 @@ def start(key: Key, spec: Spec, config: Config, data: WindowData | None, inputs:
 
     def networks() -> dict:
         sizes = (inputs, *[config.width] * config.depth, spec.action_dim)
-        params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1)}
+        params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1, acts=spec)}
         return fresh(_optimiser(config), params, "ema")
 
     return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}

@@ -170,7 +170,7 @@ def init(
             "denoiser": build_denoiser(
                 kd, config.net, rows, d, config.width, config.depth, carried, n if feature_map.joint else 0
             ),
-            "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True),
+            "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True, acts=spec),
         }
         if config.barrier and config.routing == "paper":
             groups = n if config.scope == "individual" else 1

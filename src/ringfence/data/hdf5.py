@@ -92,8 +92,10 @@ def _store(path: Path, log: logs.Logs, agents: columns.Columns | None, told: dic
         rows = len(log.observations) * widest["observation"] + len(log.actions) * widest["action"]
         arrays.fits(path, 4 * rows * len(agents))
         seen = columns.take(log.observations, [a["observation"] for a in agents.values()])
-        done = columns.take(log.actions, [a["action"] for a in agents.values()], float(np.clip(0.0, low, high)))
+        done = columns.take(log.actions, [a["action"] for a in agents.values()], 0.5 * (low + high))
         card = {"agents": list(agents), "columns": agents}
+        sizes = [len(a["action"]) for a in agents.values()]
+        card |= {"action_sizes": sizes} if len({*sizes}) > 1 else {}
         notes += [note] if (note := columns.note(agents)) else []
     if log.costs is None:
         notes.append("no costs are recorded, so every step has 0: what is learned from this knows no danger")

@@ -172,7 +172,14 @@ class EpisodeStore:
             np.tile(self.terminated, n),
             np.tile(self.truncated, n),
             np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),
-            card={**self.card, "state_names": None, "agents": None, "team": n, "content": self.content},
+            card={
+                **self.card,
+                "state_names": None,
+                "agents": None,
+                "action_sizes": None,
+                "team": n,
+                "content": self.content,
+            },
         )
 
     # --- making ---
@@ -583,6 +590,14 @@ def validate(store: EpisodeStore) -> None:
             f"Episode {bad} is unfinished: its last step is neither terminated nor truncated; set one or drop it."
         )
     demand(not (over & ~last).any(), "A step inside an episode is flagged as its end; split the episode there.")
+    sizes, most = s.card.get("action_sizes"), s.actions.shape[2]
+    if sizes is not None:
+        told = isinstance(sizes, list | tuple) and len(sizes) == n
+        demand(
+            told and all(type(k) is int and 1 <= k <= most for k in sizes),
+            f"The card has action_sizes={sizes!r}; it must say for each of the {n} agents how many entries its action "
+            f"has, 1 to {most}.",
+        )
     for key, size in (("observation_names", s.observations.shape[2]), ("state_names", s.state is not None)):
         names = s.card.get(key)
         if names and key == "observation_names":

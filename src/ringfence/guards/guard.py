@@ -115,6 +115,7 @@ class Guard(eqx.Module):
     def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins (B,) or (B, N) to a plan."""
         o = self.options
+        proposals = self.world.spec.own(proposals)
         if o.refine:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.foreseen(present, proposals)
@@ -185,6 +186,7 @@ class Guard(eqx.Module):
         starts = starts.at[:, known.shape[1] :].add(noise)
         around = proposals[:, jnp.where(again < many, again, 0)]
         low, high = jnp.maximum(around - o.reach, -1.0), jnp.minimum(around + o.reach, 1.0)
+        low, high = self.world.spec.own(low), self.world.spec.own(high)
         return jnp.clip(starts, low, high), low, high
 
     def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
@@ -252,7 +254,7 @@ class Guard(eqx.Module):
     def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
         """`shielded`, of all teams at once."""
         alone, bound = self.world.alone, self.options.bound
-        low, high = jnp.maximum(plan - bound, -1.0), jnp.minimum(plan + bound, 1.0)
+        low, high = map(self.world.spec.own, (jnp.maximum(plan - bound, -1.0), jnp.minimum(plan + bound, 1.0)))
 
         def shortfall(plan: Array) -> Array:
             return self._shortfall(present, plan, margin)

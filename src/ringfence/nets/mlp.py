@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ringfence.types import Array, Key
+from ringfence.types import Array, Key, Spec
 
 
 class MLP(eqx.Module):
@@ -15,11 +15,20 @@ class MLP(eqx.Module):
     weights: list[Array]  # (G, F_in, F_out)
     biases: list[Array]  # (G, F_out)
     linear: Array | None  # (G, F_in, F_out) added to the output: what is linear need not be learned by ReLUs
+    spec: Spec | None = eqx.field(static=True)  # of networks whose outputs are actions
 
     def __init__(
-        self, key: Key, sizes: tuple[int, ...], groups: int = 1, final_scale: float = 1.0, linear: bool = False
+        self,
+        key: Key,
+        sizes: tuple[int, ...],
+        groups: int = 1,
+        final_scale: float = 1.0,
+        linear: bool = False,
+        acts: Spec | None = None,
     ):
-        """`sizes` = (in, hidden, ..., out); He initialisation, the last layer scaled by `final_scale`."""
+        """`sizes` = (in, hidden, ..., out); He initialisation, the last layer scaled by `final_scale`. Outputs that
+        are entries of actions of `acts` are 0 where an agent has none."""
+        self.spec = None if acts is None or acts.action_sizes is None else acts
         self.linear = jnp.zeros((groups, sizes[0], sizes[-1])) if linear else None
         self.weights, self.biases = [], []
         keys = jax.random.split(key, len(sizes) - 1)
@@ -30,6 +39,11 @@ class MLP(eqx.Module):
             self.biases.append(jnp.zeros((groups, fan_out)))
 
     def __call__(self, x: Array) -> Array:
+        """(..., N, F_out)"""
+        out = self._told(x)
+        return out if self.spec is None else self.spec.own(out)
+
+    def _told(self, x: Array) -> Array:
         shape, groups = x.shape, self.weights[0].shape[0]
         if groups == 1:
             x = first = x.reshape(-1, shape[-1])

@@ -411,7 +411,7 @@ def save(
 ) -> Path:
     """Write one file, whole or not at all: arrays, as `kept` makes them, and the card as its metadata."""
     path = Path(path)
-    about = {"map": features.to_dict(world.map), "spec": dataclasses.asdict(world.spec), "card": world.card.told}
+    about = {"map": features.to_dict(world.map), "spec": world.spec.told(), "card": world.card.told}
     with whole(path) as temporary:
         arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
         save_file(arrays, temporary, {"ringfence_world": json.dumps(about)})
@@ -428,7 +428,7 @@ def load(
             about = schemas.decode((f.metadata() or {})["ringfence_world"], schemas.World)
         told = about["card"]
         settings = build_config(Settings, told["settings"], "the World")
-        spec = Spec(**{**about["spec"], "feature_names": tuple(about["spec"]["feature_names"])})
+        spec = Spec.of(about["spec"])
         map = map_of(spec.task, settings.view, told["data"]["hazard"]) or features.from_dict(about["map"])
         map = features.alone(map) if settings.sight == "own" else map
         if map.names != spec.feature_names:
