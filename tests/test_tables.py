@@ -357,3 +357,28 @@ def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
     assert (store.n_agents, store.lengths.tolist()) == (2, [20, 20, 19]) and (store.costs == 1).all()
     np.testing.assert_allclose(entry(store, "own.vx"), 0.5, atol=1e-6)
     np.testing.assert_allclose(entry(store, "other0.dy")[:, 0], 1.0, atol=1e-6)
+
+
+def test_files_with_flipped_and_missing_bytes_are_refused_in_a_sentence_or_read(tmp_path):
+    """CSV and Parquet alike: nothing but a `UserError` comes of them."""
+    import pyarrow as pa
+    from pyarrow import csv
+    from pyarrow import parquet as pq
+
+    rows = pa.table({k: np.asarray(v) for k, v in fleet(agents=2, steps=6).items()})
+    pq.write_table(rows, tmp_path / "a.parquet")
+    csv.write_csv(rows, tmp_path / "a.csv")
+    rng = np.random.default_rng(0)
+    for file in (tmp_path / "a.csv", tmp_path / "a.parquet"):
+        whole, refused = file.read_bytes(), 0
+        for k in range(60):
+            data = bytearray(whole)
+            for at in rng.integers(len(data), size=3):
+                data[at] ^= 1 << rng.integers(8)
+            damaged = tmp_path / f"b{file.suffix}"
+            damaged.write_bytes(data[: rng.integers(len(data))] if k % 3 == 0 else data)
+            try:
+                from_table(damaged, **NAMES)
+            except UserError:
+                refused += 1
+        assert refused > 20

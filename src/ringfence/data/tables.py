@@ -392,8 +392,19 @@ def _words(read: dict[str, np.ndarray], name: str) -> np.ndarray:
     if column.dtype.kind == "O":
         if missing := [k for k, x in enumerate(column) if x is None or x != x]:
             raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
-        return column.astype(str)
+        other = next((k for k, x in enumerate(column) if isinstance(x, bytes) and not _is_text(x)), None)
+        if other is not None:
+            raise StoreError(f"row {other}: {name} is {column[other][:40]!r}, no text in UTF-8; write it anew in that.")
+        return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in column])
     return column
+
+
+def _is_text(x: bytes) -> bool:
+    try:
+        x.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
 
 
 def _check_units(values, rows: _Rows, position: list[str], speed: list[str], fastest: float, notes: list[str]) -> None:
