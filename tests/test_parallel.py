@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import html
+import shutil
 
 import numpy as np
 import pytest
 
-from ringfence import evaluate, play, training
+from ringfence import cli, evaluate, guard, play, training
 from ringfence.envs import SimpleSpread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
+from ringfence.runs import Run
 
 TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -187,3 +190,44 @@ def test_agents_have_names_of_their_own(run):
 
     with pytest.raises(UserError, match="names an agent twice"):
         play(run, Twins, episodes=1)
+
+
+def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypatch, capsys):
+    """On either split, with what played, and where; the report names the command that does it again."""
+    (tmp_path / "theirs.py").write_text("from ringfence.envs.pettingzoo import SimpleSpreadParallel as Theirs\n")
+    folder = shutil.copytree(run.path, tmp_path / "mine" / "bc" / "seed-0")
+    monkeypatch.chdir(tmp_path)
+    for split in ("test", "validation"):
+        cli.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
+    assert "violations/" in capsys.readouterr().out
+    told = Run(folder).results
+    assert [*told] == ["default", "default@validation"]
+    assert told["default"]["simulator"] == "theirs.py:Theirs" and told["default"]["guard"] == "none"
+    again = play(folder, SimpleSpreadParallel, episodes=2)
+    assert again["per_episode"] == told["default"]["per_episode"]
+    assert told["default@validation"]["per_episode"] != told["default"]["per_episode"]
+    cli.main(["report", str(folder), "--out", "page.html"])
+    assert f"play {folder} --env theirs.py:Theirs --episodes 2" in html.unescape((tmp_path / "page.html").read_text())
+    for env, said in (
+        ("theirs.py", "names no simulator"),
+        ("other.py:Theirs", "'other.py' is no file"),
+        ("theirs.py:Mine", "has no Mine that can be called"),
+        ("nothing_like_it:Mine", "cannot be imported"),
+    ):
+        with pytest.raises(SystemExit):
+            cli.main(["play", str(folder), "--env", env])
+        assert said in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["eval", str(folder)])
+    assert "--env FILE.py:NAME" in capsys.readouterr().err
+
+
+def test_anybodys_function_under_guard_is_played(small_world):
+    """With what the guard could not do; there is no run to keep results in."""
+    still = guard(lambda seen, state: np.zeros((3, 2)), small_world, rows=1, shield=1)
+    told = play(still, SimpleSpreadParallel, episodes=2)
+    assert told["episodes"] == 2 and 0 <= told["infeasible"] <= 1 and 0 <= told["strange"] <= 1
+    with pytest.raises(UserError, match="a function under guard has none"):
+        play(still, SimpleSpreadParallel, episodes=2, keep=True)
+    with pytest.raises(UserError, match="rows was said to ringfence.guard"):
+        play(still, SimpleSpreadParallel, episodes=2, rows=3)

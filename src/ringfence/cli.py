@@ -214,11 +214,72 @@ def evaluate(
             f"{r['cost_norm']:.3f}",
             f"{100 * r['termination_rate']:.0f} %",
         )
+    _told(table, refused, len(found))
+
+
+def play(
+    runs: Positional[list[Path]],
+    env: str,
+    episodes: int = 100,
+    split: Literal["test", "validation"] = "test",
+    at_once: int = 16,
+    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
+    danger: Literal["learned", "formula", "both"] | None = None,
+    sight: Literal["all", "own"] | None = None,
+    agents: int | None = None,
+    world: Path | None = None,
+    planner: Literal["plain", "climbing", "steady"] = "plain",
+    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
+) -> None:
+    """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports.
+
+    Args:
+        runs: run folders, or folders that hold some.
+        env: what makes the simulator, as FILE.py:NAME or MODULE:NAME, e.g. examples/yard.py:Yard. It is run.
+        episodes: a bound of 1 % takes 300 without an accident.
+        split: test resets, or validation resets for choosing settings.
+        at_once: simulators that are stepped side by side.
+        guard: as in `ringfence eval`, as are all that follow.
+        danger: how the guard knows it: learned, formula or both.
+        sight: all or own.
+        agents: who play, where they are alike.
+        world: a file of `ringfence fit --out`, needed for a guard of data of your own.
+        planner: plain, climbing or steady.
+        set: any other option of planner or guard, e.g. --set rows=7 future=true.
+    """
+    from ringfence.parallel import play as run_play
+    from ringfence.parallel import simulator
+
+    given = _options(_assignments(set), {})
+    if not runs:
+        raise UserError("No run was given; name run folders that `ringfence train` made.")
+    found, make = _runs(runs), simulator(env)
+    table, refused = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible"), {}
+    told = dict(episodes=episodes, split=split, at_once=at_once, planner=planner, guard=guard, sight=sight)
+    for run in found:
+        try:
+            r = run_play(run, make, keep=True, quiet=False, danger=danger, world=world, agents=agents, **told, **given)
+        except UserError as error:
+            refused.setdefault(str(error), []).append(run)
+            continue
+        table.add_row(
+            terminal(run.path),
+            r["guard"],
+            f"{r['return_mean']:.4g} ({r['return_interval'][0]:.4g} to {r['return_interval'][1]:.4g})",
+            f"{r['cost_mean']:.3f}",
+            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
+            f"{100 * r['infeasible']:.2g} %" if "infeasible" in r else "",
+        )
+    _told(table, refused, len(found))
+
+
+def _told(table: Table, refused: dict[str, list], many: int) -> None:
+    """What was measured, and what runs were refused for; the process ends where any was."""
     if table.row_count:
         out.print(table)
     for message, those in refused.items():
         unsaid = [str(run.path) for run in those if str(run.path) not in message]
-        _complain(", ".join(unsaid) + ": " * bool(unsaid) + message if len(found) > 1 else message)
+        _complain(", ".join(unsaid) + ": " * bool(unsaid) + message if many > 1 else message)
     if refused:
         sys.exit(2)
 
@@ -621,6 +682,7 @@ COMMANDS = {
     "fit": fit,
     "train": train,
     "eval": evaluate,
+    "play": play,
     "get": get,
     "export": export,
     "bench": bench,

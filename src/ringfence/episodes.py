@@ -49,7 +49,7 @@ class Episode:
             raise UserError(
                 f"{type(env).__name__} has {len(self.agents)} agents, the run was trained with {shape.agents}{remedy}."
             )
-        if shape.state and not hasattr(env, "state"):
+        if shape.state != 0 and not hasattr(env, "state"):
             raise UserError(
                 f"The run reads a global state, which {type(env).__name__} lacks; give it a state() method."
             )

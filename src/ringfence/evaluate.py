@@ -247,7 +247,10 @@ def evaluate_policy(
     """(summary, what was recorded) of a policy on a task's simulator. Robots are played by any object with `start` and
     `act` (types.Policy); Simple Spread, which runs inside JAX, by pytrees."""
     if task.env is None:
-        raise UserError(f"Task '{task.name}' exists only as data, so nothing can be evaluated; use a simulated task.")
+        raise UserError(
+            f"Task '{task.name}' exists only as data, so `ringfence eval` has nothing to play in; play in a simulator "
+            "of your own: `ringfence play RUN --env FILE.py:NAME`."
+        )
     episodes, record = whole_number("episodes", episodes, 1, 10**7), whole_number("record", record)
     record = min(record, episodes)
     begun = time.perf_counter()
@@ -267,7 +270,7 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
     fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """
-    job, policy, _ = _loaded(run, step, asked(planner, **options))
+    job, policy, _ = loaded(run, step, asked(planner, **options))
     return job, of_team(job, policy)
 
 
@@ -328,7 +331,7 @@ def asked(
     return found
 
 
-def _loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job, Policy, int]:
+def loaded(run: Run | str, step: int | None, how: Asked) -> tuple[training.Job, Policy, int]:
     """(job, policy, step of the checkpoint); of agents who are alike, the policy of each."""
     run = Run.of(run)
     job = load_job(run, how.agents)
@@ -500,24 +503,29 @@ def evaluate(
     run, how = Run.of(run), asked(planner, **options)
     whole_number("episodes", episodes, 1, 10**7)
     whole_number("record", record)
-    job, policy, at = _loaded(run, step, how)
+    job, policy, at = loaded(run, step, how)
     _ = run.results, writable(run.path / "results.json")  # what cannot be kept is refused before anything is played
     if step is None and at < job.config.steps:
         print(f"'{run.path}' is at step {at} of {job.config.steps}; its training is unfinished.", file=sys.stderr)
-    told = run.config
-    inner = policy.proposal if isinstance(policy, Guarded) else policy
-    plans, guards = isinstance(inner, Planner), _guard_of(policy)
     variant = variant_name(job, policy, how, split)
     variant += "" if step is None else f"@step{step}"
-    seed = told["seed"]
+    seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
     result, played = evaluate_policy(of_team(job, policy), job.task, episodes, split, seed, record, label, quiet)
-    result |= {
+    result |= {"variant": variant, "step": at} | about(run, job, policy, how)
+    run.add_result(variant, result)
+    recordings.write(run.path, variant, played, record)
+    return result
+
+
+def about(run: Run, job: training.Job, policy: Policy, how: Asked) -> dict:
+    """What a result says of who played: algorithm, planner, guard, with all their options."""
+    inner, guards = policy.proposal if isinstance(policy, Guarded) else policy, _guard_of(policy)
+    plans = isinstance(inner, Planner)
+    return {
         "algorithm": job.algorithm.name,
-        "variant": variant,
-        "step": at,
-        "provenance": told["data"]["provenance"],
-        "planner": planner if plans else "plain",
+        "provenance": run.config["data"]["provenance"],
+        "planner": how.planner if plans else "plain",
         "options": dataclasses.asdict(inner.options) if plans else {},
         "guard": how.guard if guards else "none",
         "danger": how.danger if guards else "none",
@@ -527,9 +535,6 @@ def evaluate(
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),
     }
-    run.add_result(variant, result)
-    recordings.write(run.path, variant, played, record)
-    return result
 
 
 def _parameters(policy: Policy) -> int:

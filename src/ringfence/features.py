@@ -45,6 +45,10 @@ class FeatureMap:
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
 
+    @property
+    def reads_state(self) -> bool:
+        return self.source == "state"
+
     def __call__(self, observations: Array, state: Array | None) -> Array:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
         taken = self.minus >= 0
@@ -325,6 +329,10 @@ def _same(a: np.ndarray, b: np.ndarray, rows: int = 10_000) -> bool:
 @dataclass(frozen=True, eq=False)
 class _Joint(FeatureMap):
     """Features read from each agent's observation with the global state appended to it."""
+
+    @property
+    def reads_state(self) -> bool:
+        return True
 
     def __call__(self, observations: Array, state: Array | None) -> Array:
         if state is None:

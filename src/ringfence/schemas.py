@@ -143,6 +143,7 @@ class Result(TypedDict, total=False):
     plan_ms_p50: float | None
     plan_ms_p99: float | None
     parameters: int | None
+    simulator: str  # of anybody's, that `play` played in
     data: dict[str, Any]
 
 

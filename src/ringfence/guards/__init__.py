@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from ringfence.guards.danger import DANGERS, Danger
 from ringfence.guards.guard import GUARDS, Guard, GuardOptions
-from ringfence.guards.policy import Guarded, guard, options_of
+from ringfence.guards.policy import Guarded, Pilot, guard, options_of
 
-__all__ = ["DANGERS", "GUARDS", "Danger", "Guard", "GuardOptions", "Guarded", "guard", "options_of"]
+__all__ = ["DANGERS", "GUARDS", "Danger", "Guard", "GuardOptions", "Guarded", "Pilot", "guard", "options_of"]

@@ -298,8 +298,11 @@ def commands(section: Section, out: Path) -> list[str]:
             split = " --split validation" if row.split == "validation" else ""
             step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
             how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
-            evaluations.setdefault((how,), []).append(shell(run.path))
-    lines += [f"ringfence eval {' '.join(dict.fromkeys(paths))} {how}" for (how,), paths in evaluations.items()]
+            word = f"play --env {shell(result['simulator'])}" if result.get("simulator") else "eval"
+            evaluations.setdefault((word, how), []).append(shell(run.path))
+    for (word, how), paths in evaluations.items():
+        command, *env = word.split(" ", 1)
+        lines.append(" ".join(["ringfence", command, *dict.fromkeys(paths), *env, how]))
     roots = dict.fromkeys(shell(r.path.parent.parent) for r in section.runs)
     lines.append(f"ringfence report {' '.join(roots)} --out {shell(out)}")
     return lines

@@ -102,7 +102,10 @@ def _section(task: str, runs: list[Run]) -> Section:
     for run in runs:
         results[run.path] = run.results
         if not results[run.path]:
-            raise UserError(f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first.")
+            raise UserError(
+                f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first, or for a simulator "
+                f"of your own `ringfence play {run.path} --env FILE.py:NAME`."
+            )
     entries = [
         (run, _dated(name, r, run), {"variant": name, **r}) for run in runs for name, r in results[run.path].items()
     ]
