@@ -336,10 +336,10 @@ def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
     stepped = {**load_file(file), "step": np.array(-7, np.int32)}
     for wrong in (whole[: len(whole) // 2], bytes(flipped), stepped):
         save_file(wrong, file) if isinstance(wrong, dict) else file.write_bytes(wrong)
-        assert evaluate._loaded(run, None, evaluate.asked())[2] == before
+        assert evaluate.loaded(run, None, evaluate.asked())[2] == before
         assert "the one before is used" in capsys.readouterr().err
         with pytest.raises(CheckpointError, match="truncated or damaged.*train the run again"):
-            evaluate._loaded(run, 12, evaluate.asked())
+            evaluate.loaded(run, 12, evaluate.asked())
     file.write_bytes(whole)
     again = training.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))[0]
     assert again.checkpoints()[-1] == (12, file) and file.read_bytes() == whole
@@ -552,7 +552,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
         (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
         (["--set", "steps=3", "--set", "plans=2", "rows=x"], "rows='x' cannot be read as int"),
         (["--record", "-1"], "record=-1 must be a whole number"),
-        (["--step", "3"], "no checkpoint of step 3; take one of: 10, 12"),
+        (["--step", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],
 )
 def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsys):

@@ -295,3 +295,25 @@ def test_pettingzoo_mistakes_are_named():
     env.reset(seed=0)
     with pytest.raises(UserError, match="agent_1"):
         env.step({"agent_0": np.zeros(2)})
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_mpe2s_own_is_played_with_our_actions_and_state():
+    """Its steps are ours with its integrator and rewards, which `test_position_first_equals_mpe2` holds to 1e-12."""
+    pytest.importorskip("mpe2")
+    from ringfence.envs.mpe2 import Spread
+
+    other, env = Spread(), SimpleSpread(integrator="position_first", reward="pettingzoo")
+    seen, _ = other.reset(seed=3)
+    rng = np.random.default_rng(0)
+    costs = []
+    while other.agents:
+        ours = env.from_global_state(jnp.asarray(other.state())[None])
+        np.testing.assert_allclose(np.stack([*seen.values()]), env.observe(ours)[0], atol=1e-5)
+        push = rng.uniform(-1.5, 1.5, (3, 2)).astype(np.float32)
+        after, told = env.step(ours, jnp.asarray(push)[None])
+        seen, reward, terminated, truncated, infos = other.step(dict(zip(other.agents, push)))
+        np.testing.assert_allclose(other.state(), env.global_state(after)[0], atol=1e-4)
+        np.testing.assert_allclose([*reward.values()], told.reward[0], atol=1e-4)
+        costs.append([infos["agent_0"]["cost"], float(told.cost[0])])
+    assert len(costs) == 25 and all(a == b for a, b in costs) and all(truncated.values())

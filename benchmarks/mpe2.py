@@ -1,0 +1,93 @@
+"""Policies of this package in MPE2's own `simple_spread_v3`, which nobody here wrote and whose bodies move by other
+rules than the data's; and logs recorded there, learned and guarded like anybody's own.
+
+    pip install mpe2
+    python benchmarks/mpe2.py                 # writes results/mpe2.csv and docs/evaluation.md's table; ten minutes
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import warnings
+from pathlib import Path
+
+import numpy as np
+from _rows import write
+from readme import put
+
+import ringfence
+from ringfence import zoo
+from ringfence.envs import SimpleSpread
+from ringfence.envs.mpe2 import Spread
+from ringfence.envs.pettingzoo import SimpleSpreadParallel
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "mpe2.csv"
+EPISODES, LOGGED = 200, 2000
+NAMES = SimpleSpread().feature_map("decentralized").names
+PLACES = {
+    "mpe2": Spread,
+    "ours, its rules": lambda: SimpleSpreadParallel(integrator="position_first", reward="pettingzoo"),
+    "ours, the data's rules": lambda: SimpleSpreadParallel(reward="pettingzoo"),
+}
+
+
+def main() -> None:
+    logging.disable(logging.WARNING)
+    warnings.simplefilter("ignore")
+    rows: list[dict] = []
+    with tempfile.TemporaryDirectory() as there:
+        for name in ("simple_spread-expert/bc", "simple_spread-expert/icbf"):
+            run = zoo.get(name, there)
+            for place, make in PLACES.items():
+                for how in ({}, {"guard": "shield"}):
+                    told = ringfence.play(run, make, episodes=EPISODES, at_once=100, **how)
+                    rows.append(row(name, "OMAR's rules", place, told))
+        pilot = ringfence.Controller(zoo.get("simple_spread-expert/bc", there))
+        rng = np.random.default_rng(0)
+        unsure = lambda seen, state: np.clip(pilot.act(seen, state) + 0.5 * rng.normal(size=(3, 2)), -1, 1)  # noqa: E731
+        card = {"task": "mpe2-spread", "observation_names": [*NAMES, *(f"silence{k}" for k in range(4))]}
+        store = ringfence.record(Spread, unsure, episodes=LOGGED, card=card)
+        world = ringfence.fit(store)
+        run = ringfence.train("bc", store, out=there, quiet=True)[0]
+        for how in ({}, {"guard": "shield", "world": world}):
+            told = ringfence.play(run, Spread, episodes=EPISODES, at_once=100, **how)
+            rows.append(row("bc, learned of logs recorded there", "mpe2", "mpe2", told))
+    write(OUT, rows)
+    put("docs/evaluation.md", "mpe2", table(rows))
+
+
+def row(policy: str, logs: str, place: str, told: dict) -> dict:
+    found = {
+        "policy": policy,
+        "logs": logs,
+        "place": place,
+        "guard": told["guard"],
+        "episodes": told["episodes"],
+        "return": round(told["return_mean"], 3),
+        "low": round(told["return_interval"][0], 3),
+        "high": round(told["return_interval"][1], 3),
+        "cost": round(told["cost_mean"], 4),
+        "avoidable_cost": round(told["avoidable_cost"], 4),
+        "violation_rate": round(told["violation_rate"], 4),
+        "infeasible": round(told.get("infeasible", 0.0), 4),
+    }
+    print(found, flush=True)
+    return found
+
+
+def table(rows: list[dict]) -> str:
+    lines = [
+        "| policy | played in | guard | return | steps with contact | episodes with contact |",
+        "|---|---|---|---|---|---|",
+    ]
+    for r in rows:
+        lines.append(
+            f"| {r['policy']} | {r['place']} | {r['guard']} | {float(r['return']):.1f} | {float(r['cost']):.2f} | "
+            f"{100 * float(r['violation_rate']):.1f} % |"
+        )
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
