@@ -9,10 +9,12 @@ from importlib.metadata import version
 
 # The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give.
 # Set before JAX starts; whoever sets XLA_FLAGS himself, even to nothing, tests with those.
-FLAGS = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-if version("jaxlib").startswith("0.10."):  # one that does not know a flag ends at once
-    FLAGS += " --xla_cpu_use_fusion_emitters=false"
-os.environ.setdefault("XLA_FLAGS", FLAGS)
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    # one that does not know a flag ends at once
+    + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
+)
 
 # Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("JAX_COMPILATION_CACHE_DIR") or tempfile.mkdtemp(
