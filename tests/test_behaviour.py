@@ -144,7 +144,7 @@ def test_collect_is_deterministic_and_consistent():
         assert a[name].dtype == np.float32
     again = resimulate(ENV, ENV.from_global_state(jnp.asarray(a["state"][:, 0])), a["actions"], batch=32)
     for name in a:
-        np.testing.assert_allclose(a[name], again[name], atol=1e-4)
+        np.testing.assert_allclose(a[name], again[name], rtol=2e-5, atol=1e-4)
     other = collect(ENV, shipped_policy("expert"), 70, jax.random.key(4), batch=32)
     assert not np.array_equal(a["state"][:, 0], other["state"][:, 0])
     assert len(np.unique(a["state"][:, 0], axis=0)) == 70  # chunks do not repeat one another

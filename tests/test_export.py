@@ -126,7 +126,7 @@ def test_a_shield(run, small_store, small_world, tmp_path, capsys):
     assert [x["name"] for x in told["inputs"]] == ["observations", "state"] and not told["initial"]
     assert told["variant"].startswith("default+shield-learned") and told["guard_options"]["margin"] == 4.0
     steps = played(run, small_store, world=small_world, **SHIELD)
-    assert apart(call, told, steps) <= 1e-5
+    assert apart(call, told, steps) <= 2e-5  # corrections add up what rounding does (docs/export.md)
     assert any(expected["info.infeasible"] for _, expected in steps), "there was something to correct"
 
 
@@ -259,7 +259,7 @@ def test_the_node_plays_the_file(run, small_store, small_world, tmp_path):
             seen, state = small_store.observations[episode * 26 + t], small_store.state[episode * 26 + t]
             cost = (None, 1.0, 1.0)[t]
             told = np.nan if cost is None else cost
-            np.testing.assert_allclose(pilot.act(seen, state, told), controller.act(seen, state, cost), atol=1e-5)
+            np.testing.assert_allclose(pilot.act(seen, state, told), controller.act(seen, state, cost), atol=2e-5)
             assert pilot.info["infeasible"] == controller.info["infeasible"]
     place, speed, goal = (np.arange(4.0).reshape(2, 2) + k for k in (0, 10, 100))
     names = ["own.x", "own.vy", "goal.dx", "other0.dx", "other0.dvy", "other0.y"]

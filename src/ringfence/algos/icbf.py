@@ -6,7 +6,7 @@ Losses, each with the paper's symbol:
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
-the planner is MADIFF's to the bit.
+the planner is MADIFF's.
 """
 
 from __future__ import annotations
