@@ -34,8 +34,8 @@ class Pilot:
         fill = lambda x, value: np.broadcast_to(np.asarray(value, x["dtype"]), x["shape"]).copy()  # noqa: E731
         self.memory = {name: fill(inputs[name], value) for name, value in self.told["initial"].items()}
 
-    def act(self, observations, state=None, cost: float = np.nan) -> np.ndarray:
-        """(N, A) from (N, O), (S,) and what the last step cost, where anybody knows."""
+    def act(self, observations, state=None, cost: float | np.ndarray = np.nan) -> np.ndarray:
+        """(N, A) from (N, O), (S,) and what the last step cost, in all or of each named constraint, where anybody knows."""
         given = {"observations": observations, "state": state, "cost": cost, **self.memory}
         draw = lambda x: self.rng.standard_normal(x["shape"])  # noqa: E731
         feed = {

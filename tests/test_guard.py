@@ -41,7 +41,7 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
     for name, margin in (("easy", -90.0), ("hard", 4.0)):
         guard = make(small_world, bound, shield=8)
         found[name] = eqx.filter_jit(guard.decide)(
-            present, plan[:, None], last, jnp.full(64, margin), jax.random.key(0)
+            present, plan[:, None], last, jnp.full((64, 1), margin), jax.random.key(0)
         )
     np.testing.assert_array_equal(found["easy"].plan, plan)
     assert not found["easy"].short.any()
@@ -55,11 +55,11 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
 def test_the_shield_never_makes_it_worse(small_world, bound, present):
     guard = make(small_world, bound, shield=3)
     plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-1, maxval=1)
-    margin = jnp.full(64, 3.0)
+    margin = jnp.full((64, 1), 3.0)
 
     def missing(plan):
         rows, spread = guard.foreseen(present, plan[:, None])
-        return guard.missing(present, guard.danger.along(rows, spread)[:, 0], margin).sum((1, 2))
+        return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin).sum((1, 2))
 
     assert (missing(eqx.filter_jit(guard.shielded)(present, plan, margin)) >= missing(plan) - 1e-5).all()
 
@@ -68,7 +68,7 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
     """Those who need it, a few at a time; their number is no multiple of anything."""
     guard = make(small_world, bound, shield=4)
     plan = jax.random.uniform(jax.random.key(6), (45, 3, 3, 2), minval=-1, maxval=1)
-    margin = jnp.linspace(-1.0, 3.0, 45)
+    margin = jnp.linspace(-1.0, 3.0, 45)[:, None]
     several = eqx.filter_jit(guard.shielded)(present[:45], plan, margin)
     few = eqx.filter_jit(guard.shielded)
     each = [few(present[k : k + 9], plan[k : k + 9], margin[k : k + 9]) for k in range(0, 45, 9)]
@@ -81,7 +81,7 @@ def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, refine=10, starts=4, care=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
     worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
-    better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros(64))
+    better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros((64, 1)))
     assert (worth(better) > worth(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts = guard.started(plan, last, jax.random.key(0))[0]
@@ -96,7 +96,7 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
     plan = jnp.stack([jnp.full((64, 3, 3, 2), v) for v in (0.0, 0.95)], 1)
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts, low, high = guard.started(plan, last, jax.random.key(0))
-    better = eqx.filter_jit(guard.refined)(present, starts, low, high, jnp.zeros(64))
+    better = eqx.filter_jit(guard.refined)(present, starts, low, high, jnp.zeros((64, 1)))
     for found in (starts, better):
         near = [jnp.abs(found - plan[:, k : k + 1]).max((2, 3, 4)) <= 0.1 + 1e-6 for k in range(2)]
         np.testing.assert_array_equal(jnp.argmax(jnp.stack(near), 0)[0], [0, 1, 0, 0, 1, 0])
@@ -127,10 +127,10 @@ def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
     guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(shield=10, bound=0.1))
     plan = jnp.full((64, 3, 3, 2), 0.95)
-    kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full(64, 9.0))
+    kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full((64, 1), 9.0))
     moved = jnp.abs(kept - plan)
     assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
-    far = make(small_world, bound, shield=10).shielded(present, plan, jnp.full(64, 9.0))
+    far = make(small_world, bound, shield=10).shielded(present, plan, jnp.full((64, 1), 9.0))
     assert jnp.abs(far - plan).max() > 0.2
 
 
@@ -147,7 +147,7 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     bound = hazards.bind(hazards.Separation(), world.spec.feature_names, 3)
     guard = make(world, bound, shield=4, refine=3, starts=3, select=True)
     plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
-    last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3)), jax.random.key(0)
+    last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3, 1)), jax.random.key(0)
     here = world.map(seen, None)
     decide = eqx.filter_jit(guard.decide)
     a = decide(here, plan, last, margin, key)
@@ -183,7 +183,7 @@ def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
     memory, _ = policy.act(policy.hear(memory, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
     o = policy.guard.options
     expected = 0.6 + o.adapt * (np.array([0.0, 1.0]) - o.rate)
-    np.testing.assert_allclose(memory["margin"], expected, rtol=1e-5)
+    np.testing.assert_allclose(memory["margin"][:, 0], expected, rtol=1e-5)
 
 
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):

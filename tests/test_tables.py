@@ -78,7 +78,7 @@ def test_uneven_times_are_put_on_one_clock():
     run, who = np.zeros(sum(sizes), int), np.repeat([0, 1], sizes)
     time, state = np.concatenate(clocks), rng.normal(size=(sum(sizes), 2))
     action, reward, cost = (rng.normal(size=(sum(sizes), k)) for k in (3, 1, 1))
-    got = resample(run, who, time, state, action, reward[:, 0], cost[:, 0], 0.25, 10.0)
+    got = resample(run, who, time, state, action, reward[:, 0], cost, 0.25, 10.0)
     seen, late = 0, 0.499 * min(0.25, np.median(np.concatenate([np.diff(c) for c in clocks])))
     for agent in (0, 1):
         mine = np.flatnonzero(who == agent)
@@ -105,7 +105,7 @@ def test_agents_that_come_and_go_make_windows_of_constant_membership():
     order = np.lexsort((t, who, run))
     run, t, who = run[order], t[order], who[order]
     zeros = np.zeros(len(t))
-    tracks = resample(run, who, t * 0.5, np.stack([t, who], 1), zeros[:, None], zeros, zeros, 0.5, 0.75)
+    tracks = resample(run, who, t * 0.5, np.stack([t, who], 1), zeros[:, None], zeros, zeros[:, None], 0.5, 0.75)
     rows, many, size = teams(tracks, 3)
     expected = set()
     for e in range(3):
@@ -145,7 +145,7 @@ def test_neighbours_are_those_who_are_nearest_at_that_time():
     order = np.lexsort((t, who, run))
     run, t, who = run[order], t[order], who[order]
     place, zeros = rng.uniform(-2, 2, (len(t), 2)), np.zeros(len(t))
-    tracks = resample(run, who, t * 1.0, place, zeros[:, None], zeros, zeros, 1.0, 100.0)
+    tracks = resample(run, who, t * 1.0, place, zeros[:, None], zeros, zeros[:, None], 1.0, 100.0)
     got = nearest(tracks, tracks.state, 3, 2.0)
     for row in range(len(tracks.step)):
         same = (tracks.recording == tracks.recording[row]) & (tracks.step == tracks.step[row])

@@ -51,7 +51,8 @@ def import_table(
     episode: str | None = None,
     action: list[str] = [],  # noqa: B006
     reward: str | None = None,
-    cost: str | None = None,
+    cost: list[str] = [],  # noqa: B006
+    limits: list[float] = [],  # noqa: B006
     goal: list[str] = [],  # noqa: B006
     layout: Literal["highd", "interaction"] | None = None,
     separation: float | None = None,
@@ -76,7 +77,8 @@ def import_table(
         episode: column that tells recordings apart.
         action: columns of what it was told to do until its next row; accelerations by default.
         reward: column of what it earned since its row before; progress to the goal by default, or nothing.
-        cost: column of danger since its row before, 0 or above.
+        cost: column of danger since its row before, 0 or above; several are constraints of these names.
+        limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
         goal: columns of where it is to go, as many as its position has.
         layout: names of columns of a published format, instead of the options above.
         separation: m between two agents' centres below which a step costs 1, where no column tells.
@@ -94,12 +96,15 @@ def import_table(
     from ringfence.hazards import Separation
 
     kept = writable(out_file)
+    if limits and len(limits) != len(cost):
+        raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
+    bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
     told = {
         "danger": None if separation is None else Separation(separation, separation / 4),
         **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
         "fastest": fastest,
         "cost": cost,
-        "card": {"task": task or kept.stem, "provenance": f"table {file.name}"},
+        "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **bounds},
     }
     if layout is not None:
         if state or action or reward or goal or episode:

@@ -31,12 +31,15 @@ class Each(eqx.Module):
         memory, step = self.one.act(memory, apart(observations), None, key)
         return memory, together(step, observations.shape[:2])
 
-    def hear(self, memory: PyTree, cost: Array) -> PyTree:
-        """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's."""
+    def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+        """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
         if not hasattr(self.one, "hear"):
             return memory
-        each = cost if cost.ndim == 2 else jnp.repeat(cost[:, None], self.agents, 1)
-        return self.one.hear(memory, each.reshape(-1))
+
+        def each(cost: Array) -> Array:
+            return (cost if cost.ndim == 2 else jnp.repeat(cost[:, None], self.agents, 1)).reshape(-1)
+
+        return self.one.hear(memory, {k: each(c) for k, c in cost.items()} if isinstance(cost, dict) else each(cost))
 
 
 def together(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 
-Cost = Callable[[dict[str, dict]], float]
+Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class Episode:
     """An episode under way: what its agents see, and what they have earned and cost.
 
     `seen` (N, O) and `state` (S,) or None are of now, or of the step before if the end was not shown; `rewards` holds
-    (N,) of every step and `costs` a float, or (N,) where each agent is told its own.
+    (N,) of every step, `costs` a float, or (N,) where each agent is told its own, and `constraints` a dictionary of
+    these by the constraint's name, where the simulator tells costs by name.
     """
 
     def __init__(self, env: Any, shape: Shape, seed: int, longest: int):
@@ -55,6 +56,7 @@ class Episode:
             )
         self.rewards: list[np.ndarray] = []
         self.costs: list[float | np.ndarray] = []
+        self.constraints: list[dict[str, float | np.ndarray]] = []
         self.terminated = self.unsafe_start = False
         self.running = self.showed_end = True
         begun = env.reset(seed=seed)
@@ -113,16 +115,48 @@ class Episode:
         name = type(self.env).__name__
         told_of = {a: i for a, i in infos.items() if isinstance(i, Mapping)}
         each = apart if apart is not None else {a: i["cost"] for a, i in told_of.items() if "cost" in i}
-        if cost is not None:
-            self.costs.append(_number(cost(infos), "cost", "cost="))
-        elif each and all(a in each for a in self.agents):
-            self.costs.append(np.array([_number(each[a], "cost", name) for a in self.agents]))
-        elif each:
-            self.costs.append(max(_number(c, "cost", name) for c in each.values()))
+        told = cost(infos) if cost is not None else self._of_all(each)
+        if told is None:
+            return
+        if isinstance(told, Mapping):
+            self.constraints.append({str(k): self._charged(c, name) for k, c in told.items()})
+            names, now = list(self.constraints[0]), list(self.constraints[-1])
+            if not names or now != names or len(self.constraints) < len(self.rewards):
+                raise UserError(
+                    f"Step {len(self.rewards)} of {name} tells costs of {', '.join(now) or 'nothing'}, the first one "
+                    f"of {', '.join(names) or 'nothing'}; name the same constraints at every step."
+                )
+            told = np.max(np.broadcast_arrays(*self.constraints[-1].values()), 0)
+        elif self.constraints:
+            raise UserError(f"Step {len(self.rewards)} of {name} tells one cost, those before several; name them all.")
+        self.costs.append(self._charged(told, "cost=" if cost is not None else name))
         if self.costs and np.min(self.costs[-1]) < 0:
             raise UserError(
                 f"Step {len(self.rewards)} has the cost {np.min(self.costs[-1]):g}; a cost is 0 or positive."
             )
+
+    def _of_all(self, each: Mapping) -> Any:
+        """What the agents' costs are together: each agent's own where all tell one, else the largest; by name where
+        they are told by name."""
+        if not each:
+            return None
+        if not any(isinstance(c, Mapping) for c in each.values()):
+            told = [_number(c, "cost", type(self.env).__name__) for c in each.values()]
+            if not all(a in each for a in self.agents):
+                return max(told)
+            return np.array([_number(each[a], "cost", type(self.env).__name__) for a in self.agents])
+        if not all(isinstance(c, Mapping) for c in each.values()):
+            raise UserError(
+                f"Step {len(self.rewards)} of {type(self.env).__name__} tells some agents' costs by name and others' "
+                "not; name them all."
+            )
+        names = list(dict.fromkeys(k for c in each.values() for k in c))
+        return {k: self._of_all({a: c[k] for a, c in each.items() if k in c}) for k in names}
+
+    def _charged(self, cost: Any, whose: str) -> float | np.ndarray:
+        if isinstance(cost, np.ndarray) and cost.shape == (len(self.agents),):
+            return cost
+        return _number(cost, "cost", whose)
 
     def _all_in(self, what: str, told: dict, step: int) -> None:
         lacking = [str(a) for a in self.agents if a not in told]

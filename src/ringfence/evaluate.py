@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -22,7 +23,7 @@ from ringfence.episodes import given_as
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.files import writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
-from ringfence.guards.policy import build
+from ringfence.guards.policy import build, costs_of_one
 from ringfence.hazards import BoundHazard
 from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
@@ -145,8 +146,8 @@ def _rollout_native(
     return kept | ({k: np.stack([i[k] for i in info], 1) for k in info[0]} if record and info else {})
 
 
-def heard(policy: Policy, memory: PyTree, cost: Array) -> PyTree:
-    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N)."""
+def heard(policy: Policy, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint."""
     return policy.hear(memory, cost) if hasattr(policy, "hear") else memory
 
 
@@ -376,10 +377,16 @@ class Controller:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._memory = self.policy.start(1)
 
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: float | None = None) -> np.ndarray:
-        """(N, A) joint action within the task's bounds; `cost` is what the last step cost, which an adapting guard
-        follows. Arrays of another shape than the run's are refused, and so is what is not finite: indices beyond an
-        array's end would be clipped in silence, and noise would follow NaN."""
+    def act(
+        self,
+        observations: np.ndarray,
+        state: np.ndarray | None = None,
+        cost: float | Mapping[str, float] | None = None,
+    ) -> np.ndarray:
+        """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
+        constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so
+        is what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow
+        NaN."""
         width, state_width = self.job.widths
         seen = given_as("observations", observations, (self.job.team, width))
         if state is not None and state_width == 0:
@@ -398,7 +405,7 @@ class Controller:
         self._key, key = jax.random.split(self._key)
         whole = None if whole is None else whole[None]
         if cost is not None:
-            self._memory = heard(self.policy, self._memory, np.full(1, cost, np.float32))
+            self._memory = heard(self.policy, self._memory, costs_of_one(cost))
         self._memory, step = self._act(self.policy, self._memory, seen[None], whole, key)
         self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
         return np.asarray(step.action[0])

@@ -103,6 +103,12 @@ def _inner(policy: Policy) -> Policy:
     return policy.one if isinstance(policy, Each) else policy
 
 
+def _constraints(policy: Policy) -> list[str]:
+    """The named ones that a guard's margins follow apart."""
+    inner = _inner(policy)
+    return list(inner.guard.danger.limits) if isinstance(inner, Guarded) else []
+
+
 def step_of(job: Job, policy: Policy) -> Step:
     """One joint action of a policy in one environment, without what nothing reads."""
     width, state_width = job.widths
@@ -114,13 +120,15 @@ def step_of(job: Job, policy: Policy) -> Step:
     given = {"observations": jax.ShapeDtypeStruct((job.team, width), jnp.float32)}
     if state_width:
         given["state"] = jax.ShapeDtypeStruct((state_width,), jnp.float32)
-    given["cost"] = jax.ShapeDtypeStruct((), jnp.float32)
+    constraints = _constraints(policy)
+    given["cost"] = jax.ShapeDtypeStruct((len(constraints),) if constraints else (), jnp.float32)
     leaves, shape = jax.tree.flatten(memory)
     named = [name for name, _ in named_leaves(memory)]
 
     def act(key: Key, seen: Sequence[Array], leaves: Sequence[Array]) -> tuple[dict[str, Array], list[Array]]:
         read = dict(zip(given, seen))
-        memory = heard(policy, jax.tree.unflatten(shape, leaves), read["cost"][None])
+        cost = {name: read["cost"][k : k + 1] for k, name in enumerate(constraints)} or read["cost"][None]
+        memory = heard(policy, jax.tree.unflatten(shape, leaves), cost)
         whole = read["state"][None] if state_width else None
         memory, step = policy.act(memory, read["observations"][None], whole, key)
         info = {f"info.{k}": step.info[k][0] for k in INFO if k in step.info and step.info[k].ndim == 1}
@@ -397,6 +405,7 @@ def facts(run: Run, job: Job, policy: Policy, made: Step, variant: str, danger: 
         "world": digest_of(sorted(named_arrays(inner.guard.world).items())) if guarded else None,
         "n_agents": job.team,
         "names": {k: list(x) for k, (x, n) in names.items() if x is not None and len(x) == n},
+        "constraints": _constraints(policy),
         "action_low": spec.action_low,
         "action_high": spec.action_high,
         "inputs": [dataclasses.asdict(x) for x in made.inputs],
@@ -499,9 +508,12 @@ def _packer():
 
 def _converter() -> tuple[Callable, Callable]:
     """What converts to ONNX, and what checks the result."""
+    as_it_was = jnp.cumsum  # which jax2onnx replaces for good, by one that takes no axis by its place
     try:
         from jax2onnx import to_onnx
         from onnx.checker import check_model
+
+        jnp.cumsum = as_it_was
     except ImportError:
         raise UserError("ONNX is written by jax2onnx, which is missing; run pip install 'ringfence[export]'.") from None
     return to_onnx, check_model

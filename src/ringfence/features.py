@@ -154,7 +154,7 @@ def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Call
         theirs = jnp.where(relative, start[..., rules[:, 1]] + start[..., mine], 0.0)  # their velocity, which they keep
         count = jnp.arange(1, steps + 1, dtype=x.dtype)[:, None, None]
         later = later.at[..., stays].set(start[..., stays])
-        later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, -3)))
+        later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, axis=-3)))
         if relative.any():
             later = later.at[..., rules[relative, 1]].set((theirs - own)[..., relative])
         return jnp.concatenate([start, later], -3)

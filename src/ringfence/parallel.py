@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ringfence import evaluate
+from ringfence import evaluate, stats
 from ringfence.each import look
 from ringfence.episodes import Cost, Episode, Shape
 from ringfence.errors import UserError, whole_number
@@ -36,6 +36,7 @@ class Player:
     longest: int  # logged episode
     unsafe: Callable[[np.ndarray, np.ndarray | None], np.ndarray] | None  # (B,) of what is seen, where a formula tells
     told: dict  # what a result says of it
+    limits: dict[str, float]  # per episode, of constraints that the data names
     run: Run | None = None
     variant: str = ""
 
@@ -66,7 +67,8 @@ def play(
     run's results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
-    agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); where there
+    agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs told as
+    a dictionary are those of constraints by name, and the result's `constraints` has each beside its limit. Where there
     are none, 1 if the run's hazard calls the state unsafe that the step leads to.
 
     The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
@@ -116,13 +118,15 @@ def play(
                         )
                     for episode, unsafe in zip(table, player.unsafe(*_seen(table))):
                         episode.charge(float(unsafe))
-                memory = evaluate.heard(policy, memory, np.array([np.max(e.costs[-1]) for e in table], np.float32))
+                memory = evaluate.heard(policy, memory, _last_costs(table))
             played += table
             for name, steps in here.items():
                 counts.setdefault(name, []).append(steps)
             bar.advance(len(table))
     together = _together(played) | {k: np.concatenate(v) for k, v in counts.items()}
     result = evaluate.summarise(together, player.task, np.array([e.unsafe_start for e in played]))
+    if played[0].constraints:
+        result["constraints"] = _of_constraints(played, player.limits)
     more = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.told
     if keep:
         about = {"split": split, "protocol": evaluate.PROTOCOL, "variant": player.variant}
@@ -180,6 +184,7 @@ def _trained(run: Run | str, planner: str, split: str, options: dict) -> Player:
         job.spec.episode_length,
         (lambda *seen: np.asarray(unsafe(*seen))) if job.hazard.has_formula else None,
         {"step": step} | evaluate.about(run, job, policy, how),
+        run.config["data"].get("constraints") or {},
         run,
         evaluate.variant_name(job, policy, how, split),
     )
@@ -194,7 +199,14 @@ def _pilot(pilot: Pilot, planner: str, options: dict) -> Player:
     task = Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high)
     shape = Shape(pilot.policy.agents, None, None if world.map.reads_state else 0, spec.alike)
     return Player(
-        "a function under guard", _OneByOne(pilot.policy), task, shape, spec.episode_length, None, {"guard": "own"}
+        "a function under guard",
+        _OneByOne(pilot.policy),
+        task,
+        shape,
+        spec.episode_length,
+        None,
+        {"guard": "own"},
+        world.limits,
     )
 
 
@@ -212,6 +224,30 @@ class _OneByOne:
 def _seen(table: list[Episode]) -> tuple[np.ndarray, np.ndarray | None]:
     """(B, N, O) and (B, S), or None without a state."""
     return np.stack([e.seen for e in table]), None if table[0].state is None else np.stack([e.state for e in table])
+
+
+def _last_costs(table: list[Episode]) -> np.ndarray | dict[str, np.ndarray]:
+    """(B,) what the last step of each cost, or that by constraint."""
+    if not table[0].constraints:
+        return np.array([np.max(e.costs[-1]) for e in table], np.float32)
+    names = table[0].constraints[0]
+    return {k: np.array([np.max(e.constraints[-1][k]) for e in table], np.float32) for k in names}
+
+
+def _of_constraints(played: list[Episode], limits: dict[str, float]) -> dict[str, dict]:
+    """Of each constraint: the team's cost per episode, its limit, and the share of episodes within it."""
+    found = {}
+    for name in played[0].constraints[0]:
+        costs = np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played])
+        found[name] = {
+            "cost_mean": float(costs.mean()),
+            "cost_interval": stats.bootstrap_mean(costs),
+            "violation_rate": float((costs > 0).mean()),
+            "violation_upper": stats.upper_bound(int((costs > 0).sum()), len(costs)),
+        }
+        if name in limits:
+            found[name] |= {"limit": limits[name], "within": float((costs <= limits[name]).mean())}
+    return found
 
 
 def _together(played: list[Episode]) -> dict[str, np.ndarray]:

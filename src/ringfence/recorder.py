@@ -37,7 +37,8 @@ def record(
     `policy` takes observations (N, O) and the state (S,), or None where the simulator tells none, and gives actions
     (N, A); what has `act` and `reset` (a `Controller`, a guarded callable) is reset with every episode. None draws
     actions uniformly within the action spaces' bounds. Episode k is reset with `seed` + k, and its draws follow from
-    that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0.
+    that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0. Told as a
+    dictionary they are those of constraints, whose limits per episode `card["constraints"]` tells (0 by default).
 
     With `out` a store's file is written every hundred episodes, and a recording of the same simulator, policy's name
     and seed goes on from there. `longest` steps without an end are refused. `card` adds fields to the store's.
@@ -95,12 +96,14 @@ def _played(env, shown: Shape, act, seed: int, cost, longest: int, low: float, h
             )
         seen.append(episode.seen)
         states.append(episode.state)
-    costs = [np.broadcast_to(c, len(episode.agents)) for c in episode.costs]
+    wide = lambda costs: np.stack([np.broadcast_to(c, len(episode.agents)) for c in costs])  # noqa: E731
+    names = episode.constraints[0] if episode.constraints else ()
     return {
         "observations": np.stack(seen),
         "actions": np.stack(acted),
         "rewards": np.stack(episode.rewards),
-        "costs": np.stack(costs),
+        "costs": wide(episode.costs),
+        "constraints": {k: wide([c[k] for c in episode.constraints]) for k in names},
         "each": any(np.ndim(c) for c in episode.costs),
         "state": None if states[0] is None else np.stack(states),
         "terminated": episode.terminated,
@@ -115,16 +118,24 @@ def _grown(done: EpisodeStore | None, made: list[dict], told: dict, bounds, env,
             f"{type(env).__name__} changes its agents or what they see between episodes; keep them the same."
         )
     lengths = np.array([len(m["actions"]) for m in made])
-    each = any(m["each"] for m in made) and not all((m["costs"] == m["costs"][:, :1]).all() for m in made)
+    told_of = [x for m in made for x in (m["costs"], *m["constraints"].values())]
+    each = any(m["each"] for m in made) and not all((x == x[:, :1]).all() for x in told_of)
     if done is not None:
         each = each or done.costs.ndim == 2
-    costs = np.concatenate([m["costs"] for m in made])
+    names = list(made[0]["constraints"])
+    if any(list(m["constraints"]) != names for m in made):
+        raise UserError(f"{type(env).__name__} names other constraints in some episodes; name the same ones in all.")
+
+    def charged(of: Callable[[dict], np.ndarray]) -> np.ndarray:
+        costs = np.concatenate([of(m) for m in made])
+        return costs if each else costs[:, 0]
+
     state = None if made[0]["state"] is None else [m["state"] for m in made]
     fresh = EpisodeStore.from_steps(
         np.concatenate([m["observations"][:-1] for m in made]),
         np.concatenate([m["actions"] for m in made]),
         np.concatenate([m["rewards"] for m in made]),
-        costs=costs if each else costs[:, 0],
+        costs={k: charged(lambda m, k=k: m["constraints"][k]) for k in names} or charged(lambda m: m["costs"]),
         episode_ends=np.cumsum(lengths),
         final_observations=np.stack([m["observations"][-1] for m in made]),
         state=None if state is None else np.concatenate([s[:-1] for s in state]),

@@ -97,6 +97,17 @@ class Constants(TypedDict):
     cost_offset: float
 
 
+class Constraint(TypedDict, total=False):
+    """What a named one cost per episode."""
+
+    cost_mean: float
+    cost_interval: Interval
+    violation_rate: Share
+    violation_upper: Share
+    limit: float
+    within: Share
+
+
 class Result(TypedDict, total=False):
     """A summary of episodes: an evaluation in results.json, or a reference row."""
 
@@ -145,6 +156,7 @@ class Result(TypedDict, total=False):
     parameters: int | None
     simulator: str  # of anybody's, that `play` played in
     data: dict[str, Any]
+    constraints: dict[str, Constraint]
 
 
 Results = dict[Variant, Result]

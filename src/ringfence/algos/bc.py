@@ -81,12 +81,14 @@ def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMa
 
 
 def within(store: EpisodeStore, config: Config) -> EpisodeStore:
-    """The episodes within the cost limit, where there is one; if they are too few to learn from, the cheapest
-    hundredth."""
+    """The episodes within the cost limit, where there is one, or within those of all constraints, where the limit is
+    the card's; if they are too few to learn from, the cheapest hundredth."""
     if config.cost_limit is None:
         return store
-    costs = store.episode_costs
-    return store.select(costs <= max(config.cost_limit, np.quantile(costs, 0.01, method="higher")))
+    over = store.episode_costs - config.cost_limit
+    if store.limits and config.cost_limit == store.card["cost_limit"]:
+        over = np.max([store.episode_costs_of(name) - limit for name, limit in store.limits.items()], 0)
+    return store.select(over <= max(0.0, np.quantile(over, 0.01, method="higher")))
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):

@@ -39,6 +39,7 @@ def audit(store: EpisodeStore) -> Audit:
         "hazard": str(s.hazard),
         "return": f"{returns.mean():.2f} ± {returns.std():.2f}, from {returns.min():.2f} to {returns.max():.2f}",
         "cost per episode": f"{costs.mean():.3f} ± {costs.std():.3f}, at most {costs.max():g}",
+        **{f"constraint {name}": _of_constraint(s, name) for name in s.limits},
         "steps with cost": f"{100 * rate:.2f} %",
         "episodes with cost": f"{100 * (costs > 0).mean():.2f} %",
         "actions": f"from {s.actions.min():.3f} to {s.actions.max():.3f}, bounds {card['action_low']:g} to "
@@ -93,6 +94,12 @@ def audit(store: EpisodeStore) -> Audit:
     if s.terminated.any() and not s.truncated.any() and np.ptp(lengths) == 0:
         warnings.append("All episodes terminate at the same length: these are probably time limits (truncated).")
     return Audit(facts, warnings, list(card.get("warnings", [])))
+
+
+def _of_constraint(store: EpisodeStore, name: str) -> str:
+    costs, limit = store.episode_costs_of(name), store.limits[name]
+    within = f"{100 * (costs <= limit).mean():.1f} % of episodes are within {limit:g}"
+    return f"{costs.mean():.3f} per episode, at most {costs.max():g}; {within}"
 
 
 def _labels(store: EpisodeStore, task: tasks.Task, rows: np.ndarray) -> np.ndarray | None:

@@ -5,6 +5,8 @@ Time runs along the first axis, episodes one after another. T is the number of s
     observations (T+E, N, O)   one more row than steps in every episode: the last state is kept
     state        (T+E, S)      global state, when known
     actions      (T, N, A)     rewards (T, N)     costs (T,) of the team, or (T, N) of each agent
+    constraints  (T, C)        or (T, N, C): the cost of each of several constraints, whose names and limits per episode
+                               the card's `constraints` tells; `costs` is then the largest of them
     speed        (T,)          m/s, of robots whose simulator told it: what another speed limit would count
     terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
     episode_ends (E,)          cumulative number of steps
@@ -27,13 +29,13 @@ import numpy as np
 
 from ringfence import hazards, schemas
 from ringfence.data import arrays
-from ringfence.errors import StoreError, UserError
+from ringfence.errors import StoreError, UserError, unknown
 from ringfence.files import whole
 from ringfence.trees import digest_of
 
 FORMAT = 1
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
-OPTIONAL = ("state", "speed")
+OPTIONAL = ("state", "speed", "constraints")
 PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
 
 
@@ -51,6 +53,7 @@ class EpisodeStore:
     state: np.ndarray | None = None
     card: dict = field(default_factory=dict)
     speed: np.ndarray | None = None
+    constraints: np.ndarray | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "card", complete_card(self.card))
@@ -97,7 +100,20 @@ class EpisodeStore:
     @property
     def team_costs(self) -> np.ndarray:
         """(T,) cost of every step: of agents with costs of their own, the largest one."""
-        return self.costs if self.costs.ndim == 1 else self.costs.max(1)
+        return team(self.costs)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limit per episode of each named constraint, in the order of `constraints`; empty where there are none."""
+        return self.card.get("constraints") or {}
+
+    def of_constraint(self, name: str) -> np.ndarray:
+        """(T,) or (T, N) cost of one constraint."""
+        return self.constraints[..., list(self.limits).index(name)]
+
+    def episode_costs_of(self, name: str) -> np.ndarray:
+        """(E,) undiscounted episode cost of the team, of one constraint."""
+        return self._per_episode(team(self.of_constraint(name)))
 
     def _per_episode(self, x: np.ndarray) -> np.ndarray:
         return np.add.reduceat(x.astype(np.float64), np.concatenate([[0], self.episode_ends[:-1]]))
@@ -135,17 +151,25 @@ class EpisodeStore:
             None if self.state is None else self.state[rows],
             self.card,
             None if self.speed is None else self.speed[steps],
+            None if self.constraints is None else self.constraints[steps],
         )
 
     def followed_by(self, other: EpisodeStore) -> EpisodeStore:
         """These episodes and then the other's, of the same agents; the card is this one's."""
         if (self.state is None) != (other.state is None):
             raise StoreError("One of the stores holds a global state and the other none; leave it out of both.")
-        costs = [s.costs for s in (self, other)]
+        if list(self.limits) != list(other.limits):
+            raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
+        costs, several = ([getattr(s, name) for s in (self, other)] for name in ("costs", "constraints"))
         if costs[0].ndim != costs[1].ndim:  # the team's are everybody's
             costs = [c if c.ndim == 2 else np.repeat(c[:, None], self.n_agents, 1) for c in costs]
+            several = [c if c is None or c.ndim == 3 else np.repeat(c[:, None], self.n_agents, 1) for c in several]
         told = {name: [getattr(s, name) for s in (self, other)] for name in (*ARRAYS, *OPTIONAL)}
-        told |= {"costs": costs, "episode_ends": [self.episode_ends, other.episode_ends + self.steps]}
+        told |= {
+            "costs": costs,
+            "constraints": several,
+            "episode_ends": [self.episode_ends, other.episode_ends + self.steps],
+        }
         if len({x.shape[1:] for x in told["observations"]}) > 1 or len({x.shape[1:] for x in told["actions"]}) > 1:
             raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
         kept = {name: None if any(x is None for x in both) else np.concatenate(both) for name, both in told.items()}
@@ -160,6 +184,8 @@ class EpisodeStore:
                 f"The agents of '{self.card['task']}' are alike and learn from what each of them meets, but its costs "
                 "are the team's; give costs (T, N)."
             )
+
+        c = len(self.limits)
 
         def own(x: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(np.moveaxis(x, 1, 0)).reshape(-1, 1, *x.shape[2:])
@@ -180,14 +206,15 @@ class EpisodeStore:
                 "team": n,
                 "content": self.content,
             },
+            constraints=None if self.constraints is None else np.moveaxis(self.constraints, 1, 0).reshape(-1, c),
         )
 
     # --- making ---
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
-        costs (E, L), (E, L, N) or None, state (E, L+1, S); `terminated` (E,) bool says which ended by themselves
-        (none, if it is not given)."""
+        costs (E, L), (E, L, N), a dictionary of these by the constraint's name, or None, state (E, L+1, S);
+        `terminated` (E,) bool says which ended by themselves (none, if it is not given)."""
         observations, actions = _numbers("observations", observations), _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
             raise StoreError(
@@ -196,6 +223,7 @@ class EpisodeStore:
             )
         e, length, n = actions.shape[:3]
         rewards = _numbers("rewards", rewards)
+        costs, several, card = _several(costs, (e, length), n, card)
         costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
         one = {
             "observations": (observations, (e, length + 1, n)),
@@ -230,6 +258,7 @@ class EpisodeStore:
             np.arange(1, e + 1) * length,
             None if state is None else flat(state, e * (length + 1)).astype(np.float32, copy=False),
             {} if card is None else card,
+            constraints=None if several is None else flat(several, e * length),
         )
 
     @classmethod
@@ -248,9 +277,11 @@ class EpisodeStore:
         speed=None,
         card=None,
     ):
-        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), state
-        (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state` (E, S): the
-        state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit); speed (T,)."""
+        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), or a
+        dictionary of these by the constraint's name (the card's `constraints` gives each its limit per episode, 0 by
+        default), state (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state`
+        (E, S): the state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit);
+        speed (T,)."""
         ends = _numbers("episode_ends", episode_ends, 1)
         if (ends % 1 != 0).any():
             raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
@@ -259,6 +290,7 @@ class EpisodeStore:
         actions = _numbers("actions", actions, 3).astype(np.float32, copy=False)
         final_observations = _numbers("final_observations", final_observations, 3).astype(np.float32, copy=False)
         rewards = _numbers("rewards", rewards).astype(np.float32, copy=False)
+        costs, several, card = _several(costs, actions.shape[:1], actions.shape[1], card)
         state, final_state = (
             None if x is None else _numbers(name, x, 2).astype(np.float32, copy=False)
             for name, x in (("state", state), ("final_state", final_state))
@@ -305,6 +337,7 @@ class EpisodeStore:
             None if state is None else np.insert(state, ends, final_state, axis=0),
             {} if card is None else card,
             None if speed is None else _numbers("speed", speed),
+            several,
         )
 
     @classmethod
@@ -395,6 +428,32 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
     return found
 
 
+def team(costs: np.ndarray) -> np.ndarray:
+    """(T,) the largest of agents' costs (T, N), or those of the team as they are."""
+    return costs if costs.ndim == 1 else costs.max(1)
+
+
+def _several(costs, lead: tuple[int, ...], agents: int, card: dict | None):
+    """(costs, constraints, card): of a dictionary by name the largest, all of them (*lead, C) or (*lead, N, C), and the
+    card with a limit of each."""
+    if not isinstance(costs, dict):
+        return costs, None, card
+    if not costs:
+        raise StoreError("costs is an empty dictionary; name a constraint, or give costs=None.")
+    found = {name: _numbers(f"costs['{name}']", x) for name, x in costs.items()}
+    for name, x in found.items():
+        if x.shape not in (lead, (*lead, agents)):
+            raise StoreError(f"costs['{name}'] has shape {x.shape}, expected {lead} or {(*lead, agents)}.")
+    if any(x.ndim > len(lead) for x in found.values()):  # the team's are everybody's
+        found = {k: x if x.ndim > len(lead) else np.repeat(x[..., None], agents, -1) for k, x in found.items()}
+    told = dict((card or {}).get("constraints") or {})
+    if strangers := [name for name in told if name not in found]:
+        raise unknown("constraint with a limit", strangers[0], found)
+    several = np.stack(list(found.values()), -1).astype(np.float32)
+    limits = {name: told.get(name, 0.0) for name in found}
+    return several.max(-1), several, {**(card or {}), "constraints": limits}
+
+
 def _digest(card: str | bytes) -> str:
     return hashlib.blake2b(card.encode() if isinstance(card, str) else card, digest_size=8).hexdigest()
 
@@ -442,6 +501,15 @@ def complete_card(card: dict) -> dict:
         )
     if "cost_limit" in card and not (_is_number(card["cost_limit"]) and card["cost_limit"] >= 0):
         raise StoreError(f"The card has cost_limit={card['cost_limit']!r}; it must be one number, 0 or more.")
+    limits = card.get("constraints")
+    if limits is not None:
+        sound = isinstance(limits, dict) and all(_is_name(k) for k in limits)
+        if not sound or not all(_is_number(v) and v >= 0 for v in limits.values()):
+            raise StoreError(
+                f"The card has constraints={limits!r}; it must give each constraint's name a limit, the cost of an "
+                "episode that is not to be passed, 0 or more."
+            )
+        card["cost_limit"] = card.get("cost_limit", float(sum(limits.values())))
     for name in ("observation_names", "state_names", "warnings"):
         words = card.get(name)
         words = words.tolist() if isinstance(words, np.ndarray) else words
@@ -494,14 +562,17 @@ def _is_sound(hazard: hazards.Hazard) -> bool:
     return sized and named and (bool(features) or not isinstance(hazard, hazards.SpeedLimit))
 
 
-def _check_name(task) -> None:
-    """A task's name becomes that of folders and files."""
+def _is_name(word) -> bool:
+    """Whether a word can become that of a folder or file."""
     try:
-        schemas.check(task, schemas.Name)
-        sound = bool(task.strip())
+        schemas.check(word, schemas.Name)
     except ValueError:
-        sound = False
-    if not sound:
+        return False
+    return bool(word.strip())
+
+
+def _check_name(task) -> None:
+    if not _is_name(task):
         raise StoreError(
             f"The card has task={repr(task)[:200]}; it must be a name without slashes, line breaks or a leading dot or "
             "dash, of at most 120 letters, since folders of runs are called so."
@@ -570,6 +641,21 @@ def validate(store: EpisodeStore) -> None:
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
     demand(bool((s.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
+    if s.constraints is not None or s.limits:
+        shape, wanted = np.shape(s.constraints), (*s.costs.shape, len(s.limits))
+        demand(
+            shape == wanted,
+            f"constraints has shape {shape}, its card names {len(s.limits)} ({', '.join(s.limits) or 'none'}) for "
+            f"costs of {s.costs.shape}; give costs={{name: array, ...}}, and a limit for each in the card.",
+        )
+        demand(
+            bool((s.constraints >= 0).all()),
+            "constraints holds negative entries; a cost is 0 or positive, check its sign.",
+        )
+        demand(
+            bool(np.array_equal(s.constraints.max(-1), s.costs)),
+            "costs is not the largest of the constraints at every step; give costs={name: array, ...} alone.",
+        )
     low, high = s.card["action_low"], s.card["action_high"]
     slack = 1e-4 * (high - low)
     outside = (s.actions < low - slack) | (s.actions > high + slack)

@@ -60,7 +60,7 @@ def from_table(
     episode: str | None = None,
     action: Sequence[str] = (),
     reward: str | None = None,
-    cost: str | None = None,
+    cost: str | Sequence[str] | None = None,
     goal: Sequence[str] = (),
     dt: float | None = None,
     gap: float | None = None,
@@ -80,7 +80,8 @@ def from_table(
     moves in the same axes; velocities that are not there are the differences of positions. `action`: what it was told
     at that time and did until its next row; without any, actions are its accelerations. `reward` and `cost` are what
     came since its row before; without `reward`, it is the progress to the `goal` (columns of its x, y), in m, or 0;
-    without `cost` it follows from `danger`, a `Separation`, or is 0.
+    without `cost` it follows from `danger`, a `Separation`, or is 0. Several columns of costs are constraints of these
+    names, whose limits per episode the `card`'s `constraints` tells (0 by default).
 
     Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
@@ -92,7 +93,8 @@ def from_table(
     table. `StoreError` names the first row that cannot be (counted from 0, without a header).
     """
     position, speed = ([f"{v}{c}" for c in AXES if f"{v}{c}" in state] for v in ("", "v"))
-    for name, given in (("state", state), ("action", action), ("goal", goal)):
+    cost = [cost] if isinstance(cost, str) else list(cost or ())
+    for name, given in (("state", state), ("action", action), ("goal", goal), ("cost", cost)):
         if isinstance(given, str):
             raise UserError(f"{name}='{given}' is one word; give a list of columns.")
         if twice := [c for c in given if list(given).count(c) > 1]:
@@ -112,13 +114,14 @@ def from_table(
         raise UserError("state holds no x and y, which neighbours and distances are told by; rename these columns.")
     if not isinstance(danger, Separation | None):
         raise UserError(f"danger={type(danger).__name__} is not read from a table; give a Separation or a cost column.")
-    wanted = [time, agent, *state, *action, *goal, *(c for c in (episode, reward, cost) if c)]
+    wanted = [time, agent, *state, *action, *goal, *cost, *(c for c in (episode, reward) if c)]
     read = _columns(table, wanted)
     rows = _sorted(read, time, agent, episode)
     notes = list(notes)
     values = {name: _numbers(read, name)[rows.order] for name in (*state, *action, *goal)}
-    told = {name: _numbers(read, c)[rows.order] if c else np.zeros(len(rows.time)) for name, c in
-            (("reward", reward), ("cost", cost))}  # fmt: skip
+    zero = np.zeros(len(rows.time))
+    earned = _numbers(read, reward)[rows.order] if reward else zero
+    charged = np.stack([_numbers(read, c)[rows.order] for c in cost] or [zero], 1)
     _check_units(values, rows, position, speed, fastest, notes)
     step = dt or float(f"{rows.step:.6g}")
     gap = gap or GAP * max(step, rows.step)
@@ -150,9 +153,7 @@ def from_table(
         notes.append("state holds no x and y, so nobody is told where others are relative to oneself")
     states = np.stack([values[c] for c in (*state, *goal)], 1)
     acts = np.stack([values[c] for c in action], 1) if action else np.zeros((len(rows.time), 1))
-    tracks = resample(
-        rows.recording, rows.agent, rows.time, states, acts, told["reward"], told["cost"], step, gap or GAP * step
-    )
+    tracks = resample(rows.recording, rows.agent, rows.time, states, acts, earned, charged, step, gap or GAP * step)
     made = _Made(tracks, tuple(state), tuple(position), tuple(speed), bool(goal), notes, rows.agents)
     if not action and not made.axes:
         raise UserError(
@@ -171,16 +172,17 @@ def from_table(
     how = dict(size=team) if neighbours is None else dict(k=neighbours, sight=sight or np.inf)
     arrays = build(made, danger, bool(cost), shortest, longest, **how)
     acts = arrays.pop("held") if action else made.accelerations(arrays["rows"])
-    return _store(made, arrays, acts, bool(reward), danger, neighbours is not None, card or {})
+    return _store(made, arrays, acts, bool(reward), cost, danger, neighbours is not None, card or {})
 
 
 def from_layout(table: Table, layout: str, **options) -> EpisodeStore:
     """The store of a table in a published format (`LAYOUTS`); options as of `from_table`."""
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
-    of = LAYOUTS[layout]
+    of, cost = LAYOUTS[layout], options.get("cost") or ()
+    cost = [cost] if isinstance(cost, str) else cost
     theirs = {c: of.columns.get(c, c) for c in ("time", "agent", *of.state, *of.action)}
-    read = _columns(table, [*theirs.values(), *(of.corner or ()), *([options["cost"]] if options.get("cost") else [])])
+    read = _columns(table, [*theirs.values(), *(of.corner or ()), *cost])
     columns = read | {ours: read[name] for ours, name in theirs.items()}
     columns["time"] = _numbers(read, theirs["time"]) * of.time_unit
     for c, side in zip("xy", of.corner or ()):
@@ -529,7 +531,7 @@ def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, lon
     if danger is not None and not told:
         place = made.place()[kept]
         far = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1) + 1e9 * np.eye(n)
-        cost = (far.min(-1) < danger.radius).astype(float)
+        cost = (far.min(-1) < danger.radius).astype(float)[..., None]
     return {"rows": kept, "many": many, "seen": np.concatenate(seen, -1), "names": names, "cost": cost,
             "held": t.action[kept]}  # fmt: skip
 
@@ -554,7 +556,7 @@ def _neighbourly(made: _Made, danger: Separation | None, told: bool, shortest: i
         names.append(f"other{j}.seen")
     cost = t.cost
     if danger is not None and not told:
-        cost = (np.linalg.norm(offset[:, 0], axis=-1) < danger.radius).astype(float) * there[:, 0]
+        cost = ((np.linalg.norm(offset[:, 0], axis=-1) < danger.radius) * there[:, 0]).astype(float)[:, None]
     rows = index[:, None]
     return {"rows": rows, "many": many, "seen": np.concatenate(parts, 1)[rows], "names": names, "cost": cost[rows],
             "held": t.action[rows], "sight": reach}  # fmt: skip
@@ -572,7 +574,9 @@ def _own(made: _Made, moving: np.ndarray, with_place: bool) -> tuple[list[str], 
     return names, parts
 
 
-def _store(made: _Made, arrays: dict, acts: np.ndarray, earned: bool, danger, alike: bool, card: dict) -> EpisodeStore:
+def _store(
+    made: _Made, arrays: dict, acts: np.ndarray, earned: bool, named: Sequence[str], danger, alike: bool, card: dict
+) -> EpisodeStore:
     t, rows, many = made.tracks, arrays["rows"], arrays["many"]
     last = np.cumsum(many) - 1
     steps = np.ones(len(rows), bool)
@@ -591,6 +595,7 @@ def _store(made: _Made, arrays: dict, acts: np.ndarray, earned: bool, danger, al
         cost = cost[:, 0]
     elif n == 1 and not alike:
         cost = cost[:, 0]
+    cost = dict(zip(named, np.moveaxis(cost, -1, 0))) if len(named) > 1 else cost[..., 0]
     acts = acts[steps]
     bound = float(np.abs(acts).max(initial=0.0)) or 1.0
     told = {

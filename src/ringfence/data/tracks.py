@@ -27,7 +27,7 @@ class Tracks:
     state: np.ndarray  # (R, C)
     action: np.ndarray  # (R, A): the last one told at that time
     earned: np.ndarray  # (R,): the sum of rewards
-    cost: np.ndarray  # (R,): the largest
+    cost: np.ndarray  # (R, K): the largest of each kind
     dt: float  # s
 
 
@@ -42,9 +42,9 @@ def resample(
     dt: float,
     gap: float,
 ) -> Tracks:
-    """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), onto steps of `dt` s. States are
-    interpolated; actions, rewards and costs belong to the step that they are told nearest to, and actions are held. A
-    hole of more than `gap` s ends a segment."""
+    """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), (M, K) costs, onto steps of `dt` s.
+    States are interpolated; actions, rewards and costs belong to the step that they are told nearest to, and actions
+    are held. A hole of more than `gap` s ends a segment."""
     begins = np.ones(len(time), bool)
     begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
     first = np.flatnonzero(begins)
@@ -81,7 +81,7 @@ def resample(
         np.stack([np.interp(at, axis, column) for column in state.T], 1),
         action[row],
         sums[row + 1] - sums[before + 1],
-        np.maximum.reduceat(np.append(cost, 0.0), bounds)[::2],
+        np.maximum.reduceat(np.concatenate([cost, np.zeros((1, cost.shape[1]))]), bounds)[::2],
         dt,
     )
 

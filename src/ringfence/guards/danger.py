@@ -49,26 +49,29 @@ class Danger(eqx.Module):
             )
 
     def along(self, rows: Array, spread: Array) -> Array:
-        """(..., K, N) scores of foreseen rows (..., K+1, N, D), the present first; spread (..., K, N)."""
+        """(..., K, N, C) scores of foreseen rows (..., K+1, N, D), the present first, by each constraint (1 unless the
+        logs name several); spread (..., K, N)."""
         before, after = rows[..., :-1, :, :], rows[..., 1:, :, :]
         if self.source == "formula":
             return self._by_formula(after)
-        told = self._by_barrier(before, after)
+        told = self.world.barrier.apart(before, after)
         if self.future:
-            ahead = self.world.barrier.ahead(after[..., -1:, :, :]) / self.world.barrier.unit
-            told = jnp.concatenate([told[..., :-1, :], jnp.minimum(told[..., -1:, :], ahead)], -2)
-        told = told - jnp.maximum(spread / self.world.strange - 1.0, 0.0)
+            ahead = self.world.barrier.ahead_apart(after[..., -1:, :, :])
+            told = jnp.concatenate([told[..., :-1, :, :], jnp.minimum(told[..., -1:, :, :], ahead)], -3)
+        told = told - jnp.maximum(spread / self.world.strange - 1.0, 0.0)[..., None]
         return told if self.source == "learned" else jnp.minimum(told, self._by_formula(after))
 
     def now(self, before: Array, present: Array) -> Array:
-        """(..., N) scores of the step that led from one state (..., N, D) to the present."""
+        """(..., N, C) scores of the step that led from one state (..., N, D) to the present."""
         if self.source == "formula":
             return self._by_formula(present)
-        told = self._by_barrier(before, present)
+        told = self.world.barrier.apart(before, present)
         return told if self.source == "learned" else jnp.minimum(told, self._by_formula(present))
 
-    def _by_formula(self, x: Array) -> Array:
-        return self.hazard.clearance(x) / self.hazard.safe_margin
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limit per episode of each constraint that is told apart; empty where danger is one."""
+        return {} if self.source == "formula" else self.world.limits
 
-    def _by_barrier(self, before: Array, after: Array) -> Array:
-        return self.world.barrier.of_steps(before, after) / self.world.barrier.unit
+    def _by_formula(self, x: Array) -> Array:
+        return (self.hazard.clearance(x) / self.hazard.safe_margin)[..., None]

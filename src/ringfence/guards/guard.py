@@ -20,6 +20,7 @@ import jax.numpy as jnp
 
 from ringfence.errors import UserError
 from ringfence.guards.danger import Danger
+from ringfence.hazards import least
 from ringfence.types import Array, Key
 from ringfence.world import World
 from ringfence.world.dynamics import Dynamics
@@ -96,7 +97,7 @@ class Decision(NamedTuple):
     plan: Array  # (B, K, N, A) actions
     chosen: Array  # (B,) index of the proposal, or (B, N) of agents that are alone
     rows: Array  # (B, P, K+1, N, D) where the proposals lead
-    safety: Array  # (B, N) least score along the plan
+    safety: Array  # (B, N) least score along the plan, of any constraint
     short: Array  # (B, N) bool: the condition is not met along it
     strange: Array  # (B, N) bool: the World does not know where the first action leads
 
@@ -113,14 +114,14 @@ class Guard(eqx.Module):
         return self.danger.world
 
     def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
-        """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins (B,) or (B, N) to a plan."""
+        """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
+        (B, C), of each constraint, or (B, N, C) of agents who are alone."""
         o = self.options
         proposals = self.world.spec.own(proposals)
         if o.refine:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.foreseen(present, proposals)
-        score = self.danger.along(rows, spread)
-        chosen = self.selected(rows, proposals, score, margin)
+        chosen = self.selected(rows, proposals, self.clear(rows, spread, margin))
         if self.world.alone:
             plan = jnp.take_along_axis(proposals, chosen[:, None, None, :, None], 1)[:, 0]
         else:
@@ -128,10 +129,9 @@ class Guard(eqx.Module):
         if o.shield:
             plan = self.shielded(present, plan, margin)
         ahead, spread = self.foreseen(present, plan[:, None])
-        score = self.danger.along(ahead, spread)[:, 0]
-        short = (self.missing(present, score, margin) < -1e-3).any(1)
+        short = (self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin) < -1e-3).any(1)
         unknown = spread[:, 0, 0] > self.world.strange
-        return Decision(plan, chosen, rows, score.min(1), short, unknown)
+        return Decision(plan, chosen, rows, self.danger.along(ahead, spread)[:, 0].min((1, 3)), short, unknown)
 
     def foreseen(self, present: Array, actions: Array, dynamics: Dynamics | None = None) -> tuple[Array, Array]:
         """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A)."""
@@ -158,20 +158,19 @@ class Guard(eqx.Module):
 
         return jax.vmap(by, (0, 1), 1)(nets, actions)
 
-    def missing(self, present: Array, score: Array, margin: Array) -> Array:
-        """(B, K, N) how much scores (B, K, N) of foreseen rows fall short of the condition, 0 or negative."""
-        o, kept = self.options, self._wide(margin, 1)
-        if o.condition == "margin":
-            return jnp.minimum(score - kept, 0.0)
-        now = self.danger.now(present, present)[:, None]
-        before = jnp.concatenate([now, score[:, :-1]], 1)
-        return jnp.minimum((score - kept) - (1.0 - o.alpha) * (before - kept), 0.0)
+    def clear(self, rows: Array, spread: Array, margin: Array) -> Array:
+        """(B, P, K, N) by how much the scores of foreseen rows pass the margins; of several constraints the worst."""
+        return _least(self.danger.along(rows, spread) - _over(margin, 2))
 
-    def _wide(self, margin: Array, axes: int) -> Array:
-        """Margins (B,) or (B, N) with that many axes after the first, and the agents' last."""
-        if margin.ndim == 1:
-            return margin.reshape(-1, *[1] * axes, 1)
-        return margin.reshape(margin.shape[0], *[1] * axes, margin.shape[1])
+    def missing(self, present: Array, clear: Array, margin: Array) -> Array:
+        """(B, K, N) how much foreseen rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
+        or negative."""
+        o = self.options
+        if o.condition == "margin":
+            return jnp.minimum(clear, 0.0)
+        now = _least(self.danger.now(present, present) - _over(margin, 0))[:, None]
+        before = jnp.concatenate([now, clear[:, :-1]], 1)
+        return jnp.minimum(clear - (1.0 - o.alpha) * before, 0.0)
 
     def started(self, proposals: Array, last: Array, key: Key) -> tuple[Array, Array, Array]:
         """(B, S, K, N, A) thrice: what is refined (the proposals, the last plan moved on by a step, and noisy copies of
@@ -196,8 +195,7 @@ class Guard(eqx.Module):
         def worth(actions: Array) -> Array:
             rows, spread = self.imagined(present, actions)
             value = self.world.values.of_plan(rows, actions) / self.world.values.usual
-            score = self.danger.along(rows, spread)
-            short = jnp.minimum(score - self._wide(margin, 2), 0.0).sum((2, 3))
+            short = jnp.minimum(self.clear(rows, spread, margin), 0.0).sum((2, 3))
             return value.sum() + self.options.care * short.sum()
 
         def climb(carry, t):
@@ -211,16 +209,14 @@ class Guard(eqx.Module):
         rounds = jnp.arange(self.options.refine, dtype=jnp.float32)
         return jax.lax.scan(climb, (actions, zero, zero), rounds)[0][0]
 
-    def selected(self, rows: Array, actions: Array, score: Array, margin: Array) -> Array:
+    def selected(self, rows: Array, actions: Array, clear: Array) -> Array:
         """(B,) which proposal: the one of most value among those that keep the margin; where there is none, the safest.
-        (B, N) where every agent chooses for itself."""
+        (B, N) where every agent chooses for itself. `clear` (B, P, K, N)."""
         if actions.shape[1] == 1 or not (self.options.select or self.options.refine):
             shape = actions.shape[:1] + ((actions.shape[3],) if self.world.alone else ())
             return jnp.zeros(shape, jnp.int32)
-        value, safety = self.world.values.of_plan(rows, actions), score.min(2)
-        if not self.world.alone:
-            safety = safety.min(-1)
-        return pick(safety, value, self._wide(margin, 1) if self.world.alone else margin[:, None])
+        value, clear = self.world.values.of_plan(rows, actions), clear.min(2)
+        return pick(clear if self.world.alone else clear.min(-1), value, 0.0)
 
     def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the foreseen rows, and the best found otherwise.
@@ -248,7 +244,7 @@ class Guard(eqx.Module):
     def _shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
         rows, spread = self.foreseen(present, plan[:, None])
-        short = self.missing(present, self.danger.along(rows, spread)[:, 0], margin)
+        short = self.missing(present, self.clear(rows, spread, margin)[:, 0], margin)
         return short.sum(1) if self.world.alone else short.sum((1, 2))[:, None]
 
     def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
@@ -277,13 +273,26 @@ class Guard(eqx.Module):
         return jnp.where((shortfall(plan) >= least)[:, None, :, None], plan, best)
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
-        """Margins (B,) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN.
+        """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has
+        the rate of half its limit.
 
         Adaptive conformal inference (Gibbs and Candès 2021) on the guard's own foresight: whatever its errors, the
         share of unsafe steps tends to `rate` as long as a margin within the bounds can prevent them.
         """
-        o = self.options
-        return jnp.clip(margin + o.adapt * (unsafe - o.rate), 0.0, max(MAX_MARGIN, o.margin))
+        o, limits = self.options, self.danger.limits
+        rate = jnp.array([0.5 * v / self.world.spec.episode_length for v in limits.values()]) if limits else o.rate
+        return jnp.clip(margin + o.adapt * (unsafe - rate), 0.0, max(MAX_MARGIN, o.margin))
+
+
+def _over(margin: Array, axes: int) -> Array:
+    """Margins (B, C) or (B, N, C) with that many axes after the first, and those of agents and constraints last."""
+    agents = 1 if margin.ndim == 2 else margin.shape[1]
+    return margin.reshape(margin.shape[0], *[1] * axes, agents, margin.shape[-1])
+
+
+def _least(x: Array) -> Array:
+    """The worst of all constraints, the last axis."""
+    return least([x[..., c] for c in range(x.shape[-1])])
 
 
 def pick(safety: Array, value: Array, margin: Array | float) -> Array:

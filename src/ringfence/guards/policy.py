@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any
@@ -35,8 +36,10 @@ class Guarded(eqx.Module):
 
     def start(self, batch: int) -> PyTree:
         o, spec = self.guard.options, self.guard.world.spec
-        shape = (batch, spec.n_agents) if self.guard.world.alone else (batch,)
-        return {
+        several = max(1, len(self.guard.danger.limits))
+        shape = (batch, spec.n_agents, several) if self.guard.world.alone else (batch, several)
+        told = {"costs": jnp.full((batch, several), jnp.nan)} if several > 1 else {}
+        return told | {
             "inner": self.proposal.start(batch),
             "margin": jnp.full(shape, o.margin),
             "last": jnp.zeros((batch, o.rows, spec.n_agents, spec.action_dim)),
@@ -45,11 +48,19 @@ class Guarded(eqx.Module):
             "age": jnp.zeros((), jnp.int32),
         }
 
-    def hear(self, memory: PyTree, cost: Array) -> PyTree:
-        """The memory with the cost that the last step had, (B,) or (B, N): what an adapting margin follows. Where none
-        is told, it follows its own judgement of the step."""
-        cost = jnp.asarray(cost, jnp.float32)
-        return {**memory, "cost": cost if cost.ndim == 1 else cost.max(-1)}
+    def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+        """The memory with the cost that the last step had, (B,) or (B, N), or of each constraint by its name: what an
+        adapting margin follows. Where none is told, it follows its own judgement of the step; a cost of nobody knows
+        which of several constraints is charged to those that judge the step unsafe, or to all."""
+        if isinstance(cost, dict):
+            each, names = {k: _of_team(c) for k, c in cost.items()}, self.guard.danger.limits
+            if "costs" in memory:
+                if strangers := [k for k in each if k not in names]:
+                    raise unknown("constraint", strangers[0], names)
+                heard = [each.get(k, jnp.full_like(memory["cost"], jnp.nan)) for k in names]
+                return {**memory, "costs": jnp.stack(heard, -1)}
+            cost = functools.reduce(jnp.maximum, each.values())
+        return {**memory, "cost": _of_team(cost)}
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         kp, kd = jax.random.split(key)
@@ -64,9 +75,13 @@ class Guarded(eqx.Module):
         margin = jnp.full_like(memory["margin"], g.options.margin)  # known to the compiler unless it moves
         if g.options.adapt:
             judged = g.danger.now(memory["before"], present) < 0
-            judged = judged if g.world.alone else judged.any(-1)
-            cost = memory["cost"].reshape(-1, *[1] * (judged.ndim - 1))
-            unsafe = jnp.where(jnp.isnan(cost), judged, cost > 0)
+            judged = judged if g.world.alone else judged.any(-2)
+            wide = lambda x: x.reshape(-1, *[1] * (judged.ndim - 2), x.shape[-1])  # noqa: E731
+            cost = wide(memory["cost"][:, None])
+            blamed = (cost > 0) & (judged | ~judged.any(-1, keepdims=True))
+            unsafe = jnp.where(jnp.isnan(cost), judged, blamed)
+            if "costs" in memory:
+                unsafe = jnp.where(jnp.isnan(costs := wide(memory["costs"])), unsafe, costs > 0)
             margin = jnp.where(memory["age"] == 0, margin, g.adapted(memory["margin"], unsafe))
         found = g.decide(present, actions, memory["last"], margin, key)
         info = {
@@ -83,7 +98,7 @@ class Guarded(eqx.Module):
             "margin": margin,
             "last": found.plan,
             "before": present,
-            "cost": jnp.full_like(memory["cost"], jnp.nan),
+            **{k: jnp.full_like(memory[k], jnp.nan) for k in ("cost", "costs") if k in memory},
             "age": memory["age"] + 1,
         }
         return memory, PolicyStep(action, info)
@@ -97,6 +112,18 @@ class Guarded(eqx.Module):
         memory, step = self.proposal.act(inner, observations, state, key)
         action = normalise.to_unit(step.action, spec.action_low, spec.action_high)
         return memory, held(action, g.options.rows), {}
+
+
+def costs_of_one(cost: float | Mapping[str, float]) -> np.ndarray | dict[str, np.ndarray]:
+    """What one environment's step cost, as `hear` takes it."""
+    one = lambda c: np.full(1, c, np.float32)  # noqa: E731
+    return {k: one(c) for k, c in cost.items()} if isinstance(cost, Mapping) else one(cost)
+
+
+def _of_team(cost: Array) -> Array:
+    """(B,) the largest of agents' costs (B, N), or those of the team."""
+    cost = jnp.asarray(cost, jnp.float32)
+    return cost if cost.ndim == 1 else cost.max(-1)
 
 
 def held(action: Array, rows: int) -> Array:
@@ -136,7 +163,7 @@ class Callback:
         return self._team.start(batch)
 
     def hear(self, memory: PyTree, cost) -> PyTree:
-        return self._team.hear(memory, jnp.asarray(cost, jnp.float32))
+        return self._team.hear(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
 
     def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
@@ -185,13 +212,18 @@ class Pilot:
         """Begin an episode."""
         self._memory = self.policy.start(1)
 
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: float | None = None) -> np.ndarray:
-        """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, which an
-        adapting guard follows."""
+    def act(
+        self,
+        observations: np.ndarray,
+        state: np.ndarray | None = None,
+        cost: float | Mapping[str, float] | None = None,
+    ) -> np.ndarray:
+        """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, in all or
+        by each constraint's name, which an adapting guard follows."""
         wanted = self.policy.function(observations, state)
         self._key, key = jax.random.split(self._key)
         if cost is not None:
-            self._memory = self.policy.hear(self._memory, np.full(1, cost))
+            self._memory = self.policy.hear(self._memory, costs_of_one(cost))
         shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
         self._memory, step = self.policy.decided(self._memory, *shown, np.asarray(wanted)[None], key)
         self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}

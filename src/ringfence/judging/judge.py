@@ -232,7 +232,7 @@ def _dangers(told: Logs, picked: np.ndarray, found: dict, world: World, ahead: i
 
         rows, spread = jax.lax.scan(step, x, jnp.moveaxis(plan, 1, 0))[1]
         rows = jnp.concatenate([x[:, None], jnp.moveaxis(rows, 0, 1)], 1)
-        return danger.along(rows, jnp.moveaxis(spread, 0, 1)).min((1, 2))
+        return danger.along(rows, jnp.moveaxis(spread, 0, 1)).min((1, 2, 3))
 
     danger, x = Danger(world, "learned", None, False), told.x[told.row[picked]]
     by_policy = np.asarray(worst(danger, x, jnp.asarray(found["plan"])))[safe]

@@ -138,7 +138,7 @@ def _unsafe(danger: Danger | None, before: Array, after: Array, spread: Array) -
     if danger is None:
         return jnp.zeros(before.shape[:-2], bool)
     rows = jnp.concatenate([before, after], -3)
-    return (danger.along(rows, spread) < 0).any(-1)
+    return (danger.along(rows, spread) < 0).any((-2, -1))
 
 
 def _between(x: np.ndarray) -> dict[str, float]:

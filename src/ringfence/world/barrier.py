@@ -71,11 +71,48 @@ class Barrier(eqx.Module):
         """V (..., N) of states (..., N, D)."""
         return soft(_score(self.future, _still(self.shape), (x - self.mean) / self.scale, x.shape[:-1]))
 
+    def apart(self, before: Array, after: Array) -> Array:
+        """ℓ (..., N, 1) in units of the margin, with an axis of constraints."""
+        return (self.of_steps(before, after) / self.unit)[..., None]
+
+    def ahead_apart(self, x: Array) -> Array:
+        """V (..., N, 1) likewise."""
+        return (self.ahead(x) / self.unit)[..., None]
+
     def _seen(self, before: Array, after: Array) -> Array:
         x = (after - self.mean) / self.scale
         if not self.shape.both_ends:
             return x
         return jnp.concatenate([x, (after - before - self.step_mean) / self.step_scale], -1)
+
+
+class Worst(eqx.Module):
+    """Barriers of several constraints, read as one, in units of their margins: the worst counts."""
+
+    each: tuple[Barrier, ...]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def unit(self) -> float:
+        return 1.0
+
+    @property
+    def shape(self) -> Shape:
+        return self.each[0].shape
+
+    def of_steps(self, before: Array, after: Array) -> Array:
+        return least([b.of_steps(before, after) / b.unit for b in self.each])
+
+    def ahead(self, x: Array) -> Array:
+        return least([b.ahead(x) / b.unit for b in self.each])
+
+    def apart(self, before: Array, after: Array) -> Array:
+        """ℓ (..., N, C) of each constraint."""
+        return jnp.concatenate([b.apart(before, after) for b in self.each], -1)
+
+    def ahead_apart(self, x: Array) -> Array:
+        """V (..., N, C) of each constraint."""
+        return jnp.concatenate([b.ahead_apart(x) for b in self.each], -1)
 
 
 def soft(score: Array) -> Array:

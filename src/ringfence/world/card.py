@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.types import Array
-from ringfence.world.barrier import team_score
+from ringfence.world.barrier import Barrier, Worst, team_score
 from ringfence.world.world import World
 
 VERSION = 6  # of the judgement: cached cards of another are made again
@@ -32,18 +34,35 @@ AIM = 0.01  # score that the search aims at: steps towards 0 itself end a hair b
 
 def judge(
     world: World, told, level: float, missed: float, loss: str = "cross-entropy"
-) -> tuple[dict[str, Any], float, float]:
-    """(facts, the ensemble's threshold, the margin that calibration asks for)."""
+) -> tuple[dict[str, Any], float, Barrier | Worst | None]:
+    """(facts, the ensemble's threshold, the barrier with the margin that calibration asks for)."""
     rng = np.random.default_rng(0)
     facts: dict[str, Any] = {"held_out": {"episodes": int(told.held.sum()), "steps": int(len(told.kept))}}
     facts["foresight"] = _foresight(world, told, rng)
     facts["values"] = _values(world, told, rng)
     strange = _strange(world, told, level)
     facts["strange"] = {"threshold": strange, "level": level}
-    unit = LEAST[loss]
-    if world.barrier is not None:
-        facts["barrier"], unit = _barrier(world, told, rng, missed, unit)
-    return facts, strange, unit
+    barrier = world.barrier
+    if isinstance(barrier, Worst):
+        each = {
+            name: _barrier(_with(world, one), told.of(name), rng, missed, LEAST[loss])
+            for name, one in zip(barrier.names, barrier.each)
+        }
+        barrier = Worst(tuple(_in_units(b, each[k][1]) for k, b in zip(barrier.names, barrier.each)), barrier.names)
+        facts["barrier"], _ = _barrier(_with(world, barrier), told, rng, missed, 1.0, 1.0)
+        facts["constraints"] = {name: found for name, (found, _) in each.items()}
+    elif barrier is not None:
+        facts["barrier"], unit = _barrier(world, told, rng, missed, LEAST[loss])
+        barrier = _in_units(barrier, unit)
+    return facts, strange, barrier
+
+
+def _with(world: World, barrier: Barrier | Worst) -> World:
+    return dataclasses.replace(world, barrier=barrier)
+
+
+def _in_units(barrier: Barrier, unit: float) -> Barrier:
+    return eqx.tree_at(lambda b: b.unit, barrier, jnp.asarray(unit, jnp.float32))
 
 
 def _foresight(world: World, told, rng) -> dict[str, Any]:
@@ -128,7 +147,10 @@ def conformal(values: np.ndarray, level: float) -> float:
     return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
 
 
-def _barrier(world: World, told, rng, missed: float, least: float) -> tuple[dict[str, Any], float]:
+def _barrier(
+    world: World, told, rng, missed: float, least: float, unit: float | None = None
+) -> tuple[dict[str, Any], float]:
+    """(facts, margin): calibrated, at `least` so much, unless it is known."""
     barrier, x, row = world.barrier, told.arrays["features"], np.asarray(told.arrays["row"])
     unsafe = told.label if told.label.ndim == 1 else told.label.any(1)
     bad, fine = (told.kept[unsafe[told.kept] == v] for v in (True, False))
@@ -164,7 +186,7 @@ def _barrier(world: World, told, rng, missed: float, least: float) -> tuple[dict
             seen.append(np.asarray(score(barrier, before, rows[:, -1])))
     foreseen = np.concatenate(seen)
     missed = max(missed, OUTLIERS / len(foreseen))
-    unit = max(least, conformal(foreseen, 1 - missed))
+    unit = unit or max(least, conformal(foreseen, 1 - missed))
     table = [_of_margin(m, h, truth, foreseen, share) for m in sorted({0.0, 1.0, 2.0, 4.0, 8.0, round(unit, 2)})]
     facts = {
         "unsafe_share": float(share),
@@ -283,6 +305,17 @@ def words(told: dict[str, Any]) -> list[str]:
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
         f"{told_of['rows']} ahead (rows={told_of['rows']}), where foresight reaches that far."
     )
+    for name, found in told.get("constraints", {}).items():
+        limit = f"Constraint '{name}', at most {told['data']['constraints'][name]:g} per episode"
+        lines.append(
+            f"{limit}: {found['warning']}."
+            if "warning" in found
+            else f"{limit}: {100 * found['unsafe_share']:.3g} % of held-out steps are unsafe, of which it finds "
+            f"{100 * found['recall']:.1f} % with 1 false alarm in 100 (AUROC {found['auroc']:.4f}); its margin is "
+            f"{found['margin']:.2g}, the unit of the lines above."
+        )
+    if "constraints" in told:
+        return lines
     lines.append(
         f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "
         f"before, {1000 * danger['missed']:.2g} looked as safe as that."

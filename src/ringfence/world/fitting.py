@@ -3,11 +3,13 @@ their costs alone share what does not depend on them, and an interrupted fit goe
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import functools
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -94,9 +96,8 @@ def fit_view(
     """
     by = None if hazard is None or settings.labels != "formula" else hazards.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, by, cached)
-    file = parts.file(
-        "world", list(PARTS), [cards.VERSION, store.content, features.to_dict(map), settings.missed, settings.barrier]
-    )
+    about = [cards.VERSION, store.content, features.to_dict(map), settings.missed, settings.barrier]
+    file = parts.file("world", list(PARTS), about + ([store.limits] if store.limits else []))
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
     world = _fitted(store, map, spec, hazard, parts, quiet)
@@ -115,8 +116,8 @@ def _fitted(
 ) -> World:
     begun, s, alone = time.perf_counter(), parts.settings, parts.settings.sight == "own"
     map = features.alone(map) if alone else map
-    label = labels_of(store, map, s, hazard) if s.barrier else None
-    told = _Told(store, map, held_out(store, parts.seed), label)
+    labels = labels_of(store, map, s, hazard) if s.barrier else {}
+    told = _Told(store, map, held_out(store, parts.seed), labels)
     fitted, arrays, blank = told.fitted, told.arrays, _blank(map, spec, s)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated")
 
@@ -152,32 +153,10 @@ def _fitted(
             quiet=quiet,
         ),
     )
-    danger = None
-    if label is not None:
-        bad = [moved, hashlib.blake2b(label.tobytes(), digest_size=8).hexdigest()]
-        now = parts.get(
-            "label", bad, blank.barrier, lambda key: _label(told, _blank_barrier(map, s), acts, s, key, quiet)
-        )
-        danger = parts.get(
-            "future",
-            bad,
-            blank.barrier,
-            lambda key: cbf.fit_future(
-                now,
-                arrays,
-                fitted,
-                fitted[told.close[fitted]],
-                key,
-                discount=s.future_discount,
-                expectile=s.expectile,
-                updates=s.future_updates,
-                quiet=quiet,
-            ),
-        )
+    each = [_barrier_of(told.of(name), moved, acts, parts, quiet) for name in labels]
+    danger = (cbf.Worst(tuple(each), tuple(labels)) if told.several else each[0]) if each else None
     world = World(acts, worth, danger, jnp.ones(()), map, spec, alone, Card({}))
-    judged, strange, unit = cards.judge(world, told, STRANGE, s.missed, s.loss)
-    if danger is not None:
-        danger = eqx.tree_at(lambda b: b.unit, danger, jnp.asarray(unit, jnp.float32))
+    judged, strange, danger = cards.judge(world, told, STRANGE, s.missed, s.loss)
     facts = {
         "format": FORMAT,
         "data": {
@@ -185,6 +164,7 @@ def _fitted(
             "content": store.card.get("content", store.content),
             "episodes": store.episodes // store.card.get("team", 1),
             "hazard": store.card["hazard"],
+            **({"constraints": store.limits} if told.several else {}),
         },
         "settings": dataclasses.asdict(s),
         "seed": parts.seed,
@@ -194,6 +174,29 @@ def _fitted(
         **judged,
     }
     return World(acts, worth, danger, jnp.asarray(strange, jnp.float32), map, spec, alone, Card(facts))
+
+
+def _barrier_of(told: _Told, moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool) -> cbf.Barrier:
+    """ℓ and V of one constraint."""
+    s, blank = parts.settings, eqx.filter_eval_shape(_blank_barrier, told.map, parts.settings)
+    bad = [moved, hashlib.blake2b(told.label.tobytes(), digest_size=8).hexdigest()]
+    now = parts.get("label", bad, blank, lambda key: _label(told, _blank_barrier(told.map, s), acts, s, key, quiet))
+    return parts.get(
+        "future",
+        bad,
+        blank,
+        lambda key: cbf.fit_future(
+            now,
+            told.arrays,
+            told.fitted,
+            told.fitted[told.close[told.fitted]],
+            key,
+            discount=s.future_discount,
+            expectile=s.expectile,
+            updates=s.future_updates,
+            quiet=quiet,
+        ),
+    )
 
 
 @dataclass(eq=False)
@@ -234,13 +237,25 @@ class _Told:
     store: EpisodeStore
     map: features.FeatureMap
     held: np.ndarray  # (E,) bool
-    label: np.ndarray | None  # (T,) or (T, N) bool: unsafe
+    labels: dict[str, np.ndarray]  # (T,) or (T, N) bool: unsafe, by constraint; "" where danger is one
 
     def __post_init__(self):
+        self.label = functools.reduce(np.logical_or, self.labels.values()) if self.labels else None
         self.arrays = WindowData(self.store, self.map).arrays
         out = self.held[self.store.episode_of_step]
         self.fitted, self.kept = np.flatnonzero(~out), np.flatnonzero(out)
         self.longest = int(self.store.lengths.max()) + 1
+
+    @property
+    def several(self) -> bool:
+        """Whether constraints are told apart."""
+        return bool(self.labels) and "" not in self.labels
+
+    def of(self, name: str) -> _Told:
+        """The same with the label of one constraint."""
+        one = copy.copy(self)
+        one.labels, one.label = {name: self.labels[name]}, self.labels[name]
+        return one
 
     def foreseen(self, acts: dynamics.Dynamics) -> jax.Array:
         """(T, N, D) where every step's actions were foreseen to lead."""
@@ -283,8 +298,9 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
 
 def labels_of(
     store: EpisodeStore, map: features.FeatureMap, settings: Settings, hazard: hazards.BoundHazard | None
-) -> np.ndarray:
-    """(T,) or (T, N) bool: the steps that are unsafe, by costs or by the formula of the states that they lead to."""
+) -> dict[str, np.ndarray]:
+    """(T,) or (T, N) bool: the steps that are unsafe, by each constraint that the store names, or under the name "" by
+    costs or by the formula of the states that they lead to."""
     name = store.card["task"]
     if settings.labels == "formula":
         if hazard is None or not hazard.has_formula:
@@ -295,17 +311,21 @@ def labels_of(
         row = np.arange(store.steps) + store.episode_of_step + 1
         x = map(store.observations, store.state)
         judge = jax.jit(lambda x: hazard.labels(x)[0])
-        unsafe = np.concatenate([np.asarray(judge(x[row[i : i + 100_000]])) for i in range(0, len(row), 100_000)])
+        found = [np.asarray(judge(x[row[i : i + 100_000]])) for i in range(0, len(row), 100_000)]
+        unsafe, where = {"": np.concatenate(found)}, "the formula's labels"
+    elif store.limits:
+        unsafe, where = {k: store.of_constraint(k) > 0 for k in store.limits}, "the costs"
     else:
-        unsafe = store.costs > 0
-    share = unsafe.mean()
-    where = "the formula's labels" if settings.labels == "formula" else "the costs"
-    for empty, kind, none in ((0.0, "0", "unsafe"), (1.0, "above 0", "safe")):
-        if share == empty:
-            raise UserError(
-                f"No step of '{name}' is {none}: {where} are {kind} everywhere, so nothing tells a barrier what "
-                "danger is; give costs that are 0 on safe steps and above 0 on unsafe ones, or fit with barrier=False."
-            )
+        unsafe, where = {"": store.costs > 0}, "the costs"
+    for which, bad in unsafe.items():
+        of = f" by '{which}'" if which else ""
+        for empty, kind, none in ((0.0, "0", "unsafe"), (1.0, "above 0", "safe")):
+            if bad.mean() == empty:
+                raise UserError(
+                    f"No step of '{name}' is {none}{of}: {where} are {kind} everywhere, so nothing tells a barrier "
+                    "what danger is; give costs that are 0 on safe steps and above 0 on unsafe ones, or "
+                    + ("leave that constraint out." if which else "fit with barrier=False.")
+                )
     return unsafe
 
 
@@ -347,13 +367,16 @@ def _label(
     )
 
 
-def _blank(map: features.FeatureMap, spec: Spec, s: Settings) -> World:
-    """The shapes of a World; nothing is computed, since programs for so many small arrays take seconds to compile."""
+def _blank(map: features.FeatureMap, spec: Spec, s: Settings, names: Sequence[str] = ()) -> World:
+    """The shapes of a World, with barriers of the named constraints; nothing is computed, since programs for so many
+    small arrays take seconds to compile."""
 
     def shapes() -> World:
         acts = dynamics.blank_dynamics(map, spec.action_dim, s.members, s.dynamics_width)
         worth = values.blank_values(map, spec.action_dim, s.discount, s.sight == "own")
         danger = _blank_barrier(map, s) if s.barrier else None
+        if danger is not None and names:
+            danger = cbf.Worst((danger,) * len(names), tuple(names))
         return World(acts, worth, danger, jnp.ones(()), map, spec, s.sight == "own", Card({}))
 
     return eqx.filter_eval_shape(shapes)
@@ -363,7 +386,7 @@ def _blank_barrier(map: features.FeatureMap, s: Settings) -> cbf.Barrier:
     return cbf.blank_barrier(map, s.barrier_width, s.both_ends, s.distances)
 
 
-def _shape_in_words(barrier: cbf.Barrier | None) -> str:
+def _shape_in_words(barrier: cbf.Barrier | cbf.Worst | None) -> str:
     if barrier is None:
         return "no barrier"
     shape = barrier.shape
@@ -433,7 +456,8 @@ def load(
         map = features.alone(map) if settings.sight == "own" else map
         if map.names != spec.feature_names:
             raise UserError(f"'{path}' is a World of another view; fit it again.")
-        world = load_named(path, _blank(map, spec, settings))
+        names = told["data"].get("constraints", ()) if settings.labels == "costs" else ()
+        world = load_named(path, _blank(map, spec, settings, names))
     except UserError:
         raise
     except Exception as error:  # what is in it may be anything

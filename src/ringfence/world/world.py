@@ -10,7 +10,7 @@ import equinox as eqx
 
 from ringfence.features import FeatureMap
 from ringfence.types import Array, Spec
-from ringfence.world.barrier import Barrier
+from ringfence.world.barrier import Barrier, Worst
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.values import Values
 
@@ -39,9 +39,14 @@ class World(eqx.Module):
 
     dynamics: Dynamics
     values: Values
-    barrier: Barrier | None  # None: the logs told no danger, and no formula did
+    barrier: Barrier | Worst | None  # None: the logs told no danger, and no formula did
     strange: Array  # () how far apart the ensemble is where the logs have not been: a conformal quantile
     map: FeatureMap = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
     alone: bool = eqx.field(static=True)  # of each agent's own view, for agents that hear of nobody
     card: Card = eqx.field(static=True)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limit per episode of each constraint that the logs name; empty where they name none."""
+        return self.card.told.get("data", {}).get("constraints") or {}
