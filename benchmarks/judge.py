@@ -57,11 +57,11 @@ def main() -> None:
         world = worlds.fit(store, seed=1)
         for variant, result in run.results.items():
             key = (told["task"], told["algorithm"], variant, str(told["seed"]))
-            if key in done or result.get("sight") == "own":
+            if key in done or (result.get("sight") == "own" and not task.alike):
                 continue
             how = {"planner": result["planner"]}
             if result["guard"] != "none":
-                how |= {"guard": result["guard"], "danger": result["danger"]}
+                how |= {"guard": result["guard"], "danger": result["danger"], **result["guard_options"]}
             found = judge(run, store, judge_world=world, compare=False, **how)
             numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
             numbers = [found["played"][k]["mean"] for k in PLAYED.values()] + numbers

@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 import json
+import os
+import shutil
+import subprocess
 import sys
 import zipfile
 from pathlib import Path
@@ -268,3 +271,26 @@ def test_the_node_plays_the_file(run, small_store, small_world, tmp_path):
     )
     with pytest.raises(SystemExit, match="reads 'lidar3', which odometry does not tell"):
         node.observed(["lidar3"], place, speed, goal)
+
+
+def test_the_c_example_plays_the_file(run, small_store, tmp_path):
+    """Compiled against ONNX Runtime in $ORT, or where a distribution puts it; what it prints is what the controller
+    does."""
+    pytest.importorskip("jax2onnx")
+    root = os.environ.get("ORT", "/usr")
+    there = [
+        f for f in ("onnxruntime_cxx_api.h", "onnxruntime/onnxruntime_cxx_api.h") if Path(root, "include", f).exists()
+    ]
+    if not there or not shutil.which("g++"):
+        pytest.skip("no headers of ONNX Runtime; unpack a release and name it by $ORT")
+    code, play = Path(__file__).parents[1] / "examples" / "export_cpp" / "play.cpp", tmp_path / "play"
+    where = ["-I", str(Path(root, "include", there[0]).parent), f"-L{root}/lib", f"-Wl,-rpath,{root}/lib"]
+    subprocess.run(["g++", "-std=c++17", str(code), *where, "-lonnxruntime", "-o", str(play)], check=True)
+    file = exporting.export(run, tmp_path / "p.onnx")
+    reads = [x.name for x in exporting.step_of(*evaluate.load(run)).inputs]
+    rows = [{"observations": small_store.observations[t], "state": small_store.state[t]} for t in range(3)]
+    told = [" ".join(str(x) for name in reads for x in row[name].ravel()) for row in rows]
+    out = subprocess.run([play, file, "3"], input="\n".join(told), capture_output=True, text=True, check=True).stdout
+    acted = np.array([[float(x) for x in line.split()] for line in out.splitlines()])
+    controller = evaluate.Controller(run)
+    np.testing.assert_allclose(acted, [controller.act(**row).ravel() for row in rows], atol=1e-4)

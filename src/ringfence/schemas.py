@@ -26,6 +26,9 @@ Few = Annotated[int, msgspec.Meta(ge=1, le=100_000)]  # agents, entries: what lo
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Interval = tuple[float, float]
 Scalar = bool | int | float | str | None
+Limits = Annotated[
+    dict[Name, Annotated[float, msgspec.Meta(ge=0, le=1e12)]], msgspec.Meta(max_length=100)
+]  # of constraints
 
 
 class Hazard(TypedDict):
@@ -57,6 +60,12 @@ class Map(TypedDict):
     dt: NotRequired[float | None]
 
 
+class Data(TypedDict, total=False):
+    """What a run or a World says of its data; whatever else a card holds is there, too."""
+
+    constraints: Limits | None
+
+
 class Config(TypedDict):
     """config.json of a run."""
 
@@ -66,7 +75,7 @@ class Config(TypedDict):
     task: Name
     hazard: Hazard
     seed: Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
-    data: dict[str, Any]
+    data: Data
     revision: NotRequired[int]
     spec: NotRequired[Spec]
     feature_map: NotRequired[Map | None]
@@ -75,12 +84,18 @@ class Config(TypedDict):
     team: NotRequired[Few]
 
 
+class Card(TypedDict):
+    """What a World's card cannot do without."""
+
+    data: Data
+
+
 class World(TypedDict):
     """What a World's file says of it."""
 
     map: Map
     spec: Spec
-    card: dict[str, Any]
+    card: Card
 
 
 class PerEpisode(TypedDict, total=False):

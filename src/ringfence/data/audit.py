@@ -33,6 +33,7 @@ def audit(store: EpisodeStore) -> Audit:
         "episodes": f"{s.episodes:,}",
         "steps": f"{s.steps:,}",
         "episode length": f"{lengths.min()} to {lengths.max()}" if np.ptp(lengths) else str(lengths[0]),
+        **({"step": f"{card['dt']:g} s"} if "dt" in card else {}),
         "agents": str(s.n_agents),
         "observation, action": f"{s.observations.shape[2]}, {s.actions.shape[2]} per agent",
         "global state": "none" if s.state is None else f"{s.state.shape[1]} entries",

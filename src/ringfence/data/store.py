@@ -59,6 +59,15 @@ class EpisodeStore:
         object.__setattr__(self, "card", complete_card(self.card))
         validate(self)
 
+    def __repr__(self) -> str:
+        named = f" ({', '.join(self.limits)})" if self.limits else ""
+        return (
+            f"EpisodeStore('{self.card['task']}': {self.episodes:,} episodes, {self.steps:,} steps of {self.n_agents} "
+            f"agents, observations {self.observations.shape[2]}, actions {self.actions.shape[2]}, state "
+            f"{0 if self.state is None else self.state.shape[1]}, {100 * (self.costs > 0).mean():.3g} % of "
+            f"entries with cost{named})"
+        )
+
     # --- sizes ---
     @property
     def steps(self) -> int:
@@ -503,12 +512,14 @@ def complete_card(card: dict) -> dict:
         raise StoreError(f"The card has cost_limit={card['cost_limit']!r}; it must be one number, 0 or more.")
     limits = card.get("constraints")
     if limits is not None:
-        sound = isinstance(limits, dict) and all(_is_name(k) for k in limits)
-        if not sound or not all(_is_number(v) and v >= 0 for v in limits.values()):
+        try:
+            limits = card["constraints"] = {k: _plain(v) for k, v in limits.items()}
+            schemas.check(limits, schemas.Limits)
+        except (AttributeError, ValueError):
             raise StoreError(
-                f"The card has constraints={limits!r}; it must give each constraint's name a limit, the cost of an "
-                "episode that is not to be passed, 0 or more."
-            )
+                f"The card has constraints={repr(limits)[:200]}; it must give each constraint's name a limit, the cost "
+                "of an episode that is not to be passed, 0 or more."
+            ) from None
         card["cost_limit"] = card.get("cost_limit", float(sum(limits.values())))
     for name in ("observation_names", "state_names", "warnings"):
         words = card.get(name)
@@ -551,6 +562,11 @@ def complete_card(card: dict) -> dict:
 
 def _is_number(x) -> bool:
     return isinstance(x, int | float | np.number) and not isinstance(x, bool) and bool(np.isfinite(x))
+
+
+def _plain(x):
+    """A number of NumPy's as Python's."""
+    return x.item() if isinstance(x, np.number) else x
 
 
 def _is_sound(hazard: hazards.Hazard) -> bool:

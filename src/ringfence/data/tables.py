@@ -23,6 +23,7 @@ from ringfence.hazards import CostColumn, Hazard, Separation
 
 AXES = "xyz"
 GAP = 5.0  # steps without a row that end an episode
+LONG = 5.0  # s, a step that hardly any controller has
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
 
 
@@ -129,6 +130,8 @@ def from_table(
         raise UserError(
             f"gap={gap:g} is less than the {rows.step:g} s between an agent's rows; every row would be cut off."
         )
+    if step >= LONG:
+        notes.append(f"a step is {step:g} s: if times are in ms or µs, scale them to seconds")
     if cost and danger is not None:
         raise UserError("cost and danger both say what a step costs; give one of them.")
     clock = (
