@@ -89,7 +89,7 @@ def test_costs_by_name_are_kept_through_everything(logs, tmp_path):
     np.testing.assert_array_equal(apart.of_constraint("fast")[: logs.steps], logs.of_constraint("fast")[:, 0])
     told = audit(logs).facts["constraint wall"]
     within = 100 * (logs.episode_costs_of("wall") == 0).mean()
-    assert f"{within:.1f} % of episodes are within 0" in told
+    assert f"{within:.1f} % of episodes are within 0" in told and f"\nconstraint wall: {told}\n" in str(audit(logs))
 
 
 def test_costs_by_name_that_do_not_fit_are_refused(logs):

@@ -105,17 +105,21 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
 
 
 @pytest.mark.parametrize(
-    "avoided, options, future",
+    "avoided, kept, options, future",
     [
-        ([0.2, 0.2, 0.9], {}, True),
-        ([0.2, 0.6, 0.9], {}, False),
-        ([0.2, 0.2, 0.9], {"rows": 7}, False),
-        ([0.2, 0.2, 0.9], {"future": False}, False),
+        ([0.2, 0.2, 0.9], 0.97, {}, True),
+        ([0.2, 0.6, 0.9], 0.97, {}, True),
+        ([0.2, 0.88, 0.9], 0.97, {}, False),
+        ([0.2, 0.2, 0.9], 0.5, {}, False),
+        ([0.2, 0.2, 0.9], 0.97, {"rows": 7}, False),
+        ([0.2, 0.2, 0.9], 0.97, {"future": False}, False),
     ],
 )
-def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, options, future):
-    """Where three rows come too late, the value of danger judges the last one, unless something else is asked for."""
-    card = Card({"barrier": {"avoidable": {"before": [1, 3, 15], "avoided": avoided, "rows": 15}}})
+def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, options, future):
+    """Where three rows come too late, the value of danger judges the last one, unless it calls most safe steps lost, or
+    something else is asked for."""
+    told = {"avoidable": {"before": [1, 3, 15], "avoided": avoided, "rows": 15}, "ahead_kept": kept}
+    card = Card({"barrier": told})
     world = dataclasses.replace(small_world, card=card)
     for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
                    ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip

@@ -20,6 +20,10 @@ class Audit(NamedTuple):
     warnings: list[str]
     notes: list[str]  # what the import found and lost
 
+    def __str__(self) -> str:
+        lines = [f"{name}: {value}" for name, value in self.facts.items()]
+        return "\n".join([*lines, *(f"warning: {w}" for w in self.warnings), *(f"note: {n}" for n in self.notes)])
+
 
 def audit(store: EpisodeStore) -> Audit:
     """Sizes, returns, cost, share of episodes that start unsafe, and warnings in plain words."""

@@ -15,7 +15,7 @@ from ringfence.types import Array
 from ringfence.world.barrier import Barrier, Worst, team_score
 from ringfence.world.world import World
 
-VERSION = 6  # of the judgement: cached cards of another are made again
+VERSION = 7  # of the judgement: cached cards of another are made again
 AHEAD = 8  # steps that foresight is judged over
 WINDOWS = 3000  # of each kind that it is judged on
 STEPS = 60_000  # held-out steps that scores are judged on
@@ -164,11 +164,14 @@ def _barrier(
     def score(barrier, before, after):
         return team_score(barrier.of_steps(before, after), barrier.shape)
 
-    def of(steps: np.ndarray) -> np.ndarray:
-        parts = [steps[i : i + 20_000] for i in range(0, len(steps), 20_000)]
-        return np.concatenate([np.asarray(score(barrier, x[row[p]], x[row[p] + 1])) for p in parts])
+    @jax.jit
+    def ahead(barrier, after):
+        return team_score(barrier.ahead(after), barrier.shape)
 
-    h, truth = of(steps), unsafe[steps]
+    parts = [steps[i : i + 20_000] for i in range(0, len(steps), 20_000)]
+    h = np.concatenate([np.asarray(score(barrier, x[row[p]], x[row[p] + 1])) for p in parts])
+    v = np.concatenate([np.asarray(ahead(barrier, x[row[p] + 1])) for p in parts])
+    truth = unsafe[steps]
     share = unsafe[told.kept].mean()
     line = np.quantile(h[~truth], FALSE_ALARMS)
     # The margin: foreseen scores, from up to three steps before, of steps that entered danger. Those that were in it
@@ -199,6 +202,7 @@ def _barrier(
         "margin": float(unit),
         "missed": missed,
         "calibration": table,
+        "ahead_kept": float((v[~truth] >= unit).mean()),
         "avoidable": _avoidable(world, told, ends[:ENTERED]),
     }
     return facts, unit
@@ -299,11 +303,12 @@ def words(told: dict[str, Any]) -> list[str]:
             f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are "
             f"unsafe; {100 * row['safe_kept']:.3g} % of the safe steps have it"
         )
-    told_of = danger["avoidable"]
+    told_of, kept = danger["avoidable"], danger.get("ahead_kept")  # which older cards lack
     shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(told_of["before"], told_of["avoided"]))
     lines.append(
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
-        f"{told_of['rows']} ahead (rows={told_of['rows']}), where foresight reaches that far."
+        f"{told_of['rows']} ahead (rows={told_of['rows']}), where foresight reaches that far"
+        + (f", or V, which leaves {100 * kept:.3g} % of the safe steps their margin." if kept is not None else ".")
     )
     for name, found in told.get("constraints", {}).items():
         limit = f"Constraint '{name}', at most {told['data']['constraints'][name]:g} per episode"
