@@ -6,6 +6,7 @@ its words are no longer there.
 
 from __future__ import annotations
 
+import csv
 import re
 import sys
 from collections.abc import Callable
@@ -16,6 +17,7 @@ import numpy as np
 from attribution import FULL, QUESTIONS, SHIELD, Question, answers
 from evidence import evaluations, mean, of, tasks_of
 from readme import put
+from scipy.stats import spearmanr
 
 from ringfence.report import board, standings
 from ringfence.stats import upper_bound
@@ -116,11 +118,11 @@ def robots_kept(algorithm: str, variant: str, wanted: int) -> Callable[[], tuple
     return check
 
 
-def contact(suite: str, row, low: float, high: float) -> Callable[[], tuple[bool, str]]:
-    """The share of episodes with contact on crossing-hasty lies in a range."""
+def contact(suite: str, row, low: float, high: float, task: str = "crossing-hasty") -> Callable[[], tuple[bool, str]]:
+    """The share of episodes with contact lies in a range."""
 
     def check():
-        share = mean(suite, "crossing-hasty", row, "violation_rate")
+        share = mean(suite, task, row, "violation_rate")
         return low <= share <= high, f"{100 * share:.3g} % of episodes"
 
     return check
@@ -132,6 +134,74 @@ def crossing_rare() -> tuple[bool, str]:
     episodes = sum(r["episodes"] for r in runs.values())
     bound = upper_bound(touched, next(iter(runs.values()))["episodes"])
     return (touched, episodes) == (1, 5000), f"{touched} of {episodes} episodes; at most {100 * bound:.2g} % of resets"
+
+
+def rows_of(file: str, **where: str) -> list[dict[str, str]]:
+    """Rows of a table in results/ with these entries."""
+    rows = list(csv.DictReader((RESULTS / file).open()))
+    return [r for r in rows if all(r[k] == v for k, v in where.items())]
+
+
+def one_barrier_loses() -> tuple[bool, str]:
+    """The bound of a barrier for each lies below what a guard's absence has, and that below one barrier for both."""
+    none, one, each = (rows_of("constraints.csv", guard=g, barriers=b)[0] for g, b in TWO)
+    contact = [float(r["contact"]) for r in (none, one, each)]
+    told = " / ".join(f"{100 * c:.1f} %" for c in contact) + " of episodes without a guard, with one, with each"
+    return contact[1] > float(none["contact_bound"]) and contact[2] == 0, told
+
+
+TWO = (("none", ""), ("shield", "one"), ("shield", "each"))
+
+
+def brakes_in_time() -> tuple[bool, str]:
+    """Of the clone three rows leave next to nothing; of the blind controller they leave most, and V nothing."""
+    ask = dict(guard="shield", danger="learned")
+    clone, blind, seen = (
+        float(rows_of("yard.csv", who=who, options=how, **ask)[0]["contact"])
+        for who, how in (("cloning", "future=False"), ("blind", "future=False"), ("blind", ""))
+    )
+    told = (
+        f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * blind:.3g} % of the blind; V: {100 * seen:.2g} %"
+    )
+    return clone <= 0.005 and blind > 0.5 and seen <= 0.01, told
+
+
+def own_shield_leaves(most: float) -> Callable[[], tuple[bool, str]]:
+    def check():
+        row = ("bc", "default+shield-learned-own")
+        left = max(mean("own-sight", task, row, "avoidable_cost") for task in tasks_of("own-sight"))
+        return left <= most, f"at most {left:.3f} on four tiers"
+
+    return check
+
+
+def as_safe_by_v() -> tuple[bool, str]:
+    """ℓ alone touches along one and three rows, and neither V with them nor ℓ along fifteen does."""
+    name = "default+shield-learned"
+    shares = [
+        mean("crossing-guards", "crossing-hasty", ("bc", name + more), "violation_rate")
+        for more in ("+rows1+futureFalse", "+rows3+futureFalse", "+rows15+futureFalse", "+rows1", "")
+    ]
+    told = ", ".join(f"{100 * s:.3g} %" for s in shares)
+    return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {told} of episodes"
+
+
+def exported_in_time() -> tuple[bool, str]:
+    slower = [float(r["stablehlo_ms"]) / float(r["controller_ms"]) for r in rows_of("export.csv")]
+    return max(slower) <= 1.0, f"{min(slower):.2f} to {max(slower):.2f} of the controller's time"
+
+
+def judged(number: str, truth: str, least: float) -> Callable[[], tuple[bool, str]]:
+    """Spearman's correlation on every task whose policies were judged."""
+
+    def check():
+        tasks = {r["task"]: [] for r in rows_of("judging.csv")}
+        for task in tasks:
+            rows = rows_of("judging.csv", task=task)
+            tasks[task] = float(spearmanr(*([float(r[k]) for r in rows] for k in (truth, number))).statistic)
+        return min(tasks.values()) >= least, ", ".join(f"{k} {v:.2f}" for k, v in tasks.items())
+
+    return check
 
 
 CLAIMS = (
@@ -162,6 +232,34 @@ CLAIMS = (
         robots_kept("bc", "default+full-learned", 17),
     ),
     Claim("docs/crossing.md", "1 of 5000", "results/crossing/table.csv", crossing_rare),
+    Claim(
+        "docs/crossing.md",
+        "V with one row or three is as safe",
+        "results/crossing-guards/table.csv",
+        as_safe_by_v,
+    ),
+    Claim(
+        "docs/crossing.md",
+        "the shield touches in 85 %",
+        "results/crossing/table.csv",
+        contact("crossing", ("bc", "default+shield-learned"), 0.83, 0.87, "crossing-careful"),
+    ),
+    Claim("docs/guard.md", "One barrier for both loses contact", "results/constraints.csv", one_barrier_loses),
+    Claim("docs/guard.md", "and not for who never brakes", "results/yard.csv", brakes_in_time),
+    Claim(
+        "docs/guard.md",
+        "A shield of each agent's own leaves 0.006 avoidable cost at most",
+        "results/own-sight/table.csv",
+        own_shield_leaves(0.0065),
+    ),
+    Claim(
+        "docs/guard.md",
+        "keeps 17 of 18 limits",
+        "results/guards-mujoco/table.csv",
+        robots_kept("bc", "default+full-learned", 17),
+    ),
+    Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
+    Claim("docs/judging.md", "Danger is told well", "results/judging.csv", judged("played_danger", "true_cost", 0.8)),
     Claim("docs/attribution.md", "A shield takes the cost from every proposal", SPREAD, shielded_all),
     Claim(
         "docs/attribution.md",

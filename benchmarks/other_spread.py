@@ -2,7 +2,7 @@
 rules than the data's; and logs recorded there, learned and guarded like anybody's own.
 
     pip install mpe2
-    python benchmarks/mpe2.py                 # writes results/mpe2.csv and docs/evaluation.md's table; ten minutes
+    python benchmarks/other_spread.py        # writes results/mpe2.csv and docs/evaluation.md's table; ten minutes
 """
 
 from __future__ import annotations
