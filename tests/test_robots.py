@@ -20,7 +20,7 @@ from ringfence.bench import unpack
 from ringfence.data import matd3, robots
 from ringfence.data.make import make
 from ringfence.data.matd3 import MATD3Config
-from ringfence.data.store import ARRAYS
+from ringfence.data.rules import ARRAYS
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.policies import Constant

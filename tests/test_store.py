@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ringfence.data import arrays
-from ringfence.data.store import ARRAYS, EpisodeStore
+from ringfence.data.rules import ARRAYS
+from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
 from ringfence.hazards import CostColumn
 from ringfence.scores import return_scores

@@ -32,7 +32,8 @@ import numpy as np
 
 from ringfence import schemas, tasks
 from ringfence.data import arrays, columns, logs, minari
-from ringfence.data.store import EpisodeStore, complete_card
+from ringfence.data.rules import complete_card
+from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
 
 D4RL = ("observations", "actions", "rewards", "terminals", "timeouts")

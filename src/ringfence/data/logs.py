@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 
 from ringfence.data import columns
-from ringfence.data.store import complete_card
+from ringfence.data.rules import complete_card
 from ringfence.errors import StoreError
 
 PACKED = 100  # times its size that a compressed file may unpack to; columns of zeros pack well

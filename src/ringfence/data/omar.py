@@ -21,7 +21,8 @@ import jax
 import numpy as np
 
 from ringfence import hazards, tasks
-from ringfence.data.store import EpisodeStore, complete_card
+from ringfence.data.rules import complete_card
+from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
 from ringfence.errors import StoreError
 
