@@ -253,10 +253,10 @@ def far_sighted(world: World) -> dict[str, dict]:
     told = world.card.told.get("barrier", {})
     if told.get("ahead_kept", 0.0) < KEPT or "avoidable" not in told:
         return {}
-    shares, rows = told["avoidable"], GuardOptions().rows
-    seen = [share for before, share in zip(shares["before"], shares["avoided"]) if before <= rows]
+    shares = told["avoidable"]
+    seen = [share for rows, share in zip(shares["before"], shares["avoided"]) if rows <= GuardOptions().rows]
     far = max(seen, default=0.0) < LITTLE * max(shares["avoided"])
-    return {name: {"rows": rows, "future": True} for name in ("shield", "adapt", "full")} if far else {}
+    return {name: {"future": True} for name in ("shield", "adapt", "full")} if far else {}
 
 
 def build(

@@ -224,7 +224,7 @@ class _Parts:
             return kept
         begun = time.perf_counter()
         made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
-        self.seconds[name] = time.perf_counter() - begun
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
         if self.cached:
             _write(file, made)
         return made
