@@ -110,10 +110,12 @@ def limits(suite: str, algorithm: str, variant: str) -> int:
     return sum(r.safe for r in found)
 
 
-def robots_kept(algorithm: str, variant: str, wanted: int) -> Callable[[], tuple[bool, str]]:
+def robots_kept(
+    algorithm: str, variant: str, wanted: int, suite: str = "guards-mujoco"
+) -> Callable[[], tuple[bool, str]]:
     def check():
-        kept = limits("guards-mujoco", algorithm, variant)
-        return kept == wanted, f"{kept} of {len(tasks_of('guards-mujoco'))}"
+        kept = limits(suite, algorithm, variant)
+        return kept == wanted, f"{kept} of {len(tasks_of(suite))}"
 
     return check
 
@@ -257,6 +259,12 @@ CLAIMS = (
         "keeps 17 of 18 limits",
         "results/guards-mujoco/table.csv",
         robots_kept("bc", "default+full-learned", 17),
+    ),
+    Claim(
+        "docs/guard.md",
+        "keep 16 of 18 limits under `adapt`",
+        "results/own-sight-mujoco/table.csv",
+        robots_kept("bc", "default+adapt-learned-own", 16, "own-sight-mujoco"),
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
     Claim("docs/judging.md", "Danger is told well", "results/judging.csv", judged("played_danger", "true_cost", 0.8)),
