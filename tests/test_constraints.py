@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,10 +11,11 @@ import pytest
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
-from ringfence import cli, guard, play, record, world, worlds
+from ringfence import cli, guard, play, record, training, world, worlds
 from ringfence.data.audit import audit
 from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
+from ringfence.report import build_report
 from tests.quick import QUICK_WORLD
 
 LIMITS = {"wall": 0.0, "fast": 10.0}
@@ -176,6 +178,16 @@ def test_learners_keep_every_limit(logs):
     kept = bc.within(logs, bc.Config(cost_limit=logs.card["cost_limit"]))
     assert 0 < kept.episodes < (logs.episode_costs <= 10).sum()
     assert (kept.episode_costs_of("wall") == 0).all() and (kept.episode_costs_of("fast") <= 10).all()
+
+
+def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path):
+    changes = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
+    run = training.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
+    told = play(run, Sleds, episodes=3, keep=True)["constraints"]
+    assert {k: v["limit"] for k, v in told.items()} == LIMITS
+    page = build_report([run], tmp_path / "page.html").read_text()
+    shown = re.findall(r"<td>(wall|fast)</td><td>([\d.]+)</td><td>(\d+)</td>", page)
+    assert shown == [(k, f"{told[k]['cost_mean']:.3f}", f"{v:g}") for k, v in LIMITS.items()]
 
 
 def test_simulators_that_change_their_constraints_are_refused(fitted):

@@ -112,15 +112,15 @@ class Constants(TypedDict):
     cost_offset: float
 
 
-class Constraint(TypedDict, total=False):
+class Constraint(TypedDict):
     """What a named one cost per episode."""
 
     cost_mean: float
-    cost_interval: Interval
     violation_rate: Share
-    violation_upper: Share
-    limit: float
-    within: Share
+    cost_interval: NotRequired[Interval]
+    violation_upper: NotRequired[Share]
+    limit: NotRequired[float]
+    within: NotRequired[Share]
 
 
 class Result(TypedDict, total=False):

@@ -18,6 +18,7 @@ from ringfence.files import whole
 from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
+from ringfence.report.pooling import mean_of
 from ringfence.report.table import NAMES, Row, Section, sections
 from ringfence.runs import Run
 from ringfence.words import shell
@@ -88,7 +89,12 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "unit": unit,
         "headline": headline(section),
         "tables": [
-            {"split": split, "rows": rows, "references": section.references if split == "test" else []}
+            {
+                "split": split,
+                "rows": rows,
+                "references": section.references if split == "test" else [],
+                "constraints": constraints(rows),
+            }
             for split, rows in section.tables.items()
         ],
         "constants": section.constants,
@@ -110,6 +116,18 @@ def _section(section: Section, k: int, out: Path) -> dict:
         "card": facts(section.card),
         "regenerated": regenerated(section.card),
     }
+
+
+def constraints(rows: list[Row]) -> list[dict]:
+    """What each named constraint cost the rows whose simulator told them apart, mean of their runs."""
+    found = []
+    for row in rows:
+        told = [result["constraints"] for _, result in row.members if "constraints" in result]
+        for name in told[0] if len(told) == len(row.members) and told else ():
+            each = [t[name] for t in told if name in t]
+            line = {k: mean_of(each, k) for k in ("cost_mean", "violation_rate", "limit", "within")}
+            found.append({"row": row, "name": name, **line})
+    return found
 
 
 # --- words ---
