@@ -262,11 +262,15 @@ def play(
         except UserError as error:
             refused.setdefault(str(error), []).append(run)
             continue
+        each = [
+            f"{terminal(name)} {c['cost_mean']:.3f}" + (f" of {c['limit']:g}" if "limit" in c else "")
+            for name, c in r.get("constraints", {}).items()
+        ]
         table.add_row(
             terminal(run.path),
             r["guard"],
             f"{r['return_mean']:.4g} ({r['return_interval'][0]:.4g} to {r['return_interval'][1]:.4g})",
-            f"{r['cost_mean']:.3f}",
+            "\n".join([f"{r['cost_mean']:.3f}", *each]),
             f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
             f"{100 * r['infeasible']:.2g} %" if "infeasible" in r else "",
         )
