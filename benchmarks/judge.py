@@ -44,6 +44,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--tasks", nargs="*")
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--without", default="", help="variants that hold this word, e.g. full, which takes minutes")
     args = parser.parse_args()
     rows = list(csv.DictReader(OUT.open())) if OUT.exists() else []
     done = {tuple(r[k] for k in HEAD[:4]) for r in rows}
@@ -57,6 +58,8 @@ def main() -> None:
         world = worlds.fit(store, seed=1)
         for variant, result in run.results.items():
             key = (told["task"], told["algorithm"], variant, str(told["seed"]))
+            if args.without and args.without in variant:
+                continue
             if key in done or (result.get("sight") == "own" and not task.alike):
                 continue
             how = {"planner": result["planner"]}

@@ -36,7 +36,7 @@ REFERENCE = {
         "ringfence.reference",
         "ringfence.zoo",
     ),
-    "Judging": ("ringfence.judging",),
+    "Judging": ("ringfence.judging.judge",),
     "Export": ("ringfence.export",),
     "World": ("ringfence.worlds", "ringfence.world"),
     "Parts of a World": (
