@@ -86,6 +86,7 @@ def main() -> None:
         rows.append([who, guard, danger, words, episodes, *measured, bound])
         print(rows[-1], flush=True)
         write(rows)
+    write(rows)
     put("docs/guard.md", "yard", table(OUT))
 
 
@@ -107,7 +108,7 @@ def table(file: Path) -> str:
     ways = {"": "", "future=False": ", 3 rows without V", "rows=7": ", 7 rows", "rows=10": ", 10 rows"}
     for r in csv.DictReader(file.open()):
         guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['danger']}{ways[r['options']]}"
-        bound = f" (≤ {100 * float(r['bound']):.2g} %)" if r["bound"] else ""
+        bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
         touched = f"{100 * float(r['contact']):.3g} %{bound}"
         lines.append(f"| {r['who']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} episodes |")
     return "\n".join(lines)
