@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from attribution import FULL, QUESTIONS, SHIELD, Question, answers
-from evidence import evaluations, mean, of, tasks_of
+from evidence import difference, evaluations, mean, of, tasks_of
 from readme import put
 from scipy.stats import spearmanr
 
@@ -195,6 +195,18 @@ def as_safe_by_v() -> tuple[bool, str]:
     return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {told} of episodes"
 
 
+def told_clones_earn() -> tuple[bool, str]:
+    """More than plain cloning and than the certificates on the same resets, and without contact."""
+    suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
+    better = [difference(suite, task, ("bc-return", key), twin, "return") for twin in (("bc", key), CERTIFICATES)]
+    touched = mean(suite, task, ("bc-return", key), "violation_rate")
+    told = ", ".join(f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})" for d in better)
+    return touched == 0 and all(d.low > 0 for d in better), f"{told} than cloning and than certificates; contact in 0 %"
+
+
+CERTIFICATES = ("certificates", "reference")
+
+
 def exported_in_time() -> tuple[bool, str]:
     slower = [float(r["stablehlo_ms"]) / float(r["controller_ms"]) for r in rows_of("export.csv")]
     return max(slower) <= 1.0, f"{min(slower):.2f} to {max(slower):.2f} of the controller's time"
@@ -246,6 +258,12 @@ CLAIMS = (
         "V with one row or three is as safe",
         "results/crossing-guards/table.csv",
         as_safe_by_v,
+    ),
+    Claim(
+        "docs/crossing.md",
+        "a clone that is told its return earns 4.94 under the same shield",
+        "results/crossing-guards/table.csv",
+        told_clones_earn,
     ),
     Claim(
         "docs/crossing.md",

@@ -52,8 +52,14 @@ WAYS = BESIDE | {
     "bc default+shield-formula+rows15+futureFalse": "shield, formula, 15 rows",
     "bc default+full-learned": "**full**",
     "mpc default+full-learned": "no prior (`mpc`), full",
-    "icbf default": "`icbf`",
-    "icbf default+shield-learned": "`icbf`, shield",
+    "bc-best default": "cloning the best tenth",
+    "bc-best default+shield-learned": "cloning the best tenth, shield",
+    "bc-return default": "cloning told its return",
+    "bc-return default+shield-learned": "cloning told its return, shield",
+    "bc-safe default": "cloning episodes without contact",
+    "bc-safe default+shield-learned": "cloning episodes without contact, shield",
+    "icbf split": "`icbf`",
+    "icbf split+shield-learned": "`icbf`, shield",
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
