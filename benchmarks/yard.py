@@ -35,6 +35,7 @@ ROWS = (
     ("cloning", "shield", "learned", {}, 1),
     ("cloning", "shield", "formula", {}, 1),
     ("cloning", "full", "learned", {}, 5),
+    ("cloning", "full", "learned", {"rows": 3, "future": True}, 5),
     ("cloning", "full", "formula", {}, 5),
     ("blind", "none", "none", {}, 1),
     ("blind", "shield", "learned", {"future": False}, 1),
@@ -106,6 +107,7 @@ def write(rows: list[list]) -> None:
 def table(file: Path) -> str:
     lines = ["| who | guard | return | episodes with contact (bound) | made of |", "|---|---|---|---|---|"]
     ways = {"": "", "future=False": ", 3 rows without V", "rows=7": ", 7 rows", "rows=10": ", 10 rows"}
+    ways |= {"rows=3 future=True": ", 3 rows"}
     for r in csv.DictReader(file.open()):
         guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['danger']}{ways[r['options']]}"
         bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -23,7 +22,7 @@ from ringfence.episodes import given_as
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.files import writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
-from ringfence.guards.policy import build, costs_of_one
+from ringfence.guards.policy import Paid, build, costs_of_one
 from ringfence.hazards import BoundHazard
 from ringfence.policies import PLANNERS, Planner, PlanOptions
 from ringfence.progress import Progress
@@ -377,12 +376,7 @@ class Controller:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._memory = self.policy.start(1)
 
-    def act(
-        self,
-        observations: np.ndarray,
-        state: np.ndarray | None = None,
-        cost: float | Mapping[str, float] | None = None,
-    ) -> np.ndarray:
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
         """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
         constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so
         is what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow

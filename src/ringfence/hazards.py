@@ -93,6 +93,11 @@ def least(x: list[Array]) -> Array:
     return functools.reduce(jnp.minimum, x)
 
 
+def lowest(x: Array) -> Array:
+    """(...,) the least of the last axis, of agents or constraints, as `least` takes it."""
+    return least([x[..., k] for k in range(x.shape[-1])])
+
+
 def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
     """Resolve a hazard's feature names; an absent one is refused with the nearest name."""
     if isinstance(hazard, CostColumn):

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from ringfence.errors import UserError
 from ringfence.guards.danger import Danger
-from ringfence.hazards import least
+from ringfence.hazards import lowest
 from ringfence.types import Array, Key
 from ringfence.world import World
 from ringfence.world.dynamics import Dynamics
@@ -160,7 +160,7 @@ class Guard(eqx.Module):
 
     def clear(self, rows: Array, spread: Array, margin: Array) -> Array:
         """(B, P, K, N) by how much the scores of foreseen rows pass the margins; of several constraints the worst."""
-        return _least(self.danger.along(rows, spread) - _over(margin, 2))
+        return lowest(self.danger.along(rows, spread) - _over(margin, 2))
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
         """(B, K, N) how much foreseen rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
@@ -168,7 +168,7 @@ class Guard(eqx.Module):
         o = self.options
         if o.condition == "margin":
             return jnp.minimum(clear, 0.0)
-        now = _least(self.danger.now(present, present) - _over(margin, 0))[:, None]
+        now = lowest(self.danger.now(present, present) - _over(margin, 0))[:, None]
         before = jnp.concatenate([now, clear[:, :-1]], 1)
         return jnp.minimum(clear - (1.0 - o.alpha) * before, 0.0)
 
@@ -288,11 +288,6 @@ def _over(margin: Array, axes: int) -> Array:
     """Margins (B, C) or (B, N, C) with that many axes after the first, and those of agents and constraints last."""
     agents = 1 if margin.ndim == 2 else margin.shape[1]
     return margin.reshape(margin.shape[0], *[1] * axes, agents, margin.shape[-1])
-
-
-def _least(x: Array) -> Array:
-    """The worst of all constraints, the last axis."""
-    return least([x[..., c] for c in range(x.shape[-1])])
 
 
 def pick(safety: Array, value: Array, margin: Array | float) -> Array:

@@ -24,6 +24,8 @@ from ringfence.world import World
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 
+Paid = float | Mapping[str, float]  # what a step cost, in all or by each constraint's name
+
 
 class Guarded(eqx.Module):
     """A proposal under guard; itself a policy (types.Policy).
@@ -115,7 +117,7 @@ class Guarded(eqx.Module):
         return memory, held(action, g.options.rows), {}
 
 
-def costs_of_one(cost: float | Mapping[str, float]) -> np.ndarray | dict[str, np.ndarray]:
+def costs_of_one(cost: Paid) -> np.ndarray | dict[str, np.ndarray]:
     """What one environment's step cost, as `hear` takes it."""
     one = lambda c: np.full(1, c, np.float32)  # noqa: E731
     return {k: one(c) for k, c in cost.items()} if isinstance(cost, Mapping) else one(cost)
@@ -213,12 +215,7 @@ class Pilot:
         """Begin an episode."""
         self._memory = self.policy.start(1)
 
-    def act(
-        self,
-        observations: np.ndarray,
-        state: np.ndarray | None = None,
-        cost: float | Mapping[str, float] | None = None,
-    ) -> np.ndarray:
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
         """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, in all or
         by each constraint's name, which an adapting guard follows."""
         wanted = self.policy.function(observations, state)

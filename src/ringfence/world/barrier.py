@@ -27,7 +27,7 @@ import numpy as np
 import optax
 
 from ringfence.features import FeatureMap
-from ringfence.hazards import least
+from ringfence.hazards import least, lowest
 from ringfence.nets.mlp import MLP
 from ringfence.optim import regress
 from ringfence.types import Array, Key
@@ -101,10 +101,10 @@ class Worst(eqx.Module):
         return self.each[0].shape
 
     def of_steps(self, before: Array, after: Array) -> Array:
-        return least([b.of_steps(before, after) / b.unit for b in self.each])
+        return lowest(self.apart(before, after))
 
     def ahead(self, x: Array) -> Array:
-        return least([b.ahead(x) / b.unit for b in self.each])
+        return lowest(self.ahead_apart(x))
 
     def apart(self, before: Array, after: Array) -> Array:
         """ℓ (..., N, C) of each constraint."""
@@ -211,11 +211,6 @@ def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]
     return least(parts)
 
 
-def team_score(scores: Array, shape: Shape) -> Array:
-    """(...,) the worst agent's of (..., N)."""
-    return least([scores[..., i] for i in range(scores.shape[-1])])
-
-
 # --- fitting ---
 
 
@@ -255,7 +250,7 @@ def fit_label(
         z = barrier._seen(before, after)
         h = _score(net, shape, z, after.shape[:-1])
         if told.ndim == 1 and shape.blame == "worst":
-            h = team_score(h, shape)
+            h = lowest(h)
         elif told.ndim == 1:
             told = jnp.broadcast_to(told[:, None], h.shape)
         if loss == "cross-entropy":

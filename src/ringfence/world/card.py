@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.hazards import lowest
 from ringfence.types import Array
-from ringfence.world.barrier import Barrier, Worst, team_score
+from ringfence.world.barrier import Barrier, Worst
 from ringfence.world.world import World
 
 VERSION = 7  # of the judgement: cached cards of another are made again
@@ -162,11 +163,11 @@ def _barrier(
 
     @jax.jit
     def score(barrier, before, after):
-        return team_score(barrier.of_steps(before, after), barrier.shape)
+        return lowest(barrier.of_steps(before, after))
 
     @jax.jit
     def ahead(barrier, after):
-        return team_score(barrier.ahead(after), barrier.shape)
+        return lowest(barrier.ahead(after))
 
     parts = [steps[i : i + 20_000] for i in range(0, len(steps), 20_000)]
     h = np.concatenate([np.asarray(score(barrier, x[row[p]], x[row[p] + 1])) for p in parts])
@@ -219,7 +220,7 @@ def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
         def worst(actions: Array) -> Array:
             def step(before: Array, action: Array):
                 after, _ = world.dynamics.step(before, action)
-                h = team_score(world.barrier.of_steps(before, after), world.barrier.shape)
+                h = lowest(world.barrier.of_steps(before, after))
                 return after, h
 
             return jax.lax.scan(step, x, actions)[1].min(0)
