@@ -63,6 +63,11 @@ WAYS = BESIDE | {
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
+SIZES = {
+    f"bc default{guard}" + (f"+agents{n}" if n != 3 else ""): f"{n} agents{', as in the logs' * (n == 3)}, {words}"
+    for n in (3, 2, 4, 6)
+    for guard, words in (("", "cloning"), ("+shield-learned", "**shield**"), ("+full-learned", "full"))
+}
 OWN_ROBOTS = {
     "cloning": ("bc", "default"),
     "adapt, learned, own sight": ("bc", "default+adapt-learned-own"),
@@ -79,6 +84,7 @@ def main() -> None:
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
+    put("docs/crossing.md", "sizes", crossing("spread-teams", SIZES))
     put("docs/crossing.md", "other", other_simulator())
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -136,7 +137,7 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
     if n_agents < 2 and not nearest:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
     # `other0.seen` says that not all others are told, but those who come nearest.
-    told = sum(name.endswith(".seen") for name in names) if nearest else n_agents - 1
+    told = sum(bool(re.fullmatch(r"other\d+\.seen", name)) for name in names) if nearest else n_agents - 1
     relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(told)]
     if all(a in names and b in names for a, b in relative):
         index = np.array([[names.index(a), names.index(b)] for a, b in relative])  # (N-1, 2)

@@ -8,9 +8,9 @@ from types import ModuleType
 import numpy as np
 
 from ringfence import features, hazards
-from ringfence.data.recipes import crossing, robots, spread
+from ringfence.data.recipes import crossing, robots, spread, spread_alike
 from ringfence.data.store import EpisodeStore
-from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
+from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike
 from ringfence.envs.mujoco import Parts
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.types import Env, Spec
@@ -103,6 +103,19 @@ def _spread(tier: str, mean: float, deviation: float, transitions: int = 1_000_0
     )
 
 
+def _spread_alike(tier: str) -> Task:
+    """A million agent-steps, told in the views of each agent."""
+    return Task(
+        f"spread_alike-{tier}",
+        SpreadAlike(),
+        tier=tier,
+        transitions=333_350,
+        recipe=spread_alike,
+        alike=True,
+        **_SPREAD,
+    )
+
+
 ROBOT_COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
 # OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return.
 _ROBOTS: dict[Parts, dict[str, float]] = {
@@ -184,6 +197,8 @@ TASKS = {
         *(_robot(*facts) for facts in _ROBOT_TIERS),
         *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
         *(_crossing(tier) for tier in crossing.TIERS),
+        _spread_alike("expert"),
+        _spread_alike("medium"),
     )
 }
 

@@ -26,7 +26,12 @@ EVALUATIONS: dict[str, dict] = {
         for danger, rows in (("learned", 1), ("learned", 3), ("learned", 7), ("learned", 15), ("formula", 15))
     },
     "shield-learned+rows1": {"guard": "shield", "danger": "learned", "rows": 1},
-    **{f"shield-learned+agents{n}": {"guard": "shield", "danger": "learned", "agents": n} for n in (4, 16, 64, 256)},
+    **{
+        f"shield-learned+agents{n}": {"guard": "shield", "danger": "learned", "agents": n}
+        for n in (2, 4, 6, 16, 64, 256)
+    },
+    **{f"full-learned+agents{n}": {"guard": "full", "danger": "learned", "agents": n} for n in (2, 4, 6)},
+    **{f"agents{n}": {"agents": n} for n in (2, 4, 6)},
     **{
         f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"}
         for guard in ("shield", "adapt", "full")
@@ -173,6 +178,20 @@ SUITES = {
         _CROSSING[:1],
         (Entry("bc", evaluations=("shield-learned", *(f"shield-learned+agents{n}" for n in (4, 16, 64, 256)))),),
         episodes=50,
+    ),
+    # Simple Spread's three, each by its own view, in teams of another size.
+    "spread-teams": Suite(
+        ("spread_alike-expert",),
+        (
+            Entry(
+                "bc",
+                evaluations=tuple(
+                    (f"{how}+" if how else "") + f"agents{n}" if n else how or "plain"
+                    for how in ("", "shield-learned", "full-learned")
+                    for n in (0, 2, 4, 6)
+                ),
+            ),
+        ),
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
     "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=("plain", "shield-learned-own", "full-learned-own")),)),

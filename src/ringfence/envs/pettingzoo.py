@@ -16,6 +16,7 @@ from pettingzoo import ParallelEnv
 from ringfence.envs.crossing import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.simple_spread import AGENT_RADIUS, CONTACT_DISTANCE, SimpleSpread
+from ringfence.envs.spread_alike import SpreadAlike
 from ringfence.errors import UserError
 
 LANDMARK_RADIUS = 0.05
@@ -126,9 +127,10 @@ class SimpleSpreadParallel(_Plane):
     `clearance` the own smallest centre distance to another agent minus 0.30 (infinite for a single agent)."""
 
     metadata = {**_Plane.metadata, "name": "ringfence_simple_spread"}
+    simulator: type = SimpleSpread
 
     def __init__(self, render_mode: str | None = None, **options: Any):
-        super().__init__(SimpleSpread(**options), render_mode)
+        super().__init__(self.simulator(**options), render_mode)
 
     def render(self) -> np.ndarray | None:
         """(480, 480, 3) uint8 for render_mode "rgb_array": agents blue, in contact red, landmarks grey."""
@@ -155,6 +157,13 @@ class SimpleSpreadParallel(_Plane):
         distance = np.linalg.norm(position[:, None] - position[None], axis=-1)
         np.fill_diagonal(distance, np.inf)
         return distance.min(1) - CONTACT_DISTANCE
+
+
+class SpreadAlikeParallel(SimpleSpreadParallel):
+    """The same in views that any number of agents have alike; `cost` is each agent's own."""
+
+    metadata = {**_Plane.metadata, "name": "ringfence_spread_alike"}
+    simulator = SpreadAlike
 
 
 class CrossingParallel(_Plane):

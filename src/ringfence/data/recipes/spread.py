@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
+import numpy as np
 
 from ringfence import __version__
 from ringfence.data import behaviour as policies
 from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
+from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
 if TYPE_CHECKING:
@@ -51,15 +53,17 @@ def relabelled(task: Task, store: EpisodeStore) -> None:
 
 def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
     """The data set of a tier."""
-    env, tier = task.env, task.tier
-    episodes = transitions // env.episode_length
-    if tier == "medium-replay":
-        played = policies.replay_episodes(env, episodes, seed)
-        how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
-    else:
-        policy = policies.shipped_policy(tier) if tier in policies.TARGETS else "random"
-        played = policies.collect(env, policy, episodes, jax.random.fold_in(jax.random.key(COLLECTION), seed))
-        how = "uniform actions" if policy == "random" else f"MATD3 policy, Gaussian action noise {policy.noise:g}"
-    arrays = (played[k] for k in ("observations", "actions", "rewards", "costs"))
+    made, how = played(task.env, task.tier, transitions // task.env.episode_length, seed)
+    arrays = (made[k] for k in ("observations", "actions", "rewards", "costs"))
     card = card | {"transitions": transitions, "collected": how}
-    return EpisodeStore.from_episodes(*arrays, state=played["state"], card=card)
+    return EpisodeStore.from_episodes(*arrays, state=made["state"], card=card)
+
+
+def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
+    """A tier's episodes (E, L, ...), and by whom, in words."""
+    if tier == "medium-replay":
+        how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
+        return policies.replay_episodes(env, episodes, seed), how
+    policy = policies.shipped_policy(tier) if tier in policies.TARGETS else "random"
+    how = "uniform actions" if policy == "random" else f"MATD3 policy, Gaussian action noise {policy.noise:g}"
+    return policies.collect(env, policy, episodes, jax.random.fold_in(jax.random.key(COLLECTION), seed)), how
