@@ -38,6 +38,7 @@ from ringfence.errors import UserError
 from ringfence.guards import GUARDS, GuardOptions
 from ringfence.hazards import Separation, to_dict
 from ringfence.runs import Run
+from ringfence.world import Settings
 
 QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], steps=20, transitions=500)
 
@@ -89,8 +90,14 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
     Run(cell.folder(tmp_path)).add_result("default+shield-learned", told)
     assert cell.state(tmp_path, 4) == "done"
     assert cell.state(tmp_path, 5) == "to do"
-    monkeypatch.setitem(GUARDS, "shield", {**GUARDS["shield"], "rows": 5})
-    assert cell.state(tmp_path, 4) == "to do"
+    with monkeypatch.context() as patch:
+        patch.setitem(GUARDS, "shield", {**GUARDS["shield"], "rows": 5})
+        assert cell.state(tmp_path, 4) == "to do"
+    world = grid.dataclasses.asdict(Settings(labels="formula"))  # which follows from the data
+    for change, state in (({}, "done"), ({"members": 5}, "to do"), ({"view": "centralized"}, "to do")):
+        stored = told | {"world_settings": world | change}
+        Run(cell.folder(tmp_path)).add_result("default+shield-learned", stored)
+        assert cell.state(tmp_path, 4) == state
 
 
 def test_playing_again_does_not_change_what_training_took(made, tmp_path):

@@ -533,6 +533,7 @@ def about(run: Run, job: training.Job, policy: Policy, how: Asked) -> dict:
         "sight": worlds.sight_of(job.task, how.sight),
         "agents": job.team,
         "guard_options": dataclasses.asdict(guards) if guards else {},
+        **({"world_settings": policy.guard.world.card["settings"]} if guards else {}),
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(policy),
     }

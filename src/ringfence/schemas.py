@@ -162,6 +162,7 @@ class Result(TypedDict, total=False):
     sight: str
     agents: Few
     guard_options: dict[str, Scalar]
+    world_settings: dict[str, Scalar]
     infeasible: float
     strange: float
     eval_seconds: float

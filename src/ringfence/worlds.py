@@ -25,7 +25,7 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     safe steps from unsafe ones, else from its formula; without either, no barrier."""
     task = task or tasks.from_store(store)
     sight = sight_of(task, changes.pop("sight", None))
-    told = {**_usual(task, sight), "sight": sight}
+    told = usual(task, sight)
     costs = store.costs > 0
     if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
         formula = not isinstance(task.hazard, hazards.CostColumn)
@@ -43,9 +43,9 @@ def sight_of(task: Task, wanted: str | None = None) -> str:
     return wanted or ("own" if task.alike else "all")
 
 
-def _usual(task: Task, sight: str) -> dict:
-    """What a task asks of its World, unless told otherwise."""
-    return {"view": "decentralized" if sight == "own" else "pruned", **task.world}
+def usual(task: Task, sight: str) -> dict:
+    """What a task asks of its World, unless told otherwise: the fields of `Settings` that are not as everywhere."""
+    return {"view": "decentralized" if sight == "own" else "pruned", **task.world, "sight": sight}
 
 
 def fit(
@@ -103,9 +103,9 @@ def for_guard(
     if read is not None or (run.path / WORLD).exists():
         found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.
-        usual = Settings(**_usual(tasks.TASKS[run.config["task"]], sight)) if _made_here(run) else None
+        wanted = Settings(**usual(tasks.TASKS[run.config["task"]], sight)) if _made_here(run) else None
         told = found.card["settings"]
-        same = usual is None or (usual.view, usual.discount) == (told["view"], told["discount"])
+        same = wanted is None or (wanted.view, wanted.discount) == (told["view"], told["discount"])
         if same and found.alone == (sight == "own"):
             return found
     return _of_data(run, sight, quiet)

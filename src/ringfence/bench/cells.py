@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ringfence import __version__, algos, evaluate, hazards, reference, schemas, tasks, training
+from ringfence import __version__, algos, evaluate, hazards, reference, schemas, tasks, training, worlds
 from ringfence.bench.packed import unpack
 from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
 from ringfence.data.make import make
@@ -32,6 +32,7 @@ from ringfence.files import whole
 from ringfence.guards import GuardOptions, options_of
 from ringfence.policies import PLANNERS, PlanOptions
 from ringfence.runs import Run, build_config, write_json
+from ringfence.world import Settings
 
 FORMAT = 1  # of a results folder
 DAMAGED = "has a damaged status.json; delete that file"
@@ -94,7 +95,7 @@ class Cell:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
             same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
-            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task).guard)
+            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task))
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -109,9 +110,9 @@ class Cell:
         return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {}
 
 
-def same_options(stored: dict, evaluation: dict, usual: Mapping[str, dict]) -> bool:
-    """Whether a result was played with the options of planner and guard that an evaluation's name stands for today,
-    where `usual` are those that the task's simulator asks for."""
+def same_options(stored: dict, evaluation: dict, task: tasks.Task) -> bool:
+    """Whether a result was played with the options of planner and guard that an evaluation's name stands for on a task
+    today, and in a World of the settings that it has there. What labels come from follows from the data."""
     how = evaluate.asked(**evaluation)
     plan = dataclasses.asdict(PlanOptions(**{**PLANNERS[how.planner], **how.plan}))
     if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
@@ -119,9 +120,12 @@ def same_options(stored: dict, evaluation: dict, usual: Mapping[str, dict]) -> b
     guard = stored.get("guard_options") or {}
     if not how.guarded:
         return not guard
-    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, usual, **how.given)))
+    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, task.guard, **how.given)))
     told = {**dataclasses.asdict(GuardOptions()), **guard}  # an option newer than the result had its default then
-    return bool(guard) and told == wanted
+    world = Settings(**worlds.usual(task, worlds.sight_of(task, how.sight)))
+    fitted = stored.get("world_settings") or {}  # results of before say nothing of it
+    known = {k: v for k, v in dataclasses.asdict(world).items() if k not in ("labels", "barrier")}
+    return bool(guard) and told == wanted and all(fitted.get(k, v) == v for k, v in known.items())
 
 
 @dataclass(frozen=True)
