@@ -1,11 +1,14 @@
-"""What is in every data set of the tasks, the numbers of docs/data.md: `python benchmarks/data_sets.py` writes
-results/data.csv."""
+"""What is in every data set of the tasks, the numbers of docs/data.md.
+
+python benchmarks/data_sets.py            # writes results/data.csv; tasks that are named are added or made anew
+"""
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
-from _rows import write
+from _rows import read, write
 
 from ringfence import tasks
 from ringfence.data.audit import disagreement
@@ -38,11 +41,14 @@ def row(name: str) -> dict:
 
 
 def main() -> None:
-    rows = []
-    for name in tasks.TASKS:
-        rows.append(row(name))
-        print(*(f"{k}={v}" for k, v in rows[-1].items()), flush=True)
-    write(OUT, rows)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("tasks", nargs="*", help="all by default")
+    wanted = parser.parse_args().tasks or list(tasks.TASKS)
+    found = {r["task"]: r for r in read(OUT)}
+    for name in wanted:
+        found[name] = row(name)
+        print(*(f"{k}={v}" for k, v in found[name].items()), flush=True)
+        write(OUT, [found[name] for name in tasks.TASKS if name in found])
 
 
 if __name__ == "__main__":

@@ -63,11 +63,7 @@ WAYS = BESIDE | {
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
-SIZES = {
-    f"bc default{guard}" + (f"+agents{n}" if n != 3 else ""): f"{n} agents{', as in the logs' * (n == 3)}, {words}"
-    for n in (3, 2, 4, 6)
-    for guard, words in (("", "cloning"), ("+shield-learned", "**shield**"), ("+full-learned", "full"))
-}
+SIZES = {"cloning": "", "shield": "+shield-learned", "full": "+full-learned"}
 OWN_ROBOTS = {
     "cloning": ("bc", "default"),
     "adapt, learned, own sight": ("bc", "default+adapt-learned-own"),
@@ -84,7 +80,7 @@ def main() -> None:
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
-    put("docs/crossing.md", "sizes", crossing("spread-teams", SIZES))
+    put("docs/crossing.md", "sizes", sizes())
     put("docs/crossing.md", "other", other_simulator())
 
 
@@ -146,6 +142,20 @@ def crossing(suite: str, named: dict[str, str]) -> str:
             part += [f"{100 * mean(found, 'infeasible'):.2g} %" if found[0]["infeasible"] else ""]
             part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]
             out.append("| " + " | ".join(part) + " |")
+    return "\n".join(out)
+
+
+def sizes() -> str:
+    """A row per number of agents, a column per guard."""
+    rows = list(csv.DictReader((RESULTS / "spread-teams" / "table.csv").open()))
+    out = ["| agents | " + " | ".join(SIZES) + " |", "|---" * (1 + len(SIZES)) + "|"]
+    for n in (2, 3, 4, 6):
+        cells = []
+        for guard in SIZES.values():
+            name = f"default{guard}" + f"+agents{n}" * (n != 3)
+            found = [r for r in rows if (r["algorithm"], r["variant"]) == ("bc", name)]
+            cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'avoidable_cost'):.3f} ({len(found)} seeds)")
+        out.append(f"| {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 

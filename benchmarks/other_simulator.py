@@ -4,8 +4,9 @@ acceleration, its own integration and its own detection of contact.
     pip install ir-sim
     python benchmarks/other_simulator.py      # writes results/other_simulator.csv; half an hour
 
-Two ways: cloning and World learned from `crossing-hasty`'s logs, played there; and logs recorded there, of robots that
-follow IR-SIM's reciprocal velocity obstacles and trust their brakes too much, learned and played like anybody's own.
+Three ways: cloning and World learned from `crossing-hasty`'s logs, played there; and logs recorded there, learned and
+played like anybody's own: of robots that follow IR-SIM's reciprocal velocity obstacles and trust their brakes too much,
+and of teams in which two of the eight make straight for their goals and look at nobody.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
-from _rows import write
+from _rows import read, write
 
 from ringfence import EpisodeStore, Separation, tasks, training, worlds
 from ringfence.data.make import make
@@ -41,11 +42,11 @@ class IrSim:
 
     metadata: dict = {}
 
-    def __init__(self, n: int = 8, behaviour: str | None = None):
+    def __init__(self, n: int = 8, behaviour: str | None = None, blind: int = 0):
         self.n, self.side = n, Crossing(n_agents=n).side
         self.possible_agents = [f"agent{i}" for i in range(n)]
         robots = {
-            "number": n,
+            "number": n - blind,
             "kinematics": {"name": "omni"},
             "shape": {"name": "circle", "radius": RADIUS},
             "vel_max": [1.0, 1.0],
@@ -55,10 +56,11 @@ class IrSim:
         }
         if behaviour:
             robots["behavior"] = {"name": behaviour, "vxmax": 0.9, "vymax": 0.9, "acce": BELIEVED}
+        groups = [robots] if not blind else [robots, robots | {"number": blind, "behavior": {"name": "dash"}}]
         size = 10 * self.side  # far enough that nobody meets its walls
         world = {"height": size, "width": size, "offset": [-size / 2, -size / 2], "step_time": DT, "sample_time": DT}
         with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
-            yaml.safe_dump({"world": world | {"collision_mode": "unobstructed"}, "robot": [robots]}, file)
+            yaml.safe_dump({"world": world | {"collision_mode": "unobstructed"}, "robot": groups}, file)
         self.sim = irsim.make(file.name, display=False, disable_all_plot=True, log_level="CRITICAL")
         os.unlink(file.name)
         self.velocity = np.zeros((n, 2))
@@ -125,9 +127,10 @@ class IrSim:
         return dict(zip(self.possible_agents, np.asarray(LOOK[self.n](state))[0]))
 
 
-def record(episodes: int) -> EpisodeStore:
-    """Logs of IR-SIM's robots under its reciprocal velocity obstacles; pushes are what their velocities did."""
-    env, kept = IrSim(behaviour="rvo"), {k: [] for k in ("observations", "actions", "rewards", "costs")}
+def record(episodes: int, blind: int) -> EpisodeStore:
+    """Logs of IR-SIM's robots under its reciprocal velocity obstacles, but for some; pushes are what their velocities
+    did."""
+    env, kept = IrSim(behaviour="rvo", blind=blind), {k: [] for k in ("observations", "actions", "rewards", "costs")}
     for e in range(episodes):
         seen, _ = env.reset(seed=e)
         rows = [list(seen.values())]
@@ -142,7 +145,7 @@ def record(episodes: int) -> EpisodeStore:
         for k, v in steps.items():
             kept[k].append(v)
     card = {
-        "task": "irsim-rvo",
+        "task": f"irsim-rvo-{blind}-blind" if blind else "irsim-rvo",
         "provenance": "recorded in IR-SIM, robots under its reciprocal velocity obstacles",
         "simulator": f"ir-sim {irsim.__version__}",
         "observation_names": list(Crossing().observation_names),
@@ -157,9 +160,11 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200, help="that are played, each way")
     parser.add_argument("--logs", type=int, default=600, help="episodes that are recorded")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--of", nargs="+", help="these sources alone, by their words; other rows stay as they are")
     a = parser.parse_args()
     logging.disable(logging.CRITICAL)
-    rows = []
+    mine = {f"{words}{more}" for words in a.of or () for more in ("", " themselves")}
+    rows = [r for r in read(OUT) if a.of and r["learned from"] not in mine]
 
     def played(words: str, run, world, n: int, **guard) -> None:
         told = {} if not guard else {"world": world} | guard
@@ -172,11 +177,11 @@ def main() -> None:
         print(row, flush=True)
         write(OUT, rows)
 
-    with tempfile.TemporaryDirectory() as folder:
-        logs = record(a.logs)
+    def recorded(words: str, blind: int) -> EpisodeStore:
+        logs = record(a.logs, blind)
         rows.append(
             {
-                "learned from": "the logs themselves",
+                "learned from": f"{words} themselves",
                 "agents": 8,
                 "guard": "none",
                 "seed": a.seed,
@@ -189,7 +194,16 @@ def main() -> None:
             }
         )
         print(rows[-1], flush=True)
-        for words, store in (("crossing-hasty", make(tasks.get("crossing-hasty"))[0]), ("logs of IR-SIM", logs)):
+        return logs
+
+    sources = {
+        "crossing-hasty": lambda words: make(tasks.get("crossing-hasty"))[0],
+        "logs of IR-SIM": lambda words: recorded(words, 0),
+        "logs of IR-SIM, two of eight blind": lambda words: recorded(words, 2),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        for words in a.of or sources:
+            store = sources[words](words)
             world = worlds.fit(store, seed=a.seed, quiet=False)
             (run,) = training.train("bc", store, seeds=(a.seed,), out=Path(folder), quiet=True)
             played(words, run, world, 8)

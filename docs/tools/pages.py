@@ -95,6 +95,7 @@ SUITES = (
     "crossing",
     "crossing-guards",
     "crossing-teams",
+    "spread-teams",
 )
 NAMED = ("algorithm", "variant", "guard", "danger", "sight", "agents")  # what a row of a table is called by
 # Pages that stand outside docs/, and their places on the site.
