@@ -215,7 +215,7 @@ def no_size_touches() -> tuple[bool, str]:
 
 
 def has_to_have_seen() -> tuple[bool, str]:
-    """A World of logs with contact in one episode of twenty leaves most episodes with contact, one of blind drivers none."""
+    """Logs with contact in one episode of twenty teach a World that leaves most with it; of blind drivers, none."""
     words = "logs of IR-SIM"
     few, many = (
         [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight blind")
