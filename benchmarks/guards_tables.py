@@ -51,15 +51,25 @@ WAYS = BESIDE | {
     "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
     "bc default+shield-formula+rows15+futureFalse": "shield, formula, 15 rows",
     "bc default+full-learned": "**full**",
-    "mpc default+full-learned": "no prior (`mpc`), full",
+    "bc default+full-learned+reach2.0": "full that climbs anywhere",
+    "mpc default+full-learned+reach2.0": "no prior (`mpc`), full that climbs anywhere",
     "bc-best default": "cloning the best tenth",
     "bc-best default+shield-learned": "cloning the best tenth, shield",
     "bc-return default": "cloning told its return",
     "bc-return default+shield-learned": "cloning told its return, shield",
     "bc-safe default": "cloning episodes without contact",
     "bc-safe default+shield-learned": "cloning episodes without contact, shield",
-    "icbf split": "`icbf`",
-    "icbf split+shield-learned": "`icbf`, shield",
+    **{
+        f"{name}{more}": words + (", shield" if more else "")
+        for name, words in (
+            ("ma-td3bc default", "MA-TD3+BC"),
+            ("ma-td3bc-lag default", "MA-TD3+BC, Lagrange"),
+            ("omar default", "OMAR"),
+            ("madiff default", "our MADIFF"),
+            ("icbf split", "`icbf`"),
+        )
+        for more in ("", "+shield-learned")
+    },
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}

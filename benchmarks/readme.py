@@ -124,7 +124,7 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
     "MA-TD3+BC with a Lagrange multiplier": (
         ("simple_spread", "ma-td3bc-lag", ""),
         ("mujoco", "ma-td3bc-lag", ""),
-        None,
+        ("crossing-guards", "ma-td3bc-lag", "default"),
     ),
     "our MADIFF, 6000 updates": (("guards", "madiff", "long"), ("mujoco", "madiff", ""), None),
     "ICBF-Diffuser, losses as printed, 1500 (robots 6000)": (

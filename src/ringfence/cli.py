@@ -210,11 +210,19 @@ def evaluate(
             f"{r['cost_mean']:.3f}",
             f"{r['avoidable_cost']:.3f}",
             f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
-            f"{r['return_norm']:.3f}",
+            f"{r['return_norm']:.3f}" if _of_usual_size(r) else "–",  # constants are those of the logs' team
             f"{r['cost_norm']:.3f}",
             f"{100 * r['termination_rate']:.0f} %",
         )
     _told(table, refused, len(found))
+
+
+def _of_usual_size(r: dict) -> bool:
+    """Whether as many agents played as a task's constants are of."""
+    from ringfence.tasks import TASKS
+
+    task = TASKS.get(r["task"])
+    return task is None or r["agents"] == task.env.n_agents
 
 
 def play(
