@@ -224,6 +224,16 @@ def has_to_have_seen() -> tuple[bool, str]:
     return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {told} of episodes"
 
 
+def error_costs_nothing() -> tuple[bool, str]:
+    """The simulator itself as the World's dynamics: intervals of return and cost reach 0 under shield and `full`."""
+    rows = rows_of("ablations.csv", way="the true dynamics")
+    told = "; ".join(
+        f"{r['guard']} {r['more_return']} ({r['more_return_low']} to {r['more_return_high']})" for r in rows
+    )
+    reach = [float(r[f"more_{k}_low"]) <= 0 <= float(r[f"more_{k}_high"]) for r in rows for k in ("return", "cost")]
+    return len(rows) == 2 and all(reach), f"return {told}"
+
+
 def of_irsim(words: str) -> list[dict[str, str]]:
     return rows_of("other_simulator.csv", guard="shield", **{"learned from": words})
 
@@ -294,6 +304,7 @@ CLAIMS = (
     ),
     Claim("docs/crossing.md", "Nobody touches in any size", "results/spread-teams/table.csv", no_size_touches),
     Claim("docs/crossing.md", "a barrier needs to have seen danger", "results/other_simulator.csv", has_to_have_seen),
+    Claim("docs/ablations.md", "The World's error costs nothing", "results/ablations.csv", error_costs_nothing),
     Claim("docs/guard.md", "One barrier for both loses contact", "results/constraints.csv", one_barrier_loses),
     Claim("docs/guard.md", "and not for who never brakes", "results/yard.csv", brakes_in_time),
     Claim("docs/guard.md", "it knows what is dangerous, not what will be", "results/yard.csv", learned_sees_more),

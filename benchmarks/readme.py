@@ -57,6 +57,7 @@ ROBOT_ROWS = (
     ("bc", "mujoco", "BC"),
     ("bc-safe", "mujoco", "BC on the cheapest episodes"),
     ("ma-td3bc", "mujoco", "MA-TD3+BC"),
+    ("ma-td3bc", "mujoco-long", "MA-TD3+BC, four times the updates"),
     ("omar", "mujoco", "OMAR"),
     ("ma-cql", "mujoco", "MA-CQL"),
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),

@@ -203,7 +203,13 @@ MA_TD3BC = Algorithm(
     make_update,
     ac.no_diagnosis,
     ac.make_policy,
-    {"default": {}, "centralised": {"centralised_critic": True}, "random": {"steps": 6_000}, "mujoco": _MUJOCO},
+    {
+        "default": {},
+        "centralised": {"centralised_critic": True},
+        "random": {"steps": 6_000},
+        "mujoco": _MUJOCO,
+        "mujoco-long": {**_MUJOCO, "steps": 40_000},  # where it earns what is published on Ants' good tiers
+    },
     reads=reads,
 )
 MA_TD3BC_LAG = replace(

@@ -111,6 +111,7 @@ SUITES = {
             Entry("bc"),
             Entry("bc-safe"),
             Entry("ma-td3bc"),
+            Entry("ma-td3bc", "mujoco-long"),
             Entry("ma-td3bc-lag"),
             Entry("fisor"),
             Entry("omar"),

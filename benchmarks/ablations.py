@@ -1,0 +1,203 @@
+"""What each choice of a guard is worth: every row differs in one thing from the default of the same policy and guard,
+and is tested against it on the same resets.
+
+    python benchmarks/ablations.py           # writes results/ablations.csv; resumable, forty minutes on one core
+    python benchmarks/ablations.py --table   # writes docs/ablations.md's tables from it
+
+Cloned policies and Worlds of seed 0, test resets, danger learned of the cost column where nothing else is said.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from _rows import append, read
+from readme import put
+
+from ringfence import stats, tasks, training, worlds
+from ringfence.data.make import make
+from ringfence.envs import SimpleSpread
+from ringfence.evaluate import evaluate_policy, load
+from ringfence.features import FeatureMap
+from ringfence.types import Array
+
+OUT = Path(__file__).resolve().parent.parent / "results" / "ablations.csv"
+FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible")
+FIELDS += ("more_return", "more_return_low", "more_return_high", "p_return")
+FIELDS += ("more_cost", "more_cost_low", "more_cost_high", "p_cost")
+
+
+class Simulated(eqx.Module):
+    """Simple Spread itself, in the place of a World's dynamics."""
+
+    net: Array  # of no members: an ensemble's place
+    env: SimpleSpread = eqx.field(static=True)
+    map: FeatureMap = eqx.field(static=True)
+
+    def step(self, before: Array, action: Array) -> tuple[Array, Array]:
+        names = {name: d for d, name in enumerate(self.map.names)}
+        p, v = (before[..., jnp.array([names[f"own.{x}{c}"] for c in "xy"])] for x in ("", "v"))
+        marks = [before[..., 0, jnp.array([names[f"landmark{j}.d{c}"] for c in "xy"])] for j in range(p.shape[-2])]
+        marks = jnp.stack(marks, -2) + p[..., :1, :]
+        flat = jnp.concatenate([x.reshape(*x.shape[:-2], -1) for x in (p, v, marks)], -1)
+        after, _ = self.env.step(self.env.from_global_state(flat), action)
+        return self.map(self.env.observe(after), self.env.global_state(after)), jnp.zeros(action.shape[:-1])
+
+
+@dataclass(frozen=True)
+class Way:
+    """One thing that differs from the default."""
+
+    options: dict = field(default_factory=dict)  # of the guard
+    world: dict = field(default_factory=dict)  # settings of the World
+    true: bool = False  # the simulator foresees
+
+
+ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
+MEMBERS = {f"an ensemble of {k}": Way(world={"members": k}) for k in (1, 5)}
+RETAIN = {"condition (3), not a margin": Way({"condition": "retain"})}
+FORMULA = {"danger by the true formula": Way({"danger": "formula"})}
+TRUE = {
+    "the true dynamics": Way(true=True),
+    "the true dynamics and formula": Way({"danger": "formula"}, true=True),
+}
+V = {"the last row judged by V": Way({"future": True})}
+# By task, algorithm and preset, and guard; the default is not named among the ways.
+STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
+    ("simple_spread-expert", "bc", "shield"): ROWS | V | RETAIN | MEMBERS | FORMULA | TRUE,
+    ("simple_spread-expert", "bc", "full"): {
+        **ROWS,
+        **MEMBERS,
+        **FORMULA,
+        **TRUE,
+        **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
+        **{f"{k} steps of climbing": Way({"refine": k}) for k in (5, 10, 40)},
+        "no shield after it": Way({"shield": 0, "adapt": 0.0}),
+    },
+    ("simple_spread-expert", "icbf:split", "select"): {
+        f"{k} plan{'s' * (k > 1)} to select from": Way({"plans": k}) for k in (1, 4, 16)
+    },
+    ("crossing-hasty", "bc", "shield"): {
+        **{k: v for k, v in ROWS.items() if k != "5 rows foreseen"},
+        "by ℓ alone": Way({"future": False}),
+        **RETAIN,
+        **MEMBERS,
+        **FORMULA,
+    },
+    ("halfcheetah_2x3-medium", "bc", "adapt"): ROWS
+    | RETAIN
+    | MEMBERS
+    | FORMULA
+    | {"a margin that stays": Way({"adapt": 0.0})},
+    ("halfcheetah_2x3-medium", "bc", "full"): {
+        **ROWS,
+        **MEMBERS,
+        **FORMULA,
+        **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
+        "climbing anywhere": Way({"reach": 2.0}),
+    },
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(dict.fromkeys(task for task, *_ in STUDIES)))
+    parser.add_argument("--guards", nargs="+", default=list(dict.fromkeys(guard for *_, guard in STUDIES)))
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--table", action="store_true", help="only write the documents")
+    a = parser.parse_args()
+    if not a.table:
+        for study, ways in STUDIES.items():
+            if study[0] in a.tasks and study[2] in a.guards:
+                measure(study, ways, a.out)
+    if a.out == OUT:
+        put("docs/ablations.md", "ablations", table(read(OUT)))
+
+
+def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> None:
+    """The rows of a study that are not there yet; the default is played first, if any is missing."""
+    name, algorithm, guard = study
+    there = {r["way"] for r in read(out) if (r["task"], r["proposal"], r["guard"]) == study}
+    if {"default", *ways} <= there:
+        return
+    task = tasks.get(name)
+    episodes = 20 if task.protocol else 200
+    store, _ = make(task)
+    with tempfile.TemporaryDirectory() as folder:
+        kind, _, preset = algorithm.partition(":")
+        (run,) = training.train(kind, store, preset=preset or None, seeds=(0,), out=folder, quiet=True)
+
+        def played(way: Way) -> dict:
+            world = worlds.fit(store, **way.world)
+            if way.true:
+                simulated = Simulated(jnp.zeros((1, 1)), task.env, world.map)
+                world = eqx.tree_at(lambda w: w.dynamics, world, simulated)
+            _, policy = load(run, world=world, guard=guard, **way.options)
+            return evaluate_policy(policy, task, episodes, "test", 0)[0]
+
+        usual = None
+        for way, how in {"default": Way(), **ways}.items():
+            if way in there and way != "default":
+                continue
+            found = played(how)
+            usual = usual or found
+            row = dict(zip(FIELDS, (*study, way, episodes)))
+            row |= {"return": found["return_mean"], "cost": found["cost_mean"], "infeasible": found["infeasible"]}
+            for key in ("return", "cost"):
+                told = stats.paired_test(*(r["per_episode"][key] for r in (found, usual)))
+                row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), told["interval"]))
+                row |= {f"more_{key}": told["difference"], f"p_{key}": told["p"]}
+            row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
+            print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+            if way not in there:
+                append(out, row, FIELDS)
+
+
+def _same(r: dict, default: dict) -> bool:
+    measured = (
+        "return",
+        "cost",
+        "infeasible",
+        "more_return_low",
+        "more_return_high",
+        "more_cost_low",
+        "more_cost_high",
+    )
+    return all(r[k] == default[k] for k in measured)
+
+
+def table(rows: list[dict]) -> str:
+    """A table for each study; p-values adjusted by Holm's method over all of them."""
+    tested = [(r, key) for r in rows if r["way"] != "default" for key in ("return", "cost")]
+    adjusted = stats.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))
+    p = {(id(r), key): value for (r, key), value in zip(tested, adjusted)}
+
+    def more(r: dict, key: str) -> str:
+        mean, low, high = (float(r[f"more_{key}{x}"]) for x in ("", "_low", "_high"))
+        told = f"{mean:+.3g} [{low:.3g}, {high:.3g}]" if mean or low or high else "0"
+        return f"**{told}**" if p[id(r), key] < 0.05 and not low <= 0 <= high else told
+
+    out = []
+    for study in dict.fromkeys((r["task"], r["proposal"], r["guard"]) for r in rows):
+        found = [r for r in rows if (r["task"], r["proposal"], r["guard"]) == study]
+        out += [f"`{study[0]}`, `{study[1]}` under `{study[2]}`, {found[0]['episodes']} episodes:", ""]
+        out += ["| | return | cost | not met | return, more | cost, more |", "|---|---|---|---|---|---|"]
+        for r in found:
+            if r["way"] != "default" and _same(r, found[0]):
+                continue  # a way that is the default here
+            part = [r["way"], f"{float(r['return']):.4g}", f"{float(r['cost']):.3g}"]
+            part += [f"{100 * float(r['infeasible'] or 0):.2g} %"]
+            part += ["", ""] if r["way"] == "default" else [more(r, "return"), more(r, "cost")]
+            out.append("| " + " | ".join(part) + " |")
+        out.append("")
+    return "\n".join(out).strip()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""Return against cost as the limit moves: what is trained anew for every limit, and one model whose guard is told it.
+
+    python benchmarks/frontiers.py            # writes results/frontiers.csv; resumable, an hour on one core
+    python benchmarks/frontiers.py --picture  # draws docs/images/frontiers.png from it, and docs/frontiers.md's table
+
+Seed 0, test resets. On robots the limit is a number of steps per episode of 1000, which an adapting guard is told as
+the rate at which its margin settles, half the limit as its default is of 25. Where episodes are short there is no time
+to adapt: the guard's margin takes the limit's place, in calibrated ones of the World.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+from _rows import append, read
+from readme import put
+
+from ringfence import tasks, training, worlds
+from ringfence.data.make import make
+from ringfence.evaluate import evaluate_policy, load
+
+ROOT = Path(__file__).resolve().parent.parent
+OUT, PICTURE = ROOT / "results" / "frontiers.csv", ROOT / "docs" / "images" / "frontiers.png"
+FIELDS = ("task", "who", "knob", "value", "episodes", "return", "cost", "avoidable_cost", "train_seconds")
+MARGINS = (-1.0, 0.0, 0.25, 0.5, 1.0)
+# By task, the limits on an episode's cost.
+LIMITS = {
+    "simple_spread-expert": (0.25, 0.5, 1, 2, 4),
+    "simple_spread-medium-replay": (0.25, 0.5, 1, 2, 4),
+    "crossing-hasty": (0.1, 0.3, 1, 3, 10),
+    "halfcheetah_2x3-good": (5, 12.5, 25, 50, 100),
+    "halfcheetah_2x3-medium": (5, 12.5, 25, 50, 100),
+    "ant_2x4-medium": (5, 12.5, 25, 50, 100),
+}
+TRAINED = {"ma-td3bc-lag": "MA-TD3+BC, Lagrange", "bc-safe": "cloning, episodes within"}
+GUARDED = {"bc": "cloning, guarded", "icbf": "ICBF, guarded"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--tasks", nargs="+", default=list(LIMITS))
+    parser.add_argument("--of", nargs="+", default=[*GUARDED, *TRAINED], help="algorithms")
+    parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--picture", action="store_true", help="only draw what is there")
+    a = parser.parse_args()
+    if not a.picture:
+        for name in a.of:
+            for task in a.tasks:
+                (guarded if name in GUARDED else trained)(task, name, a.out)
+    if a.out == OUT:
+        rows = read(OUT)
+        draw(rows)
+        put("docs/frontiers.md", "frontiers", table(rows))
+
+
+def trained(name: str, algorithm: str, out: Path) -> None:
+    """A run for every limit."""
+    task, missing = tasks.get(name), _missing(name, TRAINED[algorithm], LIMITS[name], out)
+    store = make(task)[0] if missing else None
+    for limit in missing:
+        with tempfile.TemporaryDirectory() as folder:
+            changes = {"limit" if algorithm == "ma-td3bc-lag" else "cost_limit": float(limit)}
+            (run,) = training.train(algorithm, store, seeds=(0,), out=folder, quiet=True, changes=changes)
+            _play(name, TRAINED[algorithm], "limit", limit, run, out)
+
+
+def guarded(name: str, algorithm: str, out: Path) -> None:
+    """One run, whose guard is told the limit or the margin, and the run alone."""
+    task = tasks.get(name)
+    values = ("alone", *(LIMITS[name] if task.protocol else MARGINS))
+    missing = _missing(name, GUARDED[algorithm], values, out)
+    if not missing:
+        return
+    store, _ = make(task)
+    how = {"planner": "steady"} if task.protocol and algorithm == "icbf" else {}
+    with tempfile.TemporaryDirectory() as folder:
+        (run,) = training.train(algorithm, store, seeds=(0,), out=folder, quiet=True)
+        for value in missing:
+            if value == "alone":
+                _play(name, GUARDED[algorithm], "none", value, run, out, **how)
+                continue
+            told = {"guard": "adapt", "rate": value / 2000} if task.protocol else {"guard": "shield", "margin": value}
+            told |= {"danger": "learned", "world": worlds.fit(store)}
+            _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **told)
+
+
+def _missing(name: str, who: str, values: tuple, out: Path) -> list:
+    there = {r["value"] for r in read(out) if (r["task"], r["who"]) == (name, who)}
+    return [v for v in values if str(v) not in there]
+
+
+def _play(name: str, who: str, knob: str, value, run, out: Path, **how) -> None:
+    task = tasks.get(name)
+    episodes = 20 if task.protocol else 200
+    found = evaluate_policy(load(run, **how)[1], task, episodes, "test", 0)[0]
+    row = dict(zip(FIELDS, (name, who, knob, value, episodes)))
+    row |= {k: f"{found[k + '_mean']:.5g}" for k in ("return", "cost")}
+    row |= {"avoidable_cost": f"{found['avoidable_cost']:.4g}"}
+    row |= {"train_seconds": f"{sum(r['seconds'] for r in run.metrics):.0f}"}
+    print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
+    append(out, row, FIELDS)
+
+
+def table(rows: list[dict]) -> str:
+    """Every point of the picture."""
+    out = ["| task | who | told | return | cost |", "|---|---|---|---|---|"]
+    for r in sorted(rows, key=lambda r: (list(LIMITS).index(r["task"]), r["who"])):
+        told = "nothing" if r["knob"] == "none" else f"{r['knob']} {float(r['value']):g}"
+        out.append(f"| `{r['task']}` | {r['who']} | {told} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
+    return "\n".join(out)
+
+
+def draw(rows: list[dict]) -> None:
+    """Return over cost, a panel for every task."""
+    figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
+    colours = dict(zip((*GUARDED.values(), *TRAINED.values()), ("#0b6e4f", "#7b2d8b", "#c8553d", "#3b6fb6")))
+    for axis, (name, limits) in zip(axes.ravel(), LIMITS.items()):
+        for who, colour in colours.items():
+            found = [r for r in rows if (r["task"], r["who"]) == (name, who) and r["knob"] != "none"]
+            found.sort(key=lambda r: float(r["value"]))
+            xy = [(float(r["cost"]), float(r["return"])) for r in found]
+            if xy:
+                axis.plot(*zip(*xy), "o-", color=colour, label=who, ms=4, lw=1.2)
+            alone = [r for r in rows if (r["task"], r["who"], r["knob"]) == (name, who, "none")]
+            for r in alone:
+                axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
+        if tasks.get(name).protocol:
+            axis.axvspan(0, 25, color="0.93", zorder=0)
+        axis.set_xscale("symlog", linthresh=limits[0])
+        axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(0, None))
+    axes[0, 0].legend(fontsize=7)
+    PICTURE.parent.mkdir(exist_ok=True)
+    figure.savefig(PICTURE, dpi=80)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main()
