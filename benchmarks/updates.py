@@ -1,6 +1,7 @@
 """Whether actor-critics on robots earn less than was published for want of updates: one run, looked at as it goes on.
 
     python benchmarks/updates.py            # writes results/tuning/updates.csv; an hour on one core
+    python benchmarks/updates.py --table    # only docs/benchmark.md's table from it
 
 Rates are constant, so a run looked at after 10 000 updates is the run that ends there. Seed 100, which trains no row,
 20 validation resets. *Value* is what the critics say of the policy's own actions in logged states; *heard* the
@@ -16,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 from _rows import append, read
+from readme import put
 
 from ringfence import tasks, training
 from ringfence.data.make import make
@@ -39,11 +41,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--of", nargs="+", default=[f"{a}:{t}" for a, t in RUNS], help="ALGORITHM:TASK")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--table", action="store_true", help="only write the document")
     a = parser.parse_args()
-    for algorithm, name in (tuple(x.split(":")) for x in a.of):
+    for algorithm, name in (tuple(x.split(":")) for x in a.of if not a.table):
         there = {int(r["updates"]) for r in read(a.out) if (r["algorithm"], r["task"]) == (algorithm, name)}
         if there < set(RUNS[algorithm, name]):
             measure(algorithm, name, there, a.out)
+    if a.out == OUT:
+        put("docs/benchmark.md", "updates", table(read(OUT)))
 
 
 def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
@@ -78,6 +83,16 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
             folder=lambda seed: run.path,
         )
         look(wanted[-1])
+
+
+def table(rows: list[dict]) -> str:
+    """A line per number of updates."""
+    out = ["| algorithm | task | updates | return | steps above the limit | fell | value | heard |", "|---" * 8 + "|"]
+    for r in rows:
+        part = [f"`{r['algorithm']}`", f"`{r['task']}`", f"{int(r['updates']):,}", f"{float(r['return']):.0f}"]
+        part += [f"{float(r['cost']):.0f}", f"{100 * float(r['falls']):.0f} %"]
+        out.append("| " + " | ".join([*part, f"{float(r['value']):.0f}", f"{float(r['heard']):.0f}"]) + " |")
+    return "\n".join(out)
 
 
 def heard(store: EpisodeStore, discount: float = 0.99) -> float:

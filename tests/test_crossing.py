@@ -141,6 +141,24 @@ def test_certificates_keep_apart_who_would_touch():
     assert contacts("careful") < 0.001 < contacts("hasty")
 
 
+def test_a_unicycle_is_steered_as_a_disc_is_pushed():
+    env, state = lone([0.8, 0.0], body="unicycle")
+    push = jnp.array([[[0.3, -0.4]]])
+    state = state._replace(heading=jnp.zeros((1, 1)))
+    moved, _ = env.step(state, recipe.steered(state, push))
+    np.testing.assert_allclose(moved.velocity[0, 0], [0.83, -0.04], atol=2e-3)
+    still = state._replace(velocity=jnp.zeros((1, 1, 2)), heading=jnp.full((1, 1), jnp.pi / 2))
+    assert recipe.steered(still, push)[0, 0, 1] < -0.5  # it turns first to where it is pushed
+
+
+def test_unicycles_drive_to_their_goals_in_logs_of_their_own():
+    store = make(tasks.get("crossing_unicycle-hasty"), 2000)[0]
+    assert store.card["observation_names"][2:4] == ["own.cos", "own.sin"] and store.returns.min() > 0.5
+    with pytest.raises(UserError, match="obstacles or walls"):
+        task = tasks.get("crossing_unicycle-hasty")
+        make(dataclasses.replace(task, env=Crossing(walls=True)), 2000)
+
+
 @pytest.fixture(scope="module")
 def logs():
     return make(tasks.get("crossing-hasty"), 2000)[0]

@@ -11,6 +11,7 @@ from ringfence import features, hazards
 from ringfence.data.recipes import crossing, robots, spread, spread_alike
 from ringfence.data.store import EpisodeStore
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike
+from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import Parts
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.types import Env, Spec
@@ -173,14 +174,18 @@ _ROBOT_TIERS: tuple[tuple[Parts, str, float, float | None], ...] = (
 )
 
 
-def _crossing(tier: str) -> Task:
-    """A million agent-steps; 1 is what the certificates earn at full speed."""
+# What the certificates earn at full speed.
+_CERTIFIED: dict[Body, float] = {"disc": 4.2, "unicycle": 3.85}
+
+
+def _crossing(tier: str, body: Body = "disc") -> Task:
+    """A million agent-steps."""
     return Task(
-        f"crossing-{tier}",
-        Crossing(),
+        ("crossing-" if body == "disc" else f"crossing_{body}-") + tier,
+        Crossing(body=body),
         hazards.Separation(0.30),
         tier=tier,
-        return_max=4.2,
+        return_max=_CERTIFIED[body],
         transitions=125_000,
         recipe=crossing,
         alike=True,
@@ -196,7 +201,7 @@ TASKS = {
         _spread("random", 159.57, 60.46),
         *(_robot(*facts) for facts in _ROBOT_TIERS),
         *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
-        *(_crossing(tier) for tier in crossing.TIERS),
+        *(_crossing(tier, body) for body in _CERTIFIED for tier in crossing.TIERS),
         _spread_alike("expert"),
         _spread_alike("medium"),
     )

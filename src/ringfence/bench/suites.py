@@ -79,7 +79,8 @@ class Suite:
     episodes: int = 200  # per run, unless told otherwise
 
 
-_CROSSING = tuple(f"crossing-{tier}" for tier in ("hasty", "mixed", "careful", "random"))
+_TIERS = ("hasty", "mixed", "careful", "random")
+_CROSSING = tuple(f"crossing-{tier}" for tier in _TIERS)
 _SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium-replay", "random"))
 # Safety-gymnasium's limits first: what reads no danger is trained there and then judged by the other limit.
 _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
@@ -152,7 +153,7 @@ SUITES = {
     ),
     # Agents who are alike, each by itself; danger that is decided ten steps ahead.
     "crossing": Suite(
-        _CROSSING,
+        _CROSSING + tuple(f"crossing_unicycle-{tier}" for tier in _TIERS),
         (Entry("bc", evaluations=("plain", "shield-learned")),),
         episodes=1000,
     ),

@@ -17,7 +17,7 @@ from ringfence import __version__
 from ringfence.data.behaviour import gather, rollout
 from ringfence.data.recipes import COLLECTION
 from ringfence.data.store import EpisodeStore
-from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, Crossing, CrossingState, length
+from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, TURN, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 BATCH = 500  # episodes that are played at once
 ROUNDS = 15  # of Hildreth's method on the programme of a step
+SLOW = 0.25  # m/s: a unicycle that is slower turns as if it were that fast
 STUBBORN = 0.1  # of full push: what a head-on encounter is broken by
 
 
@@ -90,8 +91,8 @@ def relabelled(task: Task, store: EpisodeStore) -> None:
 def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
     """The data set of a tier."""
     env, tier = task.env, task.tier
-    if env.body != "disc" or env.obstacles or env.walls:
-        raise UserError(f"'{task.name}' has bodies, obstacles or walls that the drivers do not know; log it otherwise.")
+    if env.obstacles or env.walls:
+        raise UserError(f"'{task.name}' has obstacles or walls that the drivers do not know; log it otherwise.")
     episodes = transitions // env.episode_length
     key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
     made = gather(lambda k: _played(env, tier, jax.random.fold_in(key, k * BATCH), BATCH), episodes, BATCH)
@@ -122,7 +123,7 @@ def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
 
 
 def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
-    """Pushes (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
+    """Actions (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
     speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
     kw, kn = jax.random.split(key)
     ahead = state.goal - state.position
@@ -131,7 +132,18 @@ def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array
     push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
     push = push + STUBBORN * jax.random.normal(kw, push.shape)
     push = certified(env, state, push, brake[..., None], room[..., None], haste[..., None])
+    if env.body == "unicycle":
+        push = steered(state, push)
     return jnp.clip(push + unsteady[..., None] * jax.random.normal(kn, push.shape), -1.0, 1.0)
+
+
+def steered(state: CrossingState, push: Array) -> Array:
+    """A unicycle's push along its heading and turn (B, N, 2) that move it as `push` would move a disc, as far as they
+    can: across its heading it is moved by turning, and the faster it is, the less of that it needs."""
+    x, y = jnp.cos(state.heading), jnp.sin(state.heading)
+    along, across = push[..., 0] * x + push[..., 1] * y, push[..., 1] * x - push[..., 0] * y
+    turn = PUSH * across / jnp.maximum(length(state.velocity), SLOW) / TURN
+    return jnp.clip(jnp.stack([along, turn], -1), -1.0, 1.0)
 
 
 def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, room: Array, haste: Array) -> Array:
