@@ -26,6 +26,7 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
 
     told = env.from_global_state(jnp.asarray(states))
     place, goal, touching = (np.asarray(x) for x in (told.position, told.goal, env.clearance(told) < 0))
+    ahead = np.stack([np.cos(told.heading), np.sin(told.heading)], -1)
     reach = max(env.side / 2 if env.walls else 0.0, float(np.abs(place).max()) + 2 * RADIUS)
     scale = SIZE * FINE / (2 * reach)
     hues = [tuple(int(255 * c) for c in colorsys.hsv_to_rgb(0.5 + 0.35 * k / HUES, 0.55, 0.85)) for k in range(HUES)]
@@ -54,6 +55,8 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
                 draw.line(tail, fill=pale, width=max(FINE, int(0.5 * RADIUS * scale)))
             disc(draw, goal[t, i], 0.3 * RADIUS, fill=pale)
             disc(draw, place[t, i], RADIUS, fill=colour, outline=DARK)
+            if env.body == "unicycle":
+                draw.line([at(place[t, i]), at(place[t, i] + RADIUS * ahead[t, i])], fill=DARK, width=2 * FINE)
         touches += int(touching[before + 1 : t + 1].any(1).sum())
         before = t
         picture = picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
