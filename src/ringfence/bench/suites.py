@@ -26,7 +26,8 @@ EVALUATIONS: dict[str, dict] = {
         for danger, rows in (("learned", 1), ("learned", 3), ("learned", 7), ("learned", 15), ("formula", 15))
     },
     "shield-learned+rows1": {"guard": "shield", "danger": "learned", "rows": 1},
-    "full-learned+reach2.0": {"guard": "full", "danger": "learned", "reach": 2.0},
+    "full-learned+margin1.0": {"guard": "full", "danger": "learned", "margin": 1.0},
+    "full-learned+reach2.0+margin1.0": {"guard": "full", "danger": "learned", "reach": 2.0, "margin": 1.0},
     **{
         f"shield-learned+agents{n}": {"guard": "shield", "danger": "learned", "agents": n}
         for n in (2, 4, 6, 16, 64, 256)
@@ -169,10 +170,11 @@ SUITES = {
                     *(f"shield-learned+rows{k}+futureFalse" for k in (1, 3, 7, 15)),
                     "shield-formula+rows15+futureFalse",
                     "full-learned",
-                    "full-learned+reach2.0",
+                    "full-learned+margin1.0",
+                    "full-learned+reach2.0+margin1.0",
                 ),
             ),
-            Entry("mpc", evaluations=("full-learned+reach2.0",)),  # near rest is no place to look
+            Entry("mpc", evaluations=("full-learned+reach2.0+margin1.0",)),  # near rest is no place to look
             Entry("icbf", evaluations=_ALONE),
             Entry("madiff", evaluations=_ALONE),
             *(Entry(name, evaluations=_ALONE) for name in _RIVALS),

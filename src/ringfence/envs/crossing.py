@@ -69,9 +69,9 @@ class Crossing:
     dt: ClassVar[float] = DT
     world: ClassVar[dict] = {"dynamics_width": 32}  # all that a push moves is one's own velocity
     # Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row. Who climbs
-    # far from what the logs do drives as nobody in them does, and others no longer go on as the World foresees.
+    # drives as nobody in the logs does, all the more the farther, and others no longer go on as the World foresees.
     guard: ClassVar[dict] = {name: {"rows": 3, "future": True} for name in ("shield", "adapt")}
-    guard["full"] = guard["shield"] | {"reach": 0.5}
+    guard["full"] = guard["shield"] | {"reach": 0.5, "margin": 1.5}
 
     def __post_init__(self):
         for field, options in (("body", ("disc", "unicycle")), ("goals", ("random", "across"))):

@@ -240,7 +240,7 @@ def options_of(name: str, danger: str, usual: Mapping[str, dict] = MappingProxyT
     margin, unless another is asked for, is a calibrated one of what is learned; of a formula less than its safe margin,
     which is what examples of safety have."""
     margin = {"margin": 1.0} if danger == "learned" else {}
-    return {**GUARDS[name], **usual.get(name, {}), **margin, **changes}
+    return {**GUARDS[name], **margin, **usual.get(name, {}), **changes}
 
 
 def far_sighted(world: World) -> dict[str, dict]:
