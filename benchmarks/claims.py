@@ -207,6 +207,14 @@ def told_clones_earn() -> tuple[bool, str]:
 CERTIFICATES = ("certificates", "reference")
 
 
+def diffusion_on_crossing() -> tuple[bool, str]:
+    """MADIFF less the actor that is told the same return: alone the interval is above 0, under the shield around it."""
+    suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
+    both = [difference(suite, task, ("madiff", v), ("bc-return", v), "return") for v in ("default", key)]
+    told = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
+    return both[0].low > 0 and both[1].low <= 0 <= both[1].high, f"alone and under the shield {told}"
+
+
 def no_size_touches() -> tuple[bool, str]:
     """Under a shield and `full`, in teams of two, three, four and six, by every seed."""
     rows = [r for r in rows_of("spread-teams/table.csv", danger="learned")]
@@ -328,6 +336,12 @@ CLAIMS = (
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
     Claim("docs/judging.md", "Danger is told well", "results/judging.csv", judged("played_danger", "true_cost", 0.8)),
+    Claim(
+        "docs/attribution.md",
+        "On Crossing diffusion earns more alone, and nothing more under a shield",
+        "results/crossing-guards/table.csv",
+        diffusion_on_crossing,
+    ),
     Claim("docs/attribution.md", "A shield takes the cost from every proposal", SPREAD, shielded_all),
     Claim(
         "docs/attribution.md",
