@@ -142,6 +142,14 @@ def coasting(map: FeatureMap, dt: float) -> FeatureMap:
     )
 
 
+def solitary(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
+    """s̃ of an agent that has but its own observation, of these names: what it sees and no more, in every view."""
+    if view not in VIEWS:
+        raise unknown("view", view, VIEWS)
+    table = np.arange(len(names))[None]  # of a team of one
+    return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), dt)
+
+
 def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities."""
     place, mine = rules[:, 0], rules[:, 2]

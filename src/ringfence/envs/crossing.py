@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError, unknown
-from ringfence.features import VIEWS, FeatureMap, coasting
+from ringfence.errors import UserError
+from ringfence.features import FeatureMap, solitary
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s
@@ -116,11 +116,7 @@ class Crossing:
 
     def feature_map(self, view: str) -> FeatureMap:
         """s̃_i: what the agent sees. There is no other view, or work would grow with the square of the team."""
-        if view not in VIEWS:
-            raise unknown("view", view, VIEWS)
-        names = self.observation_names
-        table = np.arange(len(names))[None]  # of a team of one
-        return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), DT)
+        return solitary(view, self.observation_names, DT)
 
     film_shows: ClassVar[str] = "Lines lead to goals, red touches."
 

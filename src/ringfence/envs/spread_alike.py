@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.simple_spread import DT, SimpleSpread, SpreadState, in_contact
-from ringfence.errors import UserError, unknown
-from ringfence.features import VIEWS, FeatureMap, coasting
+from ringfence.errors import UserError
+from ringfence.features import FeatureMap, solitary
 from ringfence.types import Array, Key, Transition
 
 SIGHT = 1.5  # m: in a room of 2 m a side, one thing in six is farther away, so what is not there is nothing new
@@ -66,11 +66,7 @@ class SpreadAlike:
 
     def feature_map(self, view: str) -> FeatureMap:
         """s̃_i: what the agent sees. There is no other view."""
-        if view not in VIEWS:
-            raise unknown("view", view, VIEWS)
-        names = self.observation_names
-        table = np.arange(len(names))[None]  # of a team of one
-        return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), DT)
+        return solitary(view, self.observation_names, DT)
 
     def reset(self, key: Key, batch: int) -> SpreadState:
         """As Simple Spread's: starts in contact are part of the task."""
