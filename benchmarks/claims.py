@@ -207,6 +207,20 @@ def told_clones_earn() -> tuple[bool, str]:
 CERTIFICATES = ("certificates", "reference")
 
 
+def full_is_safe() -> tuple[bool, str]:
+    """No contact, and by how much more than the shield alone; beside itself with one margin, climbing anywhere."""
+    suite, task, key = "crossing-guards", "crossing-hasty", "default+full-learned"
+    wide = f"{key}+reach2.0+margin1.0"
+    more = difference(suite, task, ("bc", key), ("bc", "default+shield-learned"), "return")
+    cost = difference(suite, task, ("bc", key), ("bc", wide), "cost")
+    share = more.mean / mean(suite, task, ("bc", "default+shield-learned"), "return_mean")
+    touched = mean(suite, task, ("bc", key), "violation_rate")
+    told = (
+        f"contact in {100 * touched:g} %, {100 * share:.0f} % more; with one margin, anywhere {-cost.mean:+.2g} steps"
+    )
+    return touched == 0 and 0.23 < share < 0.27 and cost.high < 0 and cost.p < 0.001, told
+
+
 def diffusion_on_crossing() -> tuple[bool, str]:
     """MADIFF less the actor that is told the same return: alone the interval is above 0, under the shield around it."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
@@ -309,6 +323,12 @@ CLAIMS = (
         "the shield touches in 85 %",
         "results/crossing/table.csv",
         contact("crossing", ("bc", "default+shield-learned"), 0.83, 0.87, "crossing-careful"),
+    ),
+    Claim(
+        "docs/crossing.md",
+        "`full` earns a quarter more than the shield, without contact",
+        "results/crossing-guards/table.csv",
+        full_is_safe,
     ),
     Claim("docs/crossing.md", "Nobody touches in any size", "results/spread-teams/table.csv", no_size_touches),
     Claim("docs/crossing.md", "a barrier needs to have seen danger", "results/other_simulator.csv", has_to_have_seen),
