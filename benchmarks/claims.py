@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import re
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -221,6 +222,26 @@ def full_is_safe() -> tuple[bool, str]:
     return touched == 0 and 0.23 < share < 0.27 and cost.high < 0 and cost.p < 0.001, told
 
 
+def limits_learned() -> tuple[bool, str]:
+    """How many of five limits the Lagrangian learner keeps on each task."""
+    kept = Counter()
+    for r in rows_of("frontiers.csv", who="MA-TD3+BC, Lagrange"):
+        kept[r["task"]] += float(r["cost"]) <= float(r["value"])
+    spread = sum(n for task, n in kept.items() if task.startswith("simple_spread"))
+    none = [kept[task] for task in ("crossing-hasty", "halfcheetah_2x3-good")]
+    return (spread, none) == (9, [0, 0]), ", ".join(f"{task} {n} of 5" for task, n in kept.items())
+
+
+def guards_price() -> tuple[bool, str]:
+    """Return of guarded cloning at the calibrated margin over that at the loosest, where there is no time to adapt."""
+    shares = {}
+    for task in ("simple_spread-expert", "simple_spread-medium-replay", "crossing-hasty"):
+        of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, who="cloning, guarded")}
+        shares[task] = float(of["1.0"]["return"]) / float(of["-1.0"]["return"]), float(of["1.0"]["cost"])
+    told = ", ".join(f"{task} {100 * share:.1f} % at {cost:g}" for task, (share, cost) in shares.items())
+    return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), told
+
+
 def diffusion_on_crossing() -> tuple[bool, str]:
     """MADIFF less the actor that is told the same return: alone the interval is above 0, under the shield around it."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
@@ -333,6 +354,8 @@ CLAIMS = (
     Claim("docs/crossing.md", "Nobody touches in any size", "results/spread-teams/table.csv", no_size_touches),
     Claim("docs/crossing.md", "a barrier needs to have seen danger", "results/other_simulator.csv", has_to_have_seen),
     Claim("docs/ablations.md", "The World's error costs nothing", "results/ablations.csv", error_costs_nothing),
+    Claim("docs/frontiers.md", "safety costs next to nothing", "results/frontiers.csv", guards_price),
+    Claim("docs/frontiers.md", "keeps 9 of 10 limits on Simple Spread", "results/frontiers.csv", limits_learned),
     Claim("docs/guard.md", "One barrier for both loses contact", "results/constraints.csv", one_barrier_loses),
     Claim("docs/guard.md", "and not for who never brakes", "results/yard.csv", brakes_in_time),
     Claim("docs/guard.md", "it knows what is dangerous, not what will be", "results/yard.csv", learned_sees_more),

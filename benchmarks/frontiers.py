@@ -131,9 +131,9 @@ def draw(rows: list[dict]) -> None:
             for r in alone:
                 axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
         if tasks.get(name).protocol:
-            axis.axvspan(0, 25, color="0.93", zorder=0)
+            axis.axvspan(-10, 25, color="0.93", zorder=0)
         axis.set_xscale("symlog", linthresh=limits[0])
-        axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(0, None))
+        axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(-0.1 * limits[0], None))
     axes[0, 0].legend(fontsize=7)
     PICTURE.parent.mkdir(exist_ok=True)
     figure.savefig(PICTURE, dpi=80)
