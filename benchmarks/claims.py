@@ -254,7 +254,7 @@ def no_size_touches() -> tuple[bool, str]:
     """Under a shield and `full`, in teams of two, three, four and six, by every seed."""
     rows = [r for r in rows_of("spread-teams/table.csv", danger="learned")]
     left = max(float(r["avoidable_cost"]) for r in rows)
-    return (left, len(rows)) == (0, 24), f"{len(rows)} rows, at most {left:g} steps"
+    return left == 0 and len(rows) >= 24, f"{len(rows)} rows, at most {left:g} steps"
 
 
 def has_to_have_seen() -> tuple[bool, str]:

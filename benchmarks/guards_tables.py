@@ -157,16 +157,18 @@ def crossing(suite: str, named: dict[str, str]) -> str:
 
 
 def sizes() -> str:
-    """A row per number of agents, a column per guard."""
+    """A row per task and number of agents, a column per guard."""
     rows = list(csv.DictReader((RESULTS / "spread-teams" / "table.csv").open()))
-    out = ["| agents | " + " | ".join(SIZES) + " |", "|---" * (1 + len(SIZES)) + "|"]
-    for n in (2, 3, 4, 6):
-        cells = []
-        for guard in SIZES.values():
-            name = f"default{guard}" + f"+agents{n}" * (n != 3)
-            found = [r for r in rows if (r["algorithm"], r["variant"]) == ("bc", name)]
-            cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'avoidable_cost'):.3f} ({len(found)} seeds)")
-        out.append(f"| {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
+    out = ["| learned from | agents | " + " | ".join(SIZES) + " |", "|---" * (2 + len(SIZES)) + "|"]
+    for task in dict.fromkeys(r["task"] for r in rows):
+        for n in (2, 3, 4, 6):
+            cells = []
+            for guard in SIZES.values():
+                name = f"default{guard}" + f"+agents{n}" * (n != 3)
+                found = [r for r in rows if (r["task"], r["algorithm"], r["variant"]) == (task, "bc", name)]
+                seeds = f" ({len(found)} seeds)" if len(found) > 1 else ""
+                cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'avoidable_cost'):.3f}{seeds}")
+            out.append(f"| `{task}` | {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 

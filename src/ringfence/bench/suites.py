@@ -187,7 +187,7 @@ SUITES = {
     ),
     # Simple Spread's three, each by its own view, in teams of another size.
     "spread-teams": Suite(
-        ("spread_alike-expert",),
+        ("spread_alike-expert", "spread_alike-medium"),
         (
             Entry(
                 "bc",
