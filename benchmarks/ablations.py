@@ -159,19 +159,6 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
                 append(out, row, FIELDS)
 
 
-def _same(r: dict, default: dict) -> bool:
-    measured = (
-        "return",
-        "cost",
-        "infeasible",
-        "more_return_low",
-        "more_return_high",
-        "more_cost_low",
-        "more_cost_high",
-    )
-    return all(r[k] == default[k] for k in measured)
-
-
 def table(rows: list[dict]) -> str:
     """A table for each study; p-values adjusted by Holm's method over all of them."""
     tested = [(r, key) for r in rows if r["way"] != "default" for key in ("return", "cost")]
@@ -189,7 +176,7 @@ def table(rows: list[dict]) -> str:
         out += [f"`{study[0]}`, `{study[1]}` under `{study[2]}`, {found[0]['episodes']} episodes:", ""]
         out += ["| | return | cost | not met | return, more | cost, more |", "|---|---|---|---|---|---|"]
         for r in found:
-            if r["way"] != "default" and _same(r, found[0]):
+            if r != found[0] and r | {"way": "default"} == found[0]:
                 continue  # a way that is the default here
             part = [r["way"], f"{float(r['return']):.4g}", f"{float(r['cost']):.3g}"]
             part += [f"{100 * float(r['infeasible'] or 0):.2g} %"]

@@ -228,8 +228,8 @@ def limits_learned() -> tuple[bool, str]:
     for r in rows_of("frontiers.csv", who="MA-TD3+BC, Lagrange"):
         kept[r["task"]] += float(r["cost"]) <= float(r["value"])
     spread = sum(n for task, n in kept.items() if task.startswith("simple_spread"))
-    none = [kept[task] for task in ("crossing-hasty", "halfcheetah_2x3-good")]
-    return (spread, none) == (9, [0, 0]), ", ".join(f"{task} {n} of 5" for task, n in kept.items())
+    del kept["crossing-hasty"]  # where a limit is of each agent's cost, and the row is of the team's
+    return (spread, kept["halfcheetah_2x3-good"]) == (9, 0), ", ".join(f"{task} {n} of 5" for task, n in kept.items())
 
 
 def guards_price() -> tuple[bool, str]:
@@ -252,7 +252,7 @@ def diffusion_on_crossing() -> tuple[bool, str]:
 
 def no_size_touches() -> tuple[bool, str]:
     """Under a shield and `full`, in teams of two, three, four and six, by every seed."""
-    rows = [r for r in rows_of("spread-teams/table.csv", danger="learned")]
+    rows = rows_of("spread-teams/table.csv", danger="learned")
     left = max(float(r["avoidable_cost"]) for r in rows)
     return left == 0 and len(rows) >= 24, f"{len(rows)} rows, at most {left:g} steps"
 
@@ -351,7 +351,12 @@ CLAIMS = (
         "results/crossing-guards/table.csv",
         full_is_safe,
     ),
-    Claim("docs/crossing.md", "Nobody touches in any size", "results/spread-teams/table.csv", no_size_touches),
+    Claim(
+        "docs/crossing.md",
+        "Whoever does not start in contact touches nobody in any size",
+        "results/spread-teams/table.csv",
+        no_size_touches,
+    ),
     Claim("docs/crossing.md", "a barrier needs to have seen danger", "results/other_simulator.csv", has_to_have_seen),
     Claim("docs/ablations.md", "The World's error costs nothing", "results/ablations.csv", error_costs_nothing),
     Claim("docs/frontiers.md", "safety costs next to nothing", "results/frontiers.csv", guards_price),

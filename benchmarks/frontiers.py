@@ -21,7 +21,7 @@ import matplotlib.pyplot as plt
 from _rows import append, read
 from readme import put
 
-from ringfence import tasks, training, worlds
+from ringfence import algos, tasks, training, worlds
 from ringfence.data.make import make
 from ringfence.evaluate import evaluate_policy, load
 
@@ -65,7 +65,7 @@ def trained(name: str, algorithm: str, out: Path) -> None:
     store = make(task)[0] if missing else None
     for limit in missing:
         with tempfile.TemporaryDirectory() as folder:
-            changes = {"limit" if algorithm == "ma-td3bc-lag" else "cost_limit": float(limit)}
+            changes = {algos.get(algorithm).limit: float(limit)}
             (run,) = training.train(algorithm, store, seeds=(0,), out=folder, quiet=True, changes=changes)
             _play(name, TRAINED[algorithm], "limit", limit, run, out)
 

@@ -146,7 +146,8 @@ def record(episodes: int, blind: int) -> EpisodeStore:
             kept[k].append(v)
     card = {
         "task": f"irsim-rvo-{blind}-blind" if blind else "irsim-rvo",
-        "provenance": "recorded in IR-SIM, robots under its reciprocal velocity obstacles",
+        "provenance": "recorded in IR-SIM, robots under its reciprocal velocity obstacles"
+        + (f" but for {blind} that make straight for their goals" if blind else ""),
         "simulator": f"ir-sim {irsim.__version__}",
         "observation_names": list(Crossing().observation_names),
         "hazard": Separation(0.30),

@@ -15,15 +15,14 @@ import argparse
 import tempfile
 from pathlib import Path
 
-import numpy as np
 from _rows import append, read
 from readme import put
 
 from ringfence import tasks, training
 from ringfence.data.make import make
-from ringfence.data.store import EpisodeStore
 from ringfence.evaluate import evaluate_policy, load
 from ringfence.runs import Run
+from ringfence.windows import returns_to_go
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "updates.csv"
 FIELDS = ("task", "algorithm", "seed", "updates", "train_seconds", "return", "return_norm", "cost", "falls", "value")
@@ -35,6 +34,7 @@ RUNS = {
     ("omar", "halfcheetah_2x3-good"): (6_000, 12_000, 24_000, 48_000),
 }
 SEED, EPISODES = 100, 20
+DISCOUNT = 0.99  # of the presets
 
 
 def main() -> None:
@@ -55,7 +55,7 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
     """Rows as the run passes each number of updates."""
     task, wanted = tasks.get(name), RUNS[algorithm, name]
     store, chunk = make(task)[0], wanted[0] // 2
-    before = heard(store)
+    heard = returns_to_go(store.rewards, store.lengths, DISCOUNT).mean()
     with tempfile.TemporaryDirectory() as folder:
         run = Run(Path(folder) / "run")
 
@@ -67,7 +67,7 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
             row = dict(zip(FIELDS, (name, algorithm, SEED, updates, round(sum(r["seconds"] for r in told)))))
             row |= {k: f"{found[v]:.5g}" for k, v in (("return", "return_mean"), ("return_norm", "return_norm"))}
             row |= {"cost": f"{found['cost_mean']:.4g}", "falls": f"{found['termination_rate']:.3g}"}
-            row |= {"value": f"{told[-1].get('value', float('nan')):.4g}", "heard": f"{before:.4g}"}
+            row |= {"value": f"{told[-1].get('value', float('nan')):.4g}", "heard": f"{heard:.4g}"}
             print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
             append(out, row, FIELDS)
 
@@ -93,17 +93,6 @@ def table(rows: list[dict]) -> str:
         part += [f"{float(r['cost']):.0f}", f"{100 * float(r['falls']):.0f} %"]
         out.append("| " + " | ".join([*part, f"{float(r['value']):.0f}", f"{float(r['heard']):.0f}"]) + " |")
     return "\n".join(out)
-
-
-def heard(store: EpisodeStore, discount: float = 0.99) -> float:
-    """Mean over logged steps of the discounted rewards that followed within the episode."""
-    total, ends = [], store.episode_ends
-    for a, b in zip([0, *ends], ends):
-        tail = np.zeros_like(store.rewards[a])
-        for r in store.rewards[a:b][::-1]:
-            tail = r + discount * tail
-            total.append(tail.mean())
-    return float(np.mean(total))
 
 
 if __name__ == "__main__":

@@ -208,7 +208,7 @@ MA_TD3BC = Algorithm(
         "centralised": {"centralised_critic": True},
         "random": {"steps": 6_000},
         "mujoco": _MUJOCO,
-        "mujoco-long": {**_MUJOCO, "steps": 40_000},  # where it earns what is published on Ants' good tiers
+        "mujoco-long": {**_MUJOCO, "steps": 40_000},  # ant_2x4-good: 3.1 k, published 2.9 k; 1.1 k before
     },
     reads=reads,
 )
