@@ -55,6 +55,7 @@ class Question:
 
 
 SHIELD, FULL = "+shield-learned", "+full-learned"
+ROBOT_KEYS = ("return", "cost")  # nobody starts above the limit
 QUESTIONS = (
     Question("a shield, under cloning", ("bc", f"default{SHIELD}"), ("bc", "default")),
     Question(
@@ -95,11 +96,26 @@ QUESTIONS = (
     Question("everybody in sight of cloning", ("bc", "joint"), ("bc", "default")),
 )
 
+ADAPT, STEADY = "+adapt-learned", "+steady+adapt-learned"
+OF_ROBOTS = (
+    Question("a guard (`adapt`), under cloning", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
+    Question("danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-formula"), ROBOT_KEYS),
+    Question("`full`, not `adapt`", ("bc", f"default{FULL}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
+    Question("ICBF, not cloning", ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
+    Question(
+        "ICBF, not an actor told the return", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
+    ),
+    Question(
+        "an actor told the return, not cloning", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS
+    ),
+)
+
 
 def main() -> None:
     put("docs/attribution.md", "crossed", crossed("guards"))
     put("docs/attribution.md", "questions", questions("guards"))
     put("docs/attribution.md", "robots", robots("guards-mujoco"))
+    put("docs/attribution.md", "robot-questions", counted("guards-mujoco"))
 
 
 def crossed(suite: str) -> str:
@@ -133,13 +149,15 @@ ROBOTS: dict[str, Row] = {
 
 
 def robots(suite: str) -> str:
-    """A line per task on which the planner was played: return / steps above the limit under the same guard."""
+    """A line per task on which the planner was played: return / steps above the limit under the same guard, by the
+    planner's seeds."""
     out = ["| | " + " | ".join(ROBOTS) + " |", "|---" * (1 + len(ROBOTS)) + "|"]
     for task in tasks_of(suite):
-        told = []
+        told, seeds = [], of(suite, task, variant(task, ROBOTS["ICBF (steady)"]))
         for row in ROBOTS.values():
-            earned, cost = (mean(suite, task, variant(task, row), key) for key in ("return_mean", "cost_mean"))
-            told.append("–" if earned is None else f"{earned:.0f} / {cost:.1f}")
+            found = [r for seed, r in of(suite, task, variant(task, row)).items() if seed in seeds]
+            earned, cost = (sum(r[key] for r in found) for key in ("return_mean", "cost_mean"))
+            told.append(f"{earned / len(found):.0f} / {cost / len(found):.1f}" if found else "–")
         if told[-1] != "–":
             out.append(f"| `{task}` | " + " | ".join(told) + " |")
     return "\n".join(out)
@@ -171,6 +189,19 @@ def questions(suite: str) -> str:
         told = {d.task: d for d in ds}
         cells = [shown(told[n], key) if n in told else "–" for n in names]
         out.append(f"| {q.words} | {'return' if key == 'return' else 'cost'} | " + " | ".join(cells) + " |")
+    return "\n".join(out)
+
+
+def counted(suite: str) -> str:
+    """A line per question of robots: on how many tasks the row has more and less, beyond chance, and which they are."""
+    out = ["| what differs | of | tasks | seeds | more on | less on |", "|---" * 6 + "|"]
+    for q, key, ds in answers(suite, OF_ROBOTS):
+        sides = [[f"`{d.task}` {d.mean:+.3g}" for d in ds if d.holds and d.mean * sign > 0] for sign in (1, -1)]
+        listed = [f": {', '.join(side)}" if len(side) <= 6 else "" for side in sides]
+        told = [f"**{len(side)}**{names}" if side else "0" for side, names in zip(sides, listed)]
+        seeds = sorted({len(d.seeds) for d in ds})
+        some = "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))
+        out.append(f"| {q.words} | {key} | {len(ds)} | {some} | {told[0]} | {told[1]} |")
     return "\n".join(out)
 
 

@@ -96,13 +96,22 @@ def main() -> None:
 
 
 def table(suite: str, columns: dict[str, Row], cell) -> str:
-    """A row per task, a column per guard; – where nothing was made."""
-    out = ["| | " + " | ".join(columns) + " |", "|---" * (1 + len(columns)) + "|"]
+    """A row per task, a column per guard; – where nothing was made. Seeds stand in the head where all cells of a column
+    have as many, else in the cell."""
+    found = {
+        (task, words): list(of(suite, task, variant(task, row)).values())
+        for task in tasks_of(suite)
+        for words, row in columns.items()
+    }
+    seeds = {w: {len(rows) for (_, words), rows in found.items() if words == w and rows} for w in columns}
+    told = [w + (f" ({max(seeds[w])} seeds)" if len(seeds[w]) == 1 and max(seeds[w]) > 1 else "") for w in columns]
+    out = ["| | " + " | ".join(told) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in tasks_of(suite):
         cells = []
-        for row in columns.values():
-            found = list(of(suite, task, variant(task, row)).values())
-            cells.append(cell(found) + (f" ({len(found)} seeds)" if len(found) > 1 else "") if found else "–")
+        for words in columns:
+            rows = found[task, words]
+            some = f" ({len(rows)} seeds)" if len(seeds[words]) > 1 and len(rows) > 1 else ""
+            cells.append(cell(rows) + some if rows else "–")
         if any(c != "–" for c in cells[1:]):
             out.append(f"| `{task}` | " + " | ".join(cells) + " |")
     return "\n".join(out)

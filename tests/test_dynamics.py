@@ -1,5 +1,7 @@
 """What actions do, as learned from logs."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,3 +62,24 @@ def test_agents_that_do_not_share_a_body_do_not_read_each_other():
     x = jnp.ones((3, AGENTS, 4))
     moved = shared.step(x, action.at[:, 1].set(-1.0))[0] - shared.step(x, action)[0]
     assert (moved != 0).any(-1).all()
+
+
+@pytest.mark.parametrize("guessing", [True, False])
+def test_who_guesses_what_others_see_does_not_take_its_own_action_for_the_cause(guessing):
+    """The first agent acts roughly as a wind blows that only the second sees, and the wind alone moves it: it foresees
+    nothing of its own action, unless it has nothing else to tell the wind by."""
+    rng = np.random.default_rng(0)
+    wind = rng.uniform(-1, 1, EPISODES * STEPS)
+    place = np.concatenate([[0], np.cumsum(wind[:-1])]) / 20
+    features = jnp.asarray(np.stack([place, wind], 1)[..., None], jnp.float32)
+    acts = np.stack([wind + rng.normal(0, 0.5, len(wind)), rng.uniform(-1, 1, len(wind))], 1)
+    actions = jnp.asarray(acts[..., None], jnp.float32)
+    table = np.array([[0], [1]])
+    map = FeatureMap("decentralized", ("seen",), "observations", table, np.full_like(table, -1))
+    map = replace(map, guessing=guessing)
+    row = jnp.arange(len(wind) - 1)
+    told = dict(members=2, updates=1500, width=16)
+    dynamics = fit_dynamics(features, actions[:-1], row, map, jax.random.key(0), **told)
+    pushed, pulled = (dynamics.step(features[:-1], actions[:-1].at[:, 0].set(a))[0][:, 0] for a in (1.0, -1.0))
+    effect = jnp.abs(pushed - pulled).mean() / (2 / 20)  # of what the wind does
+    assert effect < 0.2 if guessing else effect > 0.5

@@ -41,6 +41,7 @@ class FeatureMap:
     body: bool = False  # the agents are limbs of one body: its danger is everybody's
     joint: bool = False  # what comes next depends on everybody's action, which is known
     solitary: bool = False  # what follows does so from the agent's own movement alone
+    guessing: bool = False  # what comes next depends on what others see and do, which has to be guessed
     dt: float | None = None  # s, of a solitary map: the step that velocities are foreseen by
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
@@ -171,12 +172,14 @@ def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Call
 
 
 def alone(map: FeatureMap) -> FeatureMap:
-    """The map as one agent has it who hears of nobody: others' entries are predicted like its own, and only what
-    stands still follows from its own movement. Bodies are moved by others, whose actions it does not know."""
+    """The map as one agent has it who hears of nobody: others' entries are predicted like its own, by what it takes
+    the others to see and do, and only what stands still follows from its own movement. Bodies are moved by others,
+    whose actions it does not know, and guessing them helps no guard there."""
     if map.solitary:
         return map
     how = {d: (own, j) for d, (own, j) in derived(map.names, map.plus.shape[0]).items() if d in map.follows and j < 0}
-    return following(replace(map, own=None, reconcile=None, follows=(), joint=False), how)
+    guessing = map.plus.shape[0] > 1 and not map.body
+    return following(replace(map, own=None, reconcile=None, follows=(), joint=False, guessing=guessing), how)
 
 
 def _reconcile_relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:

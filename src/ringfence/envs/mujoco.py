@@ -37,6 +37,7 @@ RESET_SPREAD = 0.1  # of joint positions (uniform) and velocities (standard devi
 HEALTHY_Z = (0.2, 1.0)  # m, the Ant's torso; outside the episode ends
 MARGIN = 0.01  # m, contact margin of the Ant's geoms in Gymnasium's file
 LIMITS = {"2x3": 3.227, "2x4": 2.522, "4x2": 2.418}  # m/s, safety-gymnasium's
+CREEPING = 0.6  # m/s: below that limit a guard pushes an Ant less
 ROBOTS = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
 
 Parts = Literal["2x3", "2x4", "4x2"]
@@ -98,9 +99,10 @@ class SafeMuJoCo:
     @property
     def guard(self) -> dict[str, dict]:
         """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what
-        changes. An Ant that is pushed or climbs far from where the logs were falls."""
+        changes. An Ant that is pushed or climbs far from where the logs were falls; where it is to creep, few actions
+        meet the margin, so that it is pushed at every step, and less will do."""
         climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
-        bound = {"bound": 0.5} if self.ant else {}
+        bound = {"bound": 0.2 if self.limit < CREEPING else 0.5} if self.ant else {}
         return {"shield": bound, "adapt": bound, "refine": climb, "full": climb | bound}
 
     @property

@@ -149,11 +149,10 @@ class Guard(eqx.Module):
         """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work.
         All of them judge what comes of it."""
         dynamics, starts = self.world.dynamics, actions.shape[1]
-        members = jax.tree.leaves(dynamics.net)[0].shape[0]
-        nets = jax.tree.map(lambda x: x[jnp.arange(starts) % members][:, None], dynamics.net)
+        nets = dynamics.members(jnp.arange(starts)[:, None] % dynamics.size)
 
-        def by(net, actions: Array) -> tuple[Array, Array]:
-            rows, spread = self.foreseen(present, actions[:, None], eqx.tree_at(lambda d: d.net, dynamics, net))
+        def by(nets, actions: Array) -> tuple[Array, Array]:
+            rows, spread = self.foreseen(present, actions[:, None], dynamics.by_members(nets))
             return rows[:, 0], spread[:, 0]
 
         return jax.vmap(by, (0, 1), 1)(nets, actions)

@@ -93,7 +93,7 @@ def played(
     steps = int(min(steps, logs.lengths[which].max()))
     danger = Danger(world, "learned", None, False) if world.barrier is not None else None
     spec = world.spec
-    members = jax.tree.leaves(world.dynamics.net)[0].shape[0]
+    members = world.dynamics.size
 
     @jax.jit
     def play(policy, way: Back, world: World, danger: Danger | None, x: Array, member: Array, key: Key):

@@ -8,6 +8,8 @@ It is fitted long enough to learn contacts: a few thousand updates, which predic
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -27,9 +29,15 @@ BATCH = 128  # small and often: at equal time it learns contacts that 512 at hal
 class Dynamics(eqx.Module):
     """g_φ of E members. Agents that share a body (`FeatureMap.joint`) have one model of it, which reads everybody's
     action and is told in the first agent's view; otherwise every agent's own entries follow from its own action, and
-    the rest from them (`FeatureMap.reconcile`)."""
+    the rest from them (`FeatureMap.reconcile`).
+
+    Who hears of nobody (`FeatureMap.guessing`) learns from everybody's view and action, and takes the others' from a
+    guess that reads its own view alone. Without that its own action would tell what it cannot see: who brakes in the
+    logs often does so because another comes, so that braking would foresee one, and a push that nobody made no one.
+    """
 
     net: MLP  # leaves (E, G, ...)
+    guesses: MLP | None  # of what the others see and do, from own features; leaves (E, G, ...)
     mean: Array  # (D,)
     scale: Array  # (D,)
     step_mean: Array  # (F,) of the foreseen entries
@@ -51,13 +59,35 @@ class Dynamics(eqx.Module):
 
     def changes(self, before: Array, action: Array) -> Array:
         """(E, ..., N or 1, F) standardised changes of the foreseen entries, by member."""
-        return jax.vmap(lambda net: net(self.read(before, action)))(self.net)
+
+        def by(net: MLP, guesses: MLP | None) -> Array:
+            read = self.read(before, action)
+            return net(read if guesses is None else jnp.concatenate([read, self.guessed(guesses, before)], -1))
+
+        return jax.vmap(by)(self.net, self.guesses)
 
     def read(self, before: Array, action: Array) -> Array:
-        """What the network reads, (..., N or 1, D + A or N A)."""
+        """What the network reads, (..., N or 1, D + A or N A), but for what is guessed."""
         if self.map.joint:
             before, action = before[..., :1, :], action.reshape(*action.shape[:-2], 1, -1)
         return jnp.concatenate([(before - self.mean) / self.scale, action], -1)
+
+    def guessed(self, guesses: MLP, before: Array) -> Array:
+        """(..., N, (N-1) (D + A)) what each agent takes the others to see and do, standardised."""
+        return guesses((before - self.mean) / self.scale)
+
+    def members(self, index: Array) -> tuple[MLP, MLP | None]:
+        """The networks of the members at `index` (K,), leaves (K, G, ...), for `by_members`."""
+        return jax.tree.map(lambda x: x[index], (self.net, self.guesses))
+
+    def by_members(self, nets: tuple[MLP, MLP | None]) -> Dynamics:
+        """The same by other members."""
+        return replace(self, net=nets[0], guesses=nets[1])
+
+    @property
+    def size(self) -> int:
+        """E"""
+        return self.net.weights[0].shape[0]
 
     def arrived(self, before: Array, change: Array) -> Array:
         """Features (..., N, D) after a standardised change (..., N or 1, F)."""
@@ -96,28 +126,34 @@ def fit_dynamics(
     told = dict(mean=mean, scale=scale, step_mean=moved.mean(0), step_scale=varying(moved.std(0), size))
     told = {k: jnp.asarray(v, jnp.float32) for k, v in told.items()}
     model = eqx.tree_at(lambda d: tuple(getattr(d, k) for k in told), blank, tuple(told.values()))
-    net = _network(kn, map, actions.shape[-1], members, width)
+    nets = _networks(kn, map, actions.shape[-1], members, width)
+    others = _others(map)
 
-    def loss(net: MLP, data: tuple[Array, ...], pick: Array) -> Array:
+    def loss(nets: tuple[MLP, MLP | None], data: tuple[Array, ...], pick: Array) -> Array:
         features, actions, row = data
 
-        def of(net: MLP, step: Array) -> Array:
+        def of(nets: tuple[MLP, MLP | None], step: Array) -> Array:
+            (net, guesses), action = nets, actions[step]
             before, after = features[row[step]], features[row[step] + 1]
             moved = (after - before)[:, shown, model.foreseen]
             moved = (moved - model.step_mean) / model.step_scale
-            return optax.losses.huber_loss(net(model.read(before, actions[step])), moved, delta=1.0).mean()
+            read, wrong = model.read(before, action), 0.0
+            if guesses is not None:  # it learns from what others saw and did
+                theirs = read[:, others].reshape(*read.shape[:2], -1)
+                wrong = ((model.guessed(guesses, before) - theirs) ** 2).mean()
+                read = jnp.concatenate([read, theirs], -1)
+            return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
 
-        return jax.vmap(of)(net, pick.reshape(members, -1)).sum()
+        return jax.vmap(of)(nets, pick.reshape(members, -1)).sum()
 
     data = features, actions, row
-    net = regress(loss, net, data, len(row), kf, updates, BATCH * members, 4e-3, label)
-    return eqx.tree_at(lambda d: d.net, model, net)
+    return model.by_members(regress(loss, nets, data, len(row), kf, updates, BATCH * members, 4e-3, label))
 
 
 def blank_dynamics(map: FeatureMap, action: int, members: int, width: int) -> Dynamics:
     """An ensemble of the right shapes that says nothing."""
     one, some = jnp.ones(len(map.names)), jnp.ones(len(_foreseen(map)))
-    return Dynamics(_network(jax.random.key(0), map, action, members, width), one, one, some, some, map)
+    return Dynamics(*_networks(jax.random.key(0), map, action, members, width), one, one, some, some, map)
 
 
 def _foreseen(map: FeatureMap) -> np.ndarray:
@@ -131,10 +167,21 @@ def _of_first(map: FeatureMap) -> np.ndarray:
     return np.array([[at[source] for source in row] for row in map.plus.tolist()])
 
 
-def _network(key: Key, map: FeatureMap, action: int, members: int, width: int) -> MLP:
-    """Agents of one kind share weights: all of a team whose entries are named alike, and the one body of robots."""
+def _others(map: FeatureMap) -> np.ndarray:
+    """(N, N-1) who the others are."""
     n = map.plus.shape[0]
-    read = len(map.names) + (n if map.joint else 1) * action
+    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+
+
+def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) -> tuple[MLP, MLP | None]:
+    """Of what moves, and of what others see and do where that is guessed. Agents of one kind share weights: all of a
+    team whose entries are named alike, and the one body of robots."""
+    n, entries = map.plus.shape[0], len(map.names)
+    read = n * (entries + action) if map.guessing else entries + (n if map.joint else 1) * action
     groups = 1 if map.joint or map.follows else n
     sizes = (read, width, width, len(_foreseen(map)))
-    return jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(jax.random.split(key, members))
+    nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(jax.random.split(key, members))
+    if not map.guessing:
+        return nets, None
+    keys = jax.random.split(jax.random.fold_in(key, 1), members)
+    return nets, jax.vmap(lambda k: MLP(k, (entries, width, width, read - entries - action), groups=groups))(keys)

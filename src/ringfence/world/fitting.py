@@ -36,7 +36,7 @@ from ringfence.world import card as cards
 from ringfence.world import dynamics, values
 from ringfence.world.world import Card, World
 
-FORMAT = 3  # of what is fitted: what is cached of another is made again
+FORMAT = 4  # of what is fitted: what is cached of another is made again
 HELD_OUT = 0.1  # of the episodes, whole ones
 FEWEST = 5  # episodes that can be divided
 CLOSE = 20  # steps before danger that its value is learned from most
