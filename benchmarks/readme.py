@@ -190,7 +190,7 @@ def _robots_cell(shown: dict, algorithm: str, variant: str) -> str:
     found = [
         r for rows in shown.values() for r in rows if (r.method.algorithm, r.method.variant) == (algorithm, wanted)
     ]
-    kept, seeds = sum(r.safe for r in found), max(len(r.seeds) for r in found)
+    kept, seeds = sum(r.safe for r in found), min(len(r.seeds) for r in found)
     return f"{kept} of {len(found)}, {np.mean([r.returns_norm for r in found]):.2f}" + _seeds(seeds)
 
 
