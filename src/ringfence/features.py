@@ -71,6 +71,11 @@ class FeatureMap:
         return jnp.concatenate([plan[:, :history], self.reconcile(plan[:, history:])], 1)
 
 
+def others(n: int) -> np.ndarray:
+    """(N, N-1) who the others of each agent are, in order."""
+    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+
+
 def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     """Entries that follow from everybody's own ones, as names tell: entry -> (own entry whose change it follows, which
     of the others it is about, -1: a thing that stands still).
@@ -190,10 +195,9 @@ def _reconcile_relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Ar
     of one another; and a gradient on the result moves bodies, not images of them.
     """
     entries, sources = np.array(list(how)), np.array([own for own, _ in how.values()])
-    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
     about = np.array([j for _, j in how.values()])
     moving = about >= 0
-    whose = others[:, about[moving]] if moving.any() else np.zeros((n, 0), int)  # (N, entries about others)
+    whose = others(n)[:, about[moving]] if moving.any() else np.zeros((n, 0), int)  # (N, entries about others)
 
     def agree(x: Array) -> Array:
         start, later = x[..., :1, :, :], x[..., 1:, :, :]

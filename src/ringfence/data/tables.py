@@ -19,6 +19,7 @@ import numpy as np
 from ringfence.data.store import EpisodeStore
 from ringfence.data.tracks import Tracks, cut, nearest, resample, teams
 from ringfence.errors import StoreError, UserError, unknown, whole_number
+from ringfence.features import others
 from ringfence.hazards import CostColumn, Hazard, Separation
 
 AXES = "xyz"
@@ -209,7 +210,7 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
     (n,) = next(iter(sizes))
     axes = [c for c in AXES if c in columns]
     slots = 1 + max((int(m[1]) for name in names if (m := re.match(r"other(\d+)\.", name))), default=-1)
-    near = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    near = others(n)
     there = np.ones((n, slots), bool)
     reach = float(card.get("sight", np.inf))
     if card.get("alike"):
@@ -520,14 +521,14 @@ def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, lon
     names, parts = _own(made, moving, with_place=True)
     own = np.concatenate(parts, 1)[kept]
     seen = [own]
-    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    whose = others(n)
     columns = [(f"d{c}", made.column(c)) for c in made.position]
     columns += [(f"dv{c}", moving[:, k]) for k, c in enumerate(made.axes)]
     columns += [(c, made.column(c)) for c in made.state if c not in (*made.position, *made.speed)]
     for j in range(n - 1):
         for name, column in columns:
             relative = name in [f"d{v}{c}" for v in ("", "v") for c in AXES]
-            theirs = column[kept][:, others[:, j]]
+            theirs = column[kept][:, whose[:, j]]
             seen.append((theirs - column[kept] * relative)[..., None])
             names.append(f"other{j}.{name}")
     cost = t.cost[kept]

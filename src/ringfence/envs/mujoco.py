@@ -28,7 +28,7 @@ import numpy as np
 
 from ringfence import interrupts
 from ringfence.errors import UserError, unknown
-from ringfence.features import VIEWS, FeatureMap
+from ringfence.features import VIEWS, FeatureMap, others
 from ringfence.types import Array
 
 FRAME_SKIP = 5  # substeps of an environment step
@@ -442,13 +442,13 @@ def views(view: str, env: SafeMuJoCo) -> FeatureMap:
 def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present: everybody's torso is the mean of the planned ones, and
     others' joints are where their owners plan to have them."""
-    others = np.array([[j for j in range(n) if j != i] for i in range(n)], int)
+    whose = others(n)
 
     def agree(x: Array) -> Array:
         start, later = x[..., :1, :, :], x[..., 1:, :, :]
         body = jnp.broadcast_to(later[..., :torso].mean(-2, keepdims=True), later[..., :torso].shape)
         own = later[..., torso : torso + joints]
-        rest = own[..., others, :].reshape(*own.shape[:-1], (n - 1) * joints)
+        rest = own[..., whose, :].reshape(*own.shape[:-1], (n - 1) * joints)
         return jnp.concatenate([start, jnp.concatenate([body, own, rest], -1)], -3)
 
     return agree

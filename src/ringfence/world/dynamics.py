@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.features import FeatureMap
+from ringfence.features import FeatureMap, others
 from ringfence.nets.mlp import MLP
 from ringfence.normalise import varying
 from ringfence.optim import regress
@@ -127,7 +127,7 @@ def fit_dynamics(
     told = {k: jnp.asarray(v, jnp.float32) for k, v in told.items()}
     model = eqx.tree_at(lambda d: tuple(getattr(d, k) for k in told), blank, tuple(told.values()))
     nets = _networks(kn, map, actions.shape[-1], members, width)
-    others = _others(map)
+    whose = others(map.plus.shape[0])
 
     def loss(nets: tuple[MLP, MLP | None], data: tuple[Array, ...], pick: Array) -> Array:
         features, actions, row = data
@@ -139,7 +139,7 @@ def fit_dynamics(
             moved = (moved - model.step_mean) / model.step_scale
             read, wrong = model.read(before, action), 0.0
             if guesses is not None:  # it learns from what others saw and did
-                theirs = read[:, others].reshape(*read.shape[:2], -1)
+                theirs = read[:, whose].reshape(*read.shape[:2], -1)
                 wrong = ((model.guessed(guesses, before) - theirs) ** 2).mean()
                 read = jnp.concatenate([read, theirs], -1)
             return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
@@ -165,12 +165,6 @@ def _of_first(map: FeatureMap) -> np.ndarray:
     """(N, D) where the first agent's view holds what entry d of agent i is."""
     at = {source: d for d, source in enumerate(map.plus[0].tolist())}
     return np.array([[at[source] for source in row] for row in map.plus.tolist()])
-
-
-def _others(map: FeatureMap) -> np.ndarray:
-    """(N, N-1) who the others are."""
-    n = map.plus.shape[0]
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
 
 
 def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) -> tuple[MLP, MLP | None]:
