@@ -56,11 +56,11 @@ def tested(row, twin, key: str, verdict: Callable[[list], bool]) -> Callable[[],
 def planner_on_robots() -> tuple[bool, str]:
     """ICBF beside cloning under `adapt`, adjusted with all other questions of robots."""
     rows = ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}")
-    asked = answers("guards-mujoco", OF_ROBOTS)
-    found = next(ds for q, key, ds in asked if (q.row, q.twin) == rows and key == "return")
+    answered = answers("guards-mujoco", OF_ROBOTS)
+    found = next(ds for q, key, ds in answered if (q.row, q.twin) == rows and key == "return")
     more, less = ([d for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1))
     told = ", ".join(f"{d.task} {d.mean:+.0f}" for d in more)
-    return (len(found), len(more), len(less)) == (9, 4, 0), f"more: {told}; less: none of {len(found)}"
+    return (len(found), len(more), len(less)) == (9, 4, 0), f"more: {told}; less on {len(less)} of {len(found)}"
 
 
 def within(bound: float) -> Callable[[list], bool]:

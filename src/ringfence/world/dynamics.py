@@ -77,7 +77,7 @@ class Dynamics(eqx.Module):
         return guesses((before - self.mean) / self.scale)
 
     def members(self, index: Array) -> tuple[MLP, MLP | None]:
-        """The networks of the members at `index` (K,), leaves (K, G, ...), for `by_members`."""
+        """The networks of the members at `index` (...), leaves (..., G, ...), for `by_members`."""
         return jax.tree.map(lambda x: x[index], (self.net, self.guesses))
 
     def by_members(self, nets: tuple[MLP, MLP | None]) -> Dynamics:
