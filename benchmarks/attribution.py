@@ -25,6 +25,7 @@ PROPOSALS: dict[str, tuple[str, Row]] = {
     "MA-TD3+BC, Lagrange": ("own", ("ma-td3bc-lag", "default")),
     "OMAR": ("own", ("omar", "default")),
     "our MADIFF (return)": ("all", ("madiff", "default")),
+    "our MADIFF, each for itself": ("own", ("madiff", "own")),
     "our MADIFF, four times the updates": ("all", ("madiff", "long")),
     "ICBF as printed, λ = 0.1": ("all", ("icbf", "paper")),
     "ICBF as printed, λ = 1": ("all", ("icbf", "paper-1")),
@@ -94,6 +95,12 @@ QUESTIONS = (
     ),
     Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
     Question("everybody in sight of cloning", ("bc", "joint"), ("bc", "default")),
+    Question("everybody in sight of MADIFF, one plan for all", ("madiff", "default"), ("madiff", "own")),
+    Question(
+        "everybody in sight of MADIFF, one plan for all, under a shield",
+        ("madiff", f"default{SHIELD}"),
+        ("madiff", f"own{SHIELD}"),
+    ),
 )
 
 ADAPT, STEADY = "+adapt-learned", "+steady+adapt-learned"

@@ -257,6 +257,25 @@ def test_no_seed_and_no_store_are_refused(small_store, tmp_path):
         training.train("bc", "simple_spread-random", out=tmp_path)
 
 
+def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
+    """What another agent sees changes one's own action where one plan is drawn for all, and not where each plans."""
+    moved = {}
+    for observe in ("all", "single"):
+        changes = {**TINY["madiff"], "view": "decentralized", "steps": 30, "observe": observe}
+        asked = {"changes": changes, "world": {**QUICK_WORLD, "barrier": False}}
+        run = training.train("madiff", small_store, out=tmp_path / observe, **job_of("madiff") | asked)[0]
+        _, policy = evaluate.load(run)
+        seen, state = small_store.observations[:4], small_store.state[:4]
+        other = seen.copy()
+        other[:, 1] += 0.5
+        steps = (policy.act(policy.start(4), o, state, jax.random.key(0))[1] for o in (seen, other))
+        a, b = (np.asarray(step.action) for step in steps)
+        moved[observe] = np.abs(a - b)[:, 0].max()
+    assert moved["all"] > 1e-5 and moved["single"] < 1e-7
+    with pytest.raises(UserError, match="execution='centralized' needs a model"):
+        evaluate.load(run, execution="centralized")
+
+
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])
 def test_views(small_store, tmp_path, view, execution):
     changes = {**TINY["madiff"], "view": view, "steps": 2, "observe": "mixed"}

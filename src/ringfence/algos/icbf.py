@@ -526,6 +526,14 @@ MADIFF = dataclasses.replace(
     presets={
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
         "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "steps": 6000},
+        # MADIFF-D: everybody plans for all from its own observation
+        "own": {
+            "barrier": False,
+            "barrier_weight": 0.0,
+            "condition": "return",
+            "view": "decentralized",
+            "observe": "single",
+        },
         "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
         "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
     },

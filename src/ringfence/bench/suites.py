@@ -134,6 +134,7 @@ SUITES = {
             Entry("icbf", "split-0", ("plain", "select-learned", "shield-learned")),
             Entry("madiff", "default", _ALONE),
             Entry("madiff", "long", _ALONE),
+            Entry("madiff", "own", _ALONE),
             Entry("icbf", "long", _ALONE),
             Entry("bc", "joint", _ALONE),
             *(Entry(name, evaluations=_ALONE) for name in _RIVALS),
