@@ -169,7 +169,7 @@ def evaluate(
         target: return condition, as a normal score.
         temperature: scale of the first noise.
         replan: steps for which a plan is followed.
-        execution: trained (as the model was), centralized or decentralized.
+        execution: centralized or decentralized.
         video: make a GIF of the first episode (robots).
         set: any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them.
     """
@@ -358,7 +358,7 @@ def export(
         target: return condition, as a normal score.
         temperature: scale of the first noise.
         replan: steps for which a plan is followed.
-        execution: trained (as the model was), centralized or decentralized.
+        execution: centralized or decentralized.
         set: any other option of planner or guard, e.g. --set shield=20.
     """
     given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}

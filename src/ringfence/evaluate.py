@@ -24,7 +24,7 @@ from ringfence.files import writable
 from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
 from ringfence.guards.policy import Paid, build, costs_of_one
 from ringfence.hazards import BoundHazard
-from ringfence.policies import PLANNERS, Planner, PlanOptions
+from ringfence.policies import PLANNERS, Planner, PlanOptions, plan_defaults
 from ringfence.progress import Progress
 from ringfence.runs import Run, build_config
 from ringfence.tasks import Task
@@ -458,7 +458,7 @@ def load_job(run: Run, agents: int | None = None) -> training.Job:
 
 def make_policy(job: training.Job, state, options: dict) -> Policy:
     """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
-    chosen = build_config(PlanOptions, options, "the planner")
+    chosen = build_config(PlanOptions, {**plan_defaults(job.config), **options}, "the planner")
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
 
 

@@ -32,9 +32,6 @@ from ringfence.world.values import plan_value
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
-EXECUTIONS = ("trained", "centralized", "decentralized")  # trained: as the model was, alone where it saw one agent
-
-
 @dataclass(frozen=True)
 class PlanOptions:
     """Evaluation-time choices of how plans are drawn."""
@@ -48,7 +45,7 @@ class PlanOptions:
     persist: float = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: int = 1  # steps that a plan is followed for
-    execution: Literal["trained", "centralized", "decentralized"] = "trained"  # decentralized: each plans for itself
+    execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
     def __post_init__(self):
         for name in ("steps", "replan"):
@@ -59,10 +56,15 @@ class PlanOptions:
                 raise UserError(f"{name}={getattr(self, name)} must not be negative.")
         if self.sampler not in diffusion.SAMPLERS:
             raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
-        if self.execution not in EXECUTIONS:
-            raise unknown("execution", self.execution, EXECUTIONS)
+        if self.execution not in ("centralized", "decentralized"):
+            raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
         if self.persist != 1.0 and not self.ascent:
             raise UserError(f"persist={self.persist} is read by nothing that was asked for; set ascent.")
+
+
+def plan_defaults(config) -> dict:
+    """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone."""
+    return {"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {}
 
 
 # Named sets of evaluation-time choices, made on validation resets; docs/evaluation.md.
@@ -107,13 +109,6 @@ class Planner(eqx.Module):
         if o.execution == "centralized" and self.observe == "single":
             raise UserError("execution='centralized' needs a model trained with observe='all' or 'mixed'.")
         diffusion.timesteps(len(self.alpha_bar), o.steps)
-
-    @property
-    def alone(self) -> bool:
-        """Whether each agent plans for itself."""
-        return self.options.execution == "decentralized" or (
-            self.options.execution == "trained" and self.observe == "single"
-        )
 
     def start(self, batch: int) -> PyTree:
         n, d = self.spec.n_agents, self.spec.feature_dim
@@ -178,12 +173,13 @@ class Planner(eqx.Module):
         n times the work, and keeps its own part."""
         (b, n, d), rows = present.shape, self.history + self.horizon
         context = jnp.concatenate([past, present[:, None]], 1)
-        copies = count * (n if self.alone else 1)
+        local = self.options.execution == "decentralized"
+        copies = count * (n if local else 1)
         visible = jnp.ones((b, copies, n), bool)
-        if self.alone:
+        if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
         x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
-        if not self.alone:
+        if not local:
             return x.reshape(b, count, rows, n, d)
         own = x.reshape(b, n, count, rows, n, d)
         return jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)

@@ -30,7 +30,7 @@ from ringfence.data.store import EpisodeStore
 from ringfence.errors import RunConflict, UserError, unknown, whole_number
 from ringfence.files import whole
 from ringfence.guards import GuardOptions, options_of
-from ringfence.policies import PLANNERS, PlanOptions
+from ringfence.policies import PLANNERS, PlanOptions, plan_defaults
 from ringfence.runs import Run, build_config, write_json
 from ringfence.world import Settings
 
@@ -95,7 +95,7 @@ class Cell:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
             same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
-            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task))
+            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task), plan_defaults(self.config))
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -110,11 +110,12 @@ class Cell:
         return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {}
 
 
-def same_options(stored: dict, evaluation: dict, task: tasks.Task) -> bool:
+def same_options(stored: dict, evaluation: dict, task: tasks.Task, defaults: dict) -> bool:
     """Whether a result was played with the options of planner and guard that an evaluation's name stands for on a task
-    today, and in a World of the settings that it has there. What labels come from follows from the data."""
+    today, given the planner's defaults, and in a World of the settings that it has there. What labels come from follows
+    from the data."""
     how = evaluate.asked(**evaluation)
-    plan = dataclasses.asdict(PlanOptions(**{**PLANNERS[how.planner], **how.plan}))
+    plan = dataclasses.asdict(PlanOptions(**{**defaults, **PLANNERS[how.planner], **how.plan}))
     if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
         return False
     guard = stored.get("guard_options") or {}
