@@ -164,7 +164,8 @@ def robots(suite: str) -> str:
         for row in ROBOTS.values():
             found = [r for seed, r in of(suite, task, variant(task, row)).items() if seed in seeds]
             earned, cost = (sum(r[key] for r in found) for key in ("return_mean", "cost_mean"))
-            told.append(f"{earned / len(found):.0f} / {cost / len(found):.1f}" if found else "–")
+            fewer = f" [{len(found)}]" if len(found) < len(seeds) else ""
+            told.append(f"{earned / len(found):.0f} / {cost / len(found):.1f}{fewer}" if found else "–")
         if told[-1] != "–":
             out.append(f"| `{task}` | " + " | ".join(told) + " |")
     return "\n".join(out)

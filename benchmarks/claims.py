@@ -60,7 +60,7 @@ def planner_on_robots() -> tuple[bool, str]:
     found = next(ds for q, key, ds in answered if (q.row, q.twin) == rows and key == "return")
     more, less = ([d for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1))
     told = ", ".join(f"{d.task} {d.mean:+.0f}" for d in more)
-    return (len(found), len(more), len(less)) == (9, 4, 0), f"more: {told}; less on {len(less)} of {len(found)}"
+    return (len(found), len(more), len(less)) == (9, 1, 0), f"more: {told}; less on {len(less)} of {len(found)}"
 
 
 def within(bound: float) -> Callable[[list], bool]:
@@ -336,6 +336,12 @@ CLAIMS = (
         "results/guards-mujoco/table.csv",
         robots_kept("bc", "default+full-learned", 17),
     ),
+    Claim(
+        "README.md",
+        "earn more than cloned actions on one data set of nine, less on none",
+        "results/guards-mujoco/table.csv",
+        planner_on_robots,
+    ),
     Claim("docs/crossing.md", "1 of 5000", "results/crossing/table.csv", crossing_rare),
     Claim(
         "docs/crossing.md",
@@ -403,7 +409,7 @@ CLAIMS = (
     Claim("docs/attribution.md", "A shield takes the cost from every proposal", SPREAD, shielded_all),
     Claim(
         "docs/attribution.md",
-        "earns more than cloning on four of nine data sets and less on none",
+        "earns more than cloning beyond chance on one of nine data sets and less on none",
         "results/guards-mujoco/table.csv",
         planner_on_robots,
     ),
@@ -415,13 +421,13 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
-        "it earns more on two tiers and less on none",
+        "it earns more on three tiers and less on none",
         SPREAD,
         tested(
             ("madiff", f"long{SHIELD}"),
             ("bc-return", f"default{SHIELD}"),
             "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) >= 2 and not any(d.holds and d.mean > 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 3 and not any(d.holds and d.mean > 0 for d in ds),
         ),
     ),
     Claim(
