@@ -432,6 +432,17 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
+        "One plan for all earns more than a plan of each agent's own",
+        SPREAD,
+        tested(
+            ("madiff", f"default{SHIELD}"),
+            ("madiff", f"own{SHIELD}"),
+            "return",
+            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 2 and not any(d.holds and d.mean < 0 for d in ds),
+        ),
+    ),
+    Claim(
+        "docs/attribution.md",
         "The barrier in training lowers the cost of plans that are followed as they are",
         SPREAD,
         tested(("icbf", "split"), ("icbf", "split-0"), "avoidable", lower),
