@@ -338,7 +338,7 @@ CLAIMS = (
     ),
     Claim(
         "README.md",
-        "earn more than cloned actions on one data set of nine, less on none",
+        "plans earn more than cloned actions beyond chance on one data set of nine, less on none",
         "results/guards-mujoco/table.csv",
         planner_on_robots,
     ),
