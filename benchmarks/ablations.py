@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from unittest import mock
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -20,12 +23,14 @@ import numpy as np
 from _rows import append, read
 from readme import put
 
-from ringfence import stats, tasks, training, worlds
+from ringfence import features, stats, tasks, training, worlds
 from ringfence.data.make import make
 from ringfence.envs import SimpleSpread
 from ringfence.evaluate import evaluate_policy, load
 from ringfence.features import FeatureMap
 from ringfence.types import Array
+from ringfence.world import World
+from ringfence.world.barrier import Barrier
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "ablations.csv"
 FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible")
@@ -50,13 +55,39 @@ class Simulated(eqx.Module):
         return self.map(self.env.observe(after), self.env.global_state(after)), jnp.zeros(action.shape[:-1])
 
 
+class Ahead(Barrier):
+    """A barrier that knows danger by its value alone."""
+
+    def of_steps(self, before: Array, after: Array) -> Array:
+        return self.ahead(after)
+
+
+def by_value(world: World) -> World:
+    """V in the place of ℓ, in the margin of ℓ."""
+    told = world.barrier
+    return eqx.tree_at(lambda w: w.barrier, world, Ahead(**{f.name: getattr(told, f.name) for f in fields(told)}))
+
+
+def by_simulator(world: World) -> World:
+    """The simulator foresees."""
+    simulated = Simulated(jnp.zeros((1, 1)), SimpleSpread(), world.map)
+    return eqx.tree_at(lambda w: w.dynamics, world, simulated)
+
+
+def unguessed():
+    """While it lasts, Worlds of own sight foresee by the own view and action alone."""
+    usual = features.alone
+    return mock.patch.object(features, "alone", lambda map: replace(usual(map), guessing=False))
+
+
 @dataclass(frozen=True)
 class Way:
     """One thing that differs from the default."""
 
     options: dict = field(default_factory=dict)  # of the guard
     world: dict = field(default_factory=dict)  # settings of the World
-    true: bool = False  # the simulator foresees
+    other: Callable[[World], World] = lambda world: world  # what is put in the place of a part
+    fitted: Callable[[], AbstractContextManager] = nullcontext  # how the World is fitted
 
 
 ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
@@ -64,13 +95,16 @@ MEMBERS = {f"an ensemble of {k}": Way(world={"members": k}) for k in (1, 5)}
 RETAIN = {"condition (3), not a margin": Way({"condition": "retain"})}
 FORMULA = {"danger by the true formula": Way({"danger": "formula"})}
 TRUE = {
-    "the true dynamics": Way(true=True),
-    "the true dynamics and formula": Way({"danger": "formula"}, true=True),
+    "the true dynamics": Way(other=by_simulator),
+    "the true dynamics and formula": Way({"danger": "formula"}, other=by_simulator),
 }
 V = {"the last row judged by V": Way({"future": True})}
+V_ALONE = {"by V alone": Way({"future": False}, other=by_value)}
+GUESS = {"foreseen by the own action alone": Way(world={"cached": False}, fitted=unguessed)}
+OWN = ", own sight"  # of a guard's name here
 # By task, algorithm and preset, and guard; the default is not named among the ways.
 STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
-    ("simple_spread-expert", "bc", "shield"): ROWS | V | RETAIN | MEMBERS | FORMULA | TRUE,
+    ("simple_spread-expert", "bc", "shield"): ROWS | V | V_ALONE | RETAIN | MEMBERS | FORMULA | TRUE,
     ("simple_spread-expert", "bc", "full"): {
         **ROWS,
         **MEMBERS,
@@ -86,11 +120,13 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
     ("crossing-hasty", "bc", "shield"): {
         **{k: v for k, v in ROWS.items() if k != "5 rows foreseen"},
         "by ℓ alone": Way({"future": False}),
+        **V_ALONE,
         **RETAIN,
         **MEMBERS,
         **FORMULA,
     },
     ("halfcheetah_2x3-medium", "bc", "adapt"): ROWS
+    | V_ALONE
     | RETAIN
     | MEMBERS
     | FORMULA
@@ -102,6 +138,9 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
         "climbing anywhere": Way({"reach": 2.0}),
     },
+    ("simple_spread-expert", "bc", f"full{OWN}"): GUESS,
+    ("simple_spread-medium-replay", "bc", f"full{OWN}"): GUESS,
+    ("simple_spread-medium-replay", "bc", f"shield{OWN}"): GUESS,
 }
 
 
@@ -126,7 +165,7 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
     there = {r["way"] for r in read(out) if (r["task"], r["proposal"], r["guard"]) == study}
     if {"default", *ways} <= there:
         return
-    task = tasks.get(name)
+    task, sight = tasks.get(name), "own" if guard.endswith(OWN) else None
     episodes = 20 if task.protocol else 200
     store, _ = make(task)
     with tempfile.TemporaryDirectory() as folder:
@@ -134,11 +173,9 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
         (run,) = training.train(kind, store, preset=preset or None, seeds=(0,), out=folder, quiet=True)
 
         def played(way: Way) -> dict:
-            world = worlds.fit(store, **way.world)
-            if way.true:
-                simulated = Simulated(jnp.zeros((1, 1)), task.env, world.map)
-                world = eqx.tree_at(lambda w: w.dynamics, world, simulated)
-            _, policy = load(run, world=world, guard=guard, **way.options)
+            with way.fitted():
+                world = way.other(worlds.fit(store, sight=sight, **way.world))
+            _, policy = load(run, world=world, guard=guard.removesuffix(OWN), sight=sight, **way.options)
             return evaluate_policy(policy, task, episodes, "test", 0)[0]
 
         usual = None

@@ -6,6 +6,7 @@ python benchmarks/attribution.py
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 from evidence import Difference, Row, difference, family, mean, of, tasks_of, variant
@@ -112,9 +113,27 @@ OF_ROBOTS = (
     Question(
         "ICBF, not an actor told the return", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
     ),
+    Question("ICBF under `full`, not cloning", ("icbf", f"default+steady{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS),
+    Question(
+        "the barrier in training (ICBF, not MADIFF)",
+        ("icbf", f"default{STEADY}"),
+        ("madiff", f"default{STEADY}"),
+        ROBOT_KEYS,
+    ),
+    Question(
+        "diffusion (MADIFF), not an actor told the return",
+        ("madiff", f"default{STEADY}"),
+        ("bc-return", f"default{ADAPT}"),
+        ROBOT_KEYS,
+    ),
     Question(
         "an actor told the return, not cloning", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS
     ),
+    *(
+        Question(f"{words}, not cloning", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
+        for words, name in (("the best tenth", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
+    ),
+    Question("cloning under `full`, not no prior", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}"), ROBOT_KEYS),
 )
 
 
@@ -127,48 +146,58 @@ def main() -> None:
 
 def crossed(suite: str) -> str:
     """A line per proposal and guard, a column per task: normalised return / cost of resets that start safely."""
-    names = tasks_of(suite)
-    out = ["| proposal | sees | guard | " + " | ".join(n.partition("-")[2] for n in names) + " |"]
-    out.append("|---" * (3 + len(names)) + "|")
+    names, lines = tasks_of(suite), []
     for words, (sees, (algorithm, plain)) in PROPOSALS.items():
         for guard, ending in GUARDS.items():
             row, cells = (algorithm, plain + ending), []
             for task in names:
                 here = variant(task, row)
                 earned, cost = mean(suite, task, here, "return_norm"), mean(suite, task, here, "avoidable_cost")
-                seeds = len(of(suite, task, here))
-                told = "–" if earned is None else f"{earned:.2f} / {cost:.3f}"
-                cells.append(told + (f" [{seeds}]" if seeds > 1 else ""))
-            if any(c != "–" for c in cells):
-                out.append(
-                    f"| {words} | {sees} | {guard if plain != 'reference' else ''} | " + " | ".join(cells) + " |"
-                )
-    return "\n".join([*out, "", "[n]: mean of n seeds, else one."])
+                told = "–" if earned is None else f"{earned:z.2f} / {cost:.3f}"
+                cells.append((told, len(of(suite, task, here)) if plain != "reference" else 0))
+            if any(told != "–" for told, _ in cells):
+                lines.append(([words, sees, guard if plain != "reference" else ""], cells))
+    usual = [Counter(cells[i][1] for _, cells in lines if cells[i][1]).most_common(1)[0][0] for i in range(len(names))]
+    heads = [f"{name.partition('-')[2]} [{seeds}]" for name, seeds in zip(names, usual)]
+    out = ["| " + " | ".join(["proposal", "sees", "guard", *heads]) + " |", "|---" * (3 + len(names)) + "|"]
+    for about, cells in lines:
+        marked = [told + (f" [{n}]" if n and n != seeds else "") for (told, n), seeds in zip(cells, usual)]
+        out.append("| " + " | ".join([*about, *marked]) + " |")
+    return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])
 
 
-# Robots' proposals under `adapt`, danger learned: their words and rows.
+# Robots' proposals under `adapt`, danger learned, and by climbing under `full`: their words and rows.
 ROBOTS: dict[str, Row] = {
-    "cloning": ("bc", "default+adapt-learned"),
-    "best tenth": ("bc-best", "default+adapt-learned"),
-    "told the return": ("bc-return", "default+adapt-learned"),
-    "ICBF (steady)": ("icbf", "default+steady+adapt-learned"),
+    "cloning": ("bc", f"default{ADAPT}"),
+    "best tenth": ("bc-best", f"default{ADAPT}"),
+    "episodes within the limit": ("bc-safe", f"default{ADAPT}"),
+    "told the return": ("bc-return", f"default{ADAPT}"),
+    "MA-TD3+BC": ("ma-td3bc", f"default{ADAPT}"),
+    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", f"default{ADAPT}"),
+    "OMAR": ("omar", f"default{ADAPT}"),
+    "our MADIFF (steady)": ("madiff", f"default{STEADY}"),
+    "ICBF (steady)": ("icbf", f"default{STEADY}"),
+    "cloning, `full`": ("bc", f"default{FULL}"),
+    "ICBF (steady), `full`": ("icbf", f"default+steady{FULL}"),
+    "no prior (`mpc`), `full`": ("mpc", f"default{FULL}"),
 }
 
 
 def robots(suite: str) -> str:
-    """A line per task on which the planner was played: return / steps above the limit under the same guard, by the
-    planner's seeds."""
-    out = ["| | " + " | ".join(ROBOTS) + " |", "|---" * (1 + len(ROBOTS)) + "|"]
-    for task in tasks_of(suite):
-        told, seeds = [], of(suite, task, variant(task, ROBOTS["ICBF (steady)"]))
-        for row in ROBOTS.values():
-            found = [r for seed, r in of(suite, task, variant(task, row)).items() if seed in seeds]
-            earned, cost = (sum(r[key] for r in found) for key in ("return_mean", "cost_mean"))
-            fewer = f" [{len(found)}]" if len(found) < len(seeds) else ""
-            told.append(f"{earned / len(found):.0f} / {cost / len(found):.1f}{fewer}" if found else "–")
-        if told[-1] != "–":
-            out.append(f"| `{task}` | " + " | ".join(told) + " |")
-    return "\n".join(out)
+    """A line per proposal, a column per data set under the limit that proposals were played with: return / steps above
+    it."""
+    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ROBOTS["ICBF (steady)"]))]
+    out = ["| | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
+    for words, row in ROBOTS.items():
+        cells = []
+        for task in names:
+            here = variant(task, row)
+            earned, cost = mean(suite, task, here, "return_mean"), mean(suite, task, here, "cost_mean")
+            seeds = len(of(suite, task, here))
+            told = "–" if earned is None else f"{earned:.0f} / {cost:.1f}"
+            cells.append(told + (f" [{seeds}]" if seeds not in (0, 5) else ""))
+        out.append(f"| {words} | " + " | ".join(cells) + " |")
+    return "\n".join([*out, "", "[n]: of n seeds, else of five."])
 
 
 def answers(suite: str, asked: tuple[Question, ...] = QUESTIONS) -> list[tuple[Question, str, list[Difference]]]:
@@ -204,6 +233,8 @@ def counted(suite: str) -> str:
     """A line per question of robots: on how many tasks the row has more and less, beyond chance, and which they are."""
     out = ["| what differs | of | tasks | seeds | more on | less on |", "|---" * 6 + "|"]
     for q, key, ds in answers(suite, OF_ROBOTS):
+        if not ds:
+            continue
         sides = [[f"`{d.task}` {d.mean:+.3g}" for d in ds if d.holds and d.mean * sign > 0] for sign in (1, -1)]
         listed = [f": {', '.join(side)}" if len(side) <= 6 else "" for side in sides]
         told = [f"**{len(side)}**{names}" if side else "0" for side, names in zip(sides, listed)]

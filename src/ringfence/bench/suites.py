@@ -20,6 +20,7 @@ EVALUATIONS: dict[str, dict] = {
         f"steady+adapt-{danger}": {"planner": "steady", "guard": "adapt", "danger": danger}
         for danger in ("learned", "formula")
     },
+    "steady+full-learned": {"planner": "steady", "guard": "full", "danger": "learned"},
     # Where danger is decided long before: by what is dangerous now alone, and by what will be.
     **{
         f"shield-{danger}+rows{rows}+futureFalse": {"guard": "shield", "danger": danger, "rows": rows, "future": False}
@@ -146,7 +147,9 @@ SUITES = {
         _ROBOTS,
         (
             Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
-            Entry("icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula")),
+            Entry(
+                "icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula", "steady+full-learned")
+            ),
             Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
             *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
             Entry("mpc", evaluations=("full-learned",)),
