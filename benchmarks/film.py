@@ -1,9 +1,12 @@
-"""The README's film: two runs on the same test reset, side by side, with speed and limit drawn in.
+"""Films of two runs on the same test reset, side by side: robots with speed and limit drawn in, discs with who touches.
 
-python benchmarks/film.py LEFT VARIANT RIGHT VARIANT    # run folders with recordings -> docs/images/rollout.gif
+    ringfence get crossing-hasty/bc; RUN=runs/crossing-hasty/bc/seed-0
+    ringfence eval $RUN --agents 64 --episodes 1 --record 1
+    ringfence eval $RUN --agents 64 --episodes 1 --record 1 --guard shield
+    python benchmarks/film.py $RUN default+agents64 $RUN default+shield-learned+agents64 --out docs/images/crossing.gif
 
-The README's: seed 0 of madiff, mujoco+steady, and of icbf, mujoco+adaptive, both in results/mujoco/cells/
-halfcheetah_2x3-good. Recordings are not in the repository; `ringfence eval RUN --record 1 --planner steady` makes one.
+docs/images/rollout.gif is of seed 0 of madiff, mujoco+steady, and of icbf, mujoco+adaptive, both of
+halfcheetah_2x3-good in results/mujoco (revision 3). Recordings are not in the repository.
 """
 
 from __future__ import annotations
@@ -12,19 +15,17 @@ import argparse
 import os
 from pathlib import Path
 
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
 from ringfence.envs import film
-from ringfence.envs.mujoco import DT
 from ringfence.errors import UserError
 from ringfence.evaluate import load_job
 from ringfence.report import video
 from ringfence.report.table import NAMES
 from ringfence.runs import Run
 
-OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "rollout.gif"
 STEPS = 160  # from the start
-HEAD = 20  # pixels
+HEAD, WIDEST = 20, 400  # pixels of the title's height, of a half
 
 
 def main() -> None:
@@ -32,32 +33,36 @@ def main() -> None:
     for side in ("left", "right"):
         parser.add_argument(side, type=Path, help="run folder with a recording")
         parser.add_argument(f"{side}_variant", help="as results.json names it")
+    parser.add_argument("--out", type=Path, default=Path("docs/images/rollout.gif"))
     told = parser.parse_args()
     try:
-        os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
-        left, right = half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant)
+        (left, shown), (right, _) = half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant)
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
     films = video.with_one_palette([pair(*frames) for frames in zip(left, right)])
-    shown = round(1000 * DT * video.stride(STEPS))  # ms
-    films[0].save(OUT, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
-    print(OUT, f"{OUT.stat().st_size / 1e6:.1f} MB")
+    films[0].save(told.out, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
+    print(told.out, f"{told.out.stat().st_size / 1e6:.1f} MB")
 
 
-def half(run: Run, variant: str) -> list[Image.Image]:
-    """Frames with a title: the method, and what its whole episode came to."""
-    env, kept = load_job(run).task.env, video.recorded(run, variant)
+def half(run: Run, variant: str) -> tuple[list[Image.Image], int]:
+    """Frames with a title, the method and what its whole episode came to, and how long each is shown, ms."""
+    task = load_job(run, run.results.get(variant, {}).get("agents")).task
+    if getattr(task.env, "opengl", False):
+        os.environ["MUJOCO_GL"] = video.backend()  # read when mujoco is imported
+    kept = video.recorded(run, variant)
     states, costs, rewards = kept["states"][0], kept["costs"][0], kept["rewards"][0]
-    planner = variant.partition("+")[2]
-    name = NAMES[run.config["algorithm"]].removesuffix(" (no barrier)") + f", {planner}" * bool(planner)
-    title = f"{name}: return {rewards.sum():.0f}, {int(costs.sum())} of {len(costs)} steps over"
+    called = [part for part in variant.split("+")[1:] if not part.startswith("agents")]
+    name = ", ".join([NAMES[run.config["algorithm"]].removesuffix(" (no barrier)"), *called])
+    over = f"{int(costs.sum())} of {len(costs)} steps " + ("with contact" if task.alike else "over")
+    title = f"{name}: return {rewards.sum():.{1 if task.alike else 0}f}, {over}"
     made = []
-    for frame in env.frames(states[: STEPS + 1], video.moments(costs[:STEPS])):
+    for frame in task.env.frames(states[: STEPS + 1], video.moments(costs[:STEPS])):
+        frame.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
         whole = Image.new("RGB", (frame.width, frame.height + HEAD), film.PAPER)
         whole.paste(frame, (0, HEAD))
-        ImageDraw.Draw(whole).text((10, 5), title, fill=film.DARK)
+        ImageDraw.Draw(whole).text((10, 4), title, fill=film.DARK, font=ImageFont.load_default(13))
         made.append(whole)
-    return made
+    return made, round(1000 * task.env.dt * video.stride(len(costs[:STEPS])))
 
 
 def pair(left: Image.Image, right: Image.Image) -> Image.Image:

@@ -82,7 +82,7 @@ FILMS = {
     "halfcheetah_2x3-good": ("rollout.gif", "Left a planner as it is, right one that keeps the limit"),
     "crossing-hasty": (
         "crossing.gif",
-        "Sixty-four discs that learned from this data, alone and each guarded by itself",
+        "Sixty-four discs that learned from this data, left alone, right each guarded by itself",
     ),
 }
 SUITES = (

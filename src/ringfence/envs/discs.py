@@ -20,7 +20,7 @@ HUES = 8
 def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
     """Pictures of an episode, states (T+1, S), at `moments`: (step, whether somebody touched since the one before)."""
     import jax.numpy as jnp
-    from PIL import Image, ImageDraw
+    from PIL import Image, ImageDraw, ImageFont
 
     from ringfence.envs.crossing import DT, RADIUS
 
@@ -38,8 +38,8 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
         (x, y), r = at(p), radius * scale
         draw.ellipse((x - r, y - r, x + r, y + r), **how)
 
-    touches = 0
-    before = 0
+    font = ImageFont.load_default(13 * FINE)
+    touches, before = 0, 0
     for t, _ in moments:
         picture = Image.new("RGB", (SIZE * FINE, SIZE * FINE), PAPER)
         draw = ImageDraw.Draw(picture)
@@ -48,22 +48,19 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
         for i in range(env.n_agents):
             draw.line([at(place[t, i]), at(goal[t, i])], fill=EMPTY, width=FINE)
         for i in range(env.n_agents):
-            colour = RED if touching[t, i] else hues[i % HUES]
             pale = tuple((c + 2 * 255) // 3 for c in hues[i % HUES])
             tail = [at(p) for p in place[max(0, t - TAIL) : t + 1, i]]
             if len(tail) > 1:
                 draw.line(tail, fill=pale, width=max(FINE, int(0.5 * RADIUS * scale)))
             disc(draw, goal[t, i], 0.3 * RADIUS, fill=pale)
-            disc(draw, place[t, i], RADIUS, fill=colour, outline=DARK)
+        for i in range(env.n_agents):
+            disc(draw, place[t, i], RADIUS, fill=RED if touching[t, i] else hues[i % HUES], outline=DARK)
             if env.body == "unicycle":
                 draw.line([at(place[t, i]), at(place[t, i] + RADIUS * ahead[t, i])], fill=DARK, width=2 * FINE)
         touches += int(touching[before + 1 : t + 1].any(1).sum())
         before = t
-        picture = picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
-        draw = ImageDraw.Draw(picture)
-        draw.rectangle((0, 0, SIZE, 16), fill=PAPER)
-        text = f"{t * DT:4.1f} s   {env.n_agents} agents   " + (
-            f"{touches} steps of contact" if touches else "no contact"
-        )
-        draw.text((10, 3), text, fill=RED if touches else BLUE)
-        yield picture
+        draw.rectangle((0, 0, SIZE * FINE, 20 * FINE), fill=PAPER)
+        told_of = f"{touches} steps of contact" if touches else "no contact"
+        text = f"{t * DT:4.1f} s    {env.n_agents} agents    {told_of}"
+        draw.text((10 * FINE, 3 * FINE), text, fill=RED if touches else BLUE, font=font)
+        yield picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
