@@ -186,9 +186,18 @@ def test_seeds_are_pooled(runs):
     assert [r.variant for r in section.tables["validation"]] == ["split"]
 
 
+def test_the_commands_name_another_number_of_agents(runs):
+    results = runs[0].results
+    results["split"]["agents"] = 5
+    (runs[0].path / "results.json").write_text(json.dumps(results))
+    (section,) = sections(runs)
+    told = page_of.commands(section, Path("r.html"))
+    assert sum("--agents 5" in line for line in told) == 1 and not any("--agents 3" in line for line in told)
+
+
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
-    said = r"ICBF-Diffuser split\+plans4 earns the highest return.*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
+    said = r"ICBF-Diffuser split\+plans4 is the only one of 3 methods that stays.*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
     assert re.search(f'class="headline">{said}', text)
 
 

@@ -154,6 +154,8 @@ def headline(section: Section) -> list[str]:
         lead = (
             f"{best.label} keeps its cost within {limit} and earns a return of"
             if len(rows) == 1
+            else f"{best.label} is the only one of {len(rows)} methods that stays within {limit}, at a return of"
+            if len(safe) == 1
             else f"{best.label} earns the highest return of the {_of(len(safe), len(rows))} within {limit}:"
         )
         said.append(
@@ -312,7 +314,7 @@ def commands(section: Section, out: Path) -> list[str]:
     evaluations: dict[tuple, list[str]] = {}
     for row in section.rows:
         for run, result in row.members:
-            given = _how(result)
+            given = _how(result, run)
             split = " --split validation" if row.split == "validation" else ""
             step = "" if of_last_step(result, run.config["config"]) else f" --step {result['step']}"
             how = f"--episodes {result['episodes']}{split}{step} {given}".strip()
@@ -332,16 +334,21 @@ def _usual_preset(algorithm: str, task: str) -> str:
     return known.preset_for(tasks.TASKS[task].presets if task in tasks.TASKS else ()) if known else ""
 
 
-def _how(result: dict) -> str:
+def _how(result: dict, run: Run) -> str:
     """The options of `ringfence eval` that gave a result."""
-    planner, name = result.get("planner", "plain"), result.get("guard", "none")
+    planner, name, task = (
+        result.get("planner", "plain"),
+        result.get("guard", "none"),
+        tasks.TASKS.get(run.config["task"]),
+    )
     words = [f"--planner {planner}"] if planner != "plain" else []
+    team = run.config.get("team") if task is None else task.env.n_agents
+    words += [f"--agents {result['agents']}"] if result.get("agents") not in (None, team) else []
     told, usual = dict(result.get("options") or {}), dataclasses.asdict(PlanOptions()) | PLANNERS.get(planner, {})
     given = {k: v for k, v in told.items() if v != usual.get(k)}
     if result.get("guard_options"):
         words += [f"--guard {name} --danger {result['danger']}"]
         words += [f"--sight {result['sight']}"] if result["sight"] != "all" else []
-        task = tasks.TASKS.get(result["task"])
         usual = {} if task is None else task.guard
         usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"], usual)
         given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
