@@ -196,16 +196,22 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
                 append(out, row, FIELDS)
 
 
-def table(rows: list[dict]) -> str:
-    """A table for each study; p-values adjusted by Holm's method over all of them."""
+def adjusted(rows: list[dict]) -> list[dict]:
+    """The rows, those that differ from a default with `holm_return` and `holm_cost`: p by Holm's method over all."""
     tested = [(r, key) for r in rows if r["way"] != "default" for key in ("return", "cost")]
-    adjusted = stats.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))
-    p = {(id(r), key): value for (r, key), value in zip(tested, adjusted)}
+    for (r, key), p in zip(tested, stats.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))):
+        r[f"holm_{key}"] = p
+    return rows
+
+
+def table(rows: list[dict]) -> str:
+    """A table for each study, bold where Holm's adjusted p and the interval agree."""
+    rows = adjusted(rows)
 
     def more(r: dict, key: str) -> str:
         mean, low, high = (float(r[f"more_{key}{x}"]) for x in ("", "_low", "_high"))
         told = f"{mean:+.3g} [{low:.3g}, {high:.3g}]" if mean or low or high else "0"
-        return f"**{told}**" if p[id(r), key] < 0.05 and not low <= 0 <= high else told
+        return f"**{told}**" if r[f"holm_{key}"] < 0.05 and not low <= 0 <= high else told
 
     out = []
     for study in dict.fromkeys((r["task"], r["proposal"], r["guard"]) for r in rows):
@@ -213,7 +219,7 @@ def table(rows: list[dict]) -> str:
         out += [f"`{study[0]}`, `{study[1]}` under `{study[2]}`, {found[0]['episodes']} episodes:", ""]
         out += ["| | return | cost | not met | return, more | cost, more |", "|---|---|---|---|---|---|"]
         for r in found:
-            if r != found[0] and r | {"way": "default"} == found[0]:
+            if r != found[0] and all(r[k] == found[0][k] for k in FIELDS if k != "way"):
                 continue  # a way that is the default here
             part = [r["way"], f"{float(r['return']):.4g}", f"{float(r['cost']):.3g}"]
             part += [f"{100 * float(r['infeasible'] or 0):.2g} %"]

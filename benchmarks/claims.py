@@ -15,8 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from ablations import adjusted
 from attribution import ADAPT, FULL, OF_ROBOTS, QUESTIONS, SHIELD, STEADY, Question, answers
-from evidence import difference, evaluations, mean, of, tasks_of
+from evidence import LEVEL, difference, evaluations, mean, of, tasks_of
 from readme import put
 from scipy.stats import spearmanr
 
@@ -287,6 +288,21 @@ def error_costs_nothing() -> tuple[bool, str]:
     return len(rows) == 2 and all(reach), f"return {told}"
 
 
+def by_value_alone() -> tuple[bool, str]:
+    """V in the place of ℓ: as safe on Crossing, not on Simple Spread, and less return on the robot."""
+    spread, crossing, robot = (r for r in adjusted(rows_of("ablations.csv")) if r["way"] == "by V alone")
+    told = f"cost {spread['more_cost']} more, {crossing['cost']}; return {robot['more_return']}"
+    worse = float(spread["more_cost_low"]) > 0 and spread["holm_cost"] < LEVEL
+    return worse and float(crossing["cost"]) == 0 and robot["holm_return"] < LEVEL, told
+
+
+def guess_is_worth() -> tuple[bool, str]:
+    """Own sight without its guess earns less on medium-replay, under `full` and under a shield."""
+    _, *mixed = (r for r in adjusted(rows_of("ablations.csv")) if r["way"] == "foreseen by the own action alone")
+    told = ", ".join(f"{r['more_return']} (Holm p {r['holm_return']:.2g})" for r in mixed)
+    return all(float(r["more_return_high"]) < 0 and r["holm_return"] < LEVEL for r in mixed), told
+
+
 def of_irsim(words: str) -> list[dict[str, str]]:
     return rows_of("other_simulator.csv", guard="shield", **{"learned from": words})
 
@@ -375,6 +391,8 @@ CLAIMS = (
     ),
     Claim("docs/crossing.md", "a barrier needs to have seen danger", "results/other_simulator.csv", has_to_have_seen),
     Claim("docs/ablations.md", "The World's error costs nothing", "results/ablations.csv", error_costs_nothing),
+    Claim("docs/ablations.md", "V alone, without ℓ", "results/ablations.csv", by_value_alone),
+    Claim("docs/ablations.md", "a guess of what others do is worth 10 %", "results/ablations.csv", guess_is_worth),
     Claim("docs/frontiers.md", "safety costs next to nothing", "results/frontiers.csv", guards_price),
     Claim("docs/frontiers.md", "keeps 9 of 10 limits on Simple Spread", "results/frontiers.csv", limits_learned),
     Claim("docs/guard.md", "One barrier for both loses contact", "results/constraints.csv", one_barrier_loses),
