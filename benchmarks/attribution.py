@@ -139,7 +139,12 @@ OF_ROBOTS = (
         Question(f"{words}, not cloning", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
         for words, name in (("the best tenth", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
     ),
-    Question("cloning under `full`, not no prior", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}"), ROBOT_KEYS),
+    Question(
+        "cloning under `full`, not no prior (climbed anywhere)",
+        ("bc", f"default{FULL}"),
+        ("mpc", f"default{FULL}+reach2.0"),
+        ROBOT_KEYS,
+    ),
 )
 
 
@@ -187,6 +192,7 @@ ROBOTS: dict[str, Row] = {
     "cloning, `full`": ("bc", f"default{FULL}"),
     "ICBF (steady), `full`": ("icbf", f"default+steady{FULL}"),
     "no prior (`mpc`), `full`": ("mpc", f"default{FULL}"),
+    "no prior, `full`, anywhere": ("mpc", f"default{FULL}+reach2.0"),
 }
 
 

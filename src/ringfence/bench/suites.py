@@ -27,6 +27,7 @@ EVALUATIONS: dict[str, dict] = {
         for danger, rows in (("learned", 1), ("learned", 3), ("learned", 7), ("learned", 15), ("formula", 15))
     },
     "shield-learned+rows1": {"guard": "shield", "danger": "learned", "rows": 1},
+    "full-learned+reach2.0": {"guard": "full", "danger": "learned", "reach": 2.0},
     "full-learned+margin1.0": {"guard": "full", "danger": "learned", "margin": 1.0},
     "full-learned+reach2.0+margin1.0": {"guard": "full", "danger": "learned", "reach": 2.0, "margin": 1.0},
     **{
@@ -152,7 +153,7 @@ SUITES = {
             ),
             Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
             *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
-            Entry("mpc", evaluations=("full-learned",)),
+            Entry("mpc", evaluations=("full-learned", "full-learned+reach2.0")),  # anywhere, too: near rest is no place
         ),
         episodes=20,
     ),

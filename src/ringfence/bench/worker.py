@@ -5,6 +5,7 @@ It leaves when its pipe closes or its parent is gone, so that a killed runner le
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
@@ -35,6 +36,14 @@ def leave_with(parent: int) -> None:
     threading.Thread(target=watch, daemon=True).start()
 
 
+def forget() -> None:
+    """Let go of compiled programs: the next job's are others, and kept they grow a worker by 100 MiB a job."""
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
+
+
 def main() -> None:
     leave_with(os.getppid())
     wire, sys.stdout = sys.stdout, sys.stderr  # prints of libraries must not mix with the messages
@@ -61,3 +70,4 @@ def main() -> None:
             return
         except Exception as error:
             say(event="broken", error=f"{type(error).__name__}: {error}")
+        forget()
