@@ -139,11 +139,14 @@ OF_ROBOTS = (
         Question(f"{words}, not cloning", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
         for words, name in (("the best tenth", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
     ),
-    Question(
-        "cloning under `full`, not no prior (climbed anywhere)",
-        ("bc", f"default{FULL}"),
-        ("mpc", f"default{FULL}+reach2.0"),
-        ROBOT_KEYS,
+    *(
+        Question(
+            f"cloning under `full`, not no prior ({where})",
+            ("bc", f"default{FULL}"),
+            ("mpc", f"default{FULL}{reach}"),
+            ROBOT_KEYS,
+        )
+        for where, reach in (("near rest", ""), ("climbed anywhere", "+reach2.0"))
     ),
 )
 
@@ -156,6 +159,14 @@ def main() -> None:
     put("docs/attribution.md", "hours", hours(COLLECTIONS["attribution"]))
 
 
+def cell(suite: str, task: str, row: Row, keys: tuple[str, str], digits: tuple[int, int]) -> tuple[str, int]:
+    """Two means of a row on a task, as words, and of how many seeds."""
+    here = variant(task, row)
+    told = [(mean(suite, task, here, key), n) for key, n in zip(keys, digits)]
+    words = "–" if told[0][0] is None else " / ".join(f"{value:z.{n}f}" for value, n in told)
+    return words, len(of(suite, task, here))
+
+
 def crossed(suite: str) -> str:
     """A line per proposal and guard, a column per task: normalised return / cost of resets that start safely."""
     names, lines = tasks_of(suite), []
@@ -163,10 +174,8 @@ def crossed(suite: str) -> str:
         for guard, ending in GUARDS.items():
             row, cells = (algorithm, plain + ending), []
             for task in names:
-                here = variant(task, row)
-                earned, cost = mean(suite, task, here, "return_norm"), mean(suite, task, here, "avoidable_cost")
-                told = "–" if earned is None else f"{earned:z.2f} / {cost:.3f}"
-                cells.append((told, len(of(suite, task, here)) if plain != "reference" else 0))
+                told, seeds = cell(suite, task, row, ("return_norm", "avoidable_cost"), (2, 3))
+                cells.append((told, seeds if plain != "reference" else 0))
             if any(told != "–" for told, _ in cells):
                 lines.append(([words, sees, guard if plain != "reference" else ""], cells))
     usual = [Counter(cells[i][1] for _, cells in lines if cells[i][1]).most_common(1)[0][0] for i in range(len(names))]
@@ -204,10 +213,7 @@ def robots(suite: str) -> str:
     for words, row in ROBOTS.items():
         cells = []
         for task in names:
-            here = variant(task, row)
-            earned, cost = mean(suite, task, here, "return_mean"), mean(suite, task, here, "cost_mean")
-            seeds = len(of(suite, task, here))
-            told = "–" if earned is None else f"{earned:.0f} / {cost:.1f}"
+            told, seeds = cell(suite, task, row, ("return_mean", "cost_mean"), (0, 1))
             cells.append(told + (f" [{seeds}]" if seeds not in (0, 5) else ""))
         out.append(f"| {words} | " + " | ".join(cells) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, else of five."])

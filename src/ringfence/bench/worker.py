@@ -37,7 +37,7 @@ def leave_with(parent: int) -> None:
 
 
 def forget() -> None:
-    """Let go of compiled programs: the next job's are others, and kept they grow a worker by 100 MiB a job."""
+    """Let go of compiled programs: the next job's are others, and kept they grow a worker by 80 MiB a small job."""
     import jax
 
     jax.clear_caches()

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ringfence.envs.crossing import Crossing
 
 SIZE, FINE = 480, 2  # pixels of a side, drawn so many times larger
+LABEL = 20  # pixels of the words' height
 TAIL = 12  # steps
 HUES = 8
 
@@ -28,6 +29,7 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
     place, goal, touching = (np.asarray(x) for x in (told.position, told.goal, env.clearance(told) < 0))
     ahead = np.stack([np.cos(told.heading), np.sin(told.heading)], -1)
     reach = max(env.side / 2 if env.walls else 0.0, float(np.abs(place).max()) + 2 * RADIUS)
+    reach /= 1 - 2 * LABEL / SIZE  # nobody passes beneath the words
     scale = SIZE * FINE / (2 * reach)
     hues = [tuple(int(255 * c) for c in colorsys.hsv_to_rgb(0.5 + 0.35 * k / HUES, 0.55, 0.85)) for k in range(HUES)]
 
@@ -59,7 +61,7 @@ def frames(env: Crossing, states: np.ndarray, moments: list[tuple[int, bool]]):
                 draw.line([at(place[t, i]), at(place[t, i] + RADIUS * ahead[t, i])], fill=DARK, width=2 * FINE)
         touches += int(touching[before + 1 : t + 1].any(1).sum())
         before = t
-        draw.rectangle((0, 0, SIZE * FINE, 20 * FINE), fill=PAPER)
+        draw.rectangle((0, 0, SIZE * FINE, LABEL * FINE), fill=PAPER)
         told_of = f"{touches} steps of contact" if touches else "no contact"
         text = f"{t * DT:4.1f} s    {env.n_agents} agents    {told_of}"
         draw.text((10 * FINE, 3 * FINE), text, fill=RED if touches else BLUE, font=font)

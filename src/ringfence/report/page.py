@@ -336,11 +336,8 @@ def _usual_preset(algorithm: str, task: str) -> str:
 
 def _how(result: dict, run: Run) -> str:
     """The options of `ringfence eval` that gave a result."""
-    planner, name, task = (
-        result.get("planner", "plain"),
-        result.get("guard", "none"),
-        tasks.TASKS.get(run.config["task"]),
-    )
+    planner, name = result.get("planner", "plain"), result.get("guard", "none")
+    task = tasks.TASKS.get(run.config["task"])
     words = [f"--planner {planner}"] if planner != "plain" else []
     team = run.config.get("team") if task is None else task.env.n_agents
     words += [f"--agents {result['agents']}"] if result.get("agents") not in (None, team) else []
