@@ -31,6 +31,8 @@ docs: $(VENV)/.docs
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check src tests benchmarks docs/tools
+	$(BIN)/basedpyright --level error
+	$(BIN)/lint-imports
 
 clean:
 	rm -rf $(VENV) demo site

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from ringfence.runs import processor
+from ringfence.utils.environment import processor
 
 
 def machine() -> str:

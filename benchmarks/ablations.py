@@ -23,11 +23,15 @@ import numpy as np
 from _rows import append, read
 from readme import put
 
-from ringfence import features, stats, tasks, training, worlds
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 from ringfence.envs import SimpleSpread
-from ringfence.evaluate import evaluate_policy, load
-from ringfence.features import FeatureMap
+from ringfence.evaluation import statistics
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import load
+from ringfence.problem import features
+from ringfence.problem.features import FeatureMap
+from ringfence.training import loop, worlds
 from ringfence.types import Array
 from ringfence.world import World
 from ringfence.world.barrier import Barrier
@@ -165,12 +169,12 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
     there = {r["way"] for r in read(out) if (r["task"], r["proposal"], r["guard"]) == study}
     if {"default", *ways} <= there:
         return
-    task, sight = tasks.get(name), "own" if guard.endswith(OWN) else None
+    task, sight = registry.get(name), "own" if guard.endswith(OWN) else None
     episodes = 20 if task.protocol else 200
     store, _ = make(task)
     with tempfile.TemporaryDirectory() as folder:
         kind, _, preset = algorithm.partition(":")
-        (run,) = training.train(kind, store, preset=preset or None, seeds=(0,), out=folder, quiet=True)
+        (run,) = loop.train(kind, store, preset=preset or None, seeds=(0,), out=folder, quiet=True)
 
         def played(way: Way) -> dict:
             with way.fitted():
@@ -187,7 +191,7 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
             row = dict(zip(FIELDS, (*study, way, episodes)))
             row |= {"return": found["return_mean"], "cost": found["cost_mean"], "infeasible": found["infeasible"]}
             for key in ("return", "cost"):
-                told = stats.paired_test(*(r["per_episode"][key] for r in (found, usual)))
+                told = statistics.paired_test(*(r["per_episode"][key] for r in (found, usual)))
                 row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), told["interval"]))
                 row |= {f"more_{key}": told["difference"], f"p_{key}": told["p"]}
             row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
@@ -199,7 +203,7 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
 def adjusted(rows: list[dict]) -> list[dict]:
     """The rows, those that differ from a default with `holm_return` and `holm_cost`: p by Holm's method over all."""
     tested = [(r, key) for r in rows if r["way"] != "default" for key in ("return", "cost")]
-    for (r, key), p in zip(tested, stats.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))):
+    for (r, key), p in zip(tested, statistics.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))):
         r[f"holm_{key}"] = p
     return rows
 

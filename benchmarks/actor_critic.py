@@ -20,20 +20,22 @@ import jax
 import jax.numpy as jnp
 from _common import record
 
-from ringfence import tasks, training
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.training import loop
+from ringfence.training.job import make_job
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "actor_critic.json"
 
 
 def ours(algorithm: str, store, updates: int) -> tuple[float, float]:
     """(updates per second, seconds to compile)."""
-    task = tasks.from_store(store)
-    job = training.make_job(algorithm, task, None, {}, store)
+    task = registry.from_store(store)
+    job = make_job(algorithm, task, None, {}, store)
     c = job.config
-    data = training.windows_of(job, store)
+    data = loop.windows_of(job, store)
     state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard)
-    advance, _ = training.make_program(job)
+    advance, _ = loop.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     state = jax.tree.map(lambda x: x[None], state)
     begun = time.perf_counter()
@@ -50,7 +52,7 @@ def ours(algorithm: str, store, updates: int) -> tuple[float, float]:
     return sorted(rates)[1], compiling
 
 
-def loop(algorithm: str, store, updates: int) -> float:
+def torch_loop(algorithm: str, store, updates: int) -> float:
     """Updates per second of the PyTorch loop."""
     import torch
     from torch import nn
@@ -144,13 +146,13 @@ def pinned(cores: set[int], job: tuple, start, out) -> None:
     """Measure in a process that owns `cores`, once everybody is ready."""
     os.sched_setaffinity(0, cores)
     kind, name, updates = job
-    store, _ = make(tasks.get("simple_spread-expert"))
+    store, _ = make(registry.get("simple_spread-expert"))
     if kind == "loop":
         import torch
 
         torch.set_num_threads(len(cores))
     start.wait()
-    out.put(loop(name, store, updates) if kind == "loop" else ours(name, store, updates))
+    out.put(torch_loop(name, store, updates) if kind == "loop" else ours(name, store, updates))
 
 
 def together(kind: str, name: str, updates: int, cores: list[set[int]]) -> list:

@@ -14,9 +14,9 @@ import numpy as np
 from evidence import RESULTS, Difference, Row, difference, family, mean, of, tasks_of, variant
 from readme import put
 
-from ringfence import tasks
 from ringfence.bench import make_grid, unpack
 from ringfence.bench.suites import COLLECTIONS
+from ringfence.datasets import registry
 
 # Proposals: their words, what they see and are told, and their row without a guard.
 PROPOSALS: dict[str, tuple[str, Row]] = {
@@ -275,11 +275,11 @@ def hours(suites: tuple[str, ...]) -> str:
             told, name = json.loads(file.read_text()), file.parent.parent.name
             if told["state"] == "done":
                 played = told.get("eval_seconds", 0.0)
-                took[name, bool(tasks.twin(file.parts[-4]))].append(told.get("train_seconds", 0.0) + played)
+                took[name, bool(registry.twin(file.parts[-4]))].append(told.get("train_seconds", 0.0) + played)
                 took[name, "played"].append(played)
         made = [seconds for (_, how), times in took.items() if how != "played" for seconds in times]
         cells = make_grid(suite, RESULTS / suite, seeds=5).cells
-        wanted = [(c.folder(RESULTS / suite).parent.name, bool(tasks.twin(c.task))) for c in cells]
+        wanted = [(c.folder(RESULTS / suite).parent.name, bool(registry.twin(c.task))) for c in cells]
         whole = sum(np.mean(took[cell] or took[cell[0], "played"] or made) for cell in wanted)
         out.append(f"| `{suite}` | {len(made)} | {sum(made) / 7200:.1f} | {len(wanted)} | {whole / 7200:.1f} |")
         total += sum(made) / 7200, whole / 7200

@@ -16,9 +16,11 @@ import time
 from pathlib import Path
 
 import ringfence
-from ringfence import tasks, training, worlds
-from ringfence.data.make import make
-from ringfence.evaluate import evaluate_policy, load
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import load
+from ringfence.training import loop, worlds
 
 HERE = Path(__file__).resolve().parent
 OUT = HERE.parent / "results" / "tuning" / "barrier.csv"
@@ -52,9 +54,9 @@ class Simulated:
     guards = GUARDS
 
     def __init__(self, name: str, seed: int, folder: str, episodes: int):
-        self.task, self.seed = tasks.get(name), seed
+        self.task, self.seed = registry.get(name), seed
         self.store, _ = make(self.task)
-        (self.run,) = training.train("bc", self.store, seeds=(seed,), out=folder, quiet=True)
+        (self.run,) = loop.train("bc", self.store, seeds=(seed,), out=folder, quiet=True)
         body = self.task.protocol
         self.guard = {"guard": "adapt" if body else "shield"}
         self.episodes = max(1, episodes // 20) if body else episodes
@@ -74,7 +76,7 @@ class Yard:
         import yard
 
         self.env, self.episodes, self.store = yard.Yard, episodes, yard.record()
-        (self.run,) = training.train("bc", self.store, seeds=(seed,), out=folder, quiet=True)
+        (self.run,) = loop.train("bc", self.store, seeds=(seed,), out=folder, quiet=True)
         self.guard = {"guard": "shield", "rows": 7}
 
     def play(self, world, **options) -> dict:

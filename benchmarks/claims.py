@@ -21,8 +21,8 @@ from evidence import LEVEL, difference, evaluations, mean, of, tasks_of
 from readme import put
 from scipy.stats import spearmanr
 
+from ringfence.evaluation.statistics import upper_bound
 from ringfence.report import board, standings
-from ringfence.stats import upper_bound
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"

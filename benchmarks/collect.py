@@ -40,7 +40,7 @@ def main() -> None:
     start = time.perf_counter()
     import jax
 
-    from ringfence.data.behaviour import collect, shipped_policy, statistics
+    from ringfence.datasets.behaviour import collect, shipped_policy, statistics
     from ringfence.envs.simple_spread import SimpleSpread
 
     imported = time.perf_counter()

@@ -16,7 +16,7 @@ from _rows import write
 from readme import put
 
 import ringfence
-from ringfence.data.store import EpisodeStore
+from ringfence.logs.store import EpisodeStore
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

@@ -15,10 +15,11 @@ import jax
 import numpy as np
 from _common import Rows, record
 
-from ringfence import tasks, training, worlds
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 from ringfence.envs import Crossing
-from ringfence.evaluate import load
+from ringfence.loading.resolve import load
+from ringfence.training import loop, worlds
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "crossing.json"
 TEAMS = (8, 64, 256)
@@ -74,12 +75,12 @@ def acting(run, world, agents: int, options: dict, steps: int = 200) -> np.ndarr
 def main() -> None:
     row = Rows()
     row("Crossing, 8 agents: simulated", simulated(), "agent-steps/s")
-    store, _ = make(tasks.get("crossing-hasty"))
+    store, _ = make(registry.get("crossing-hasty"))
     begun = time.perf_counter()
     world = worlds.fit(store, cached=False)
     row("Crossing: fitting a World", time.perf_counter() - begun, "s")
     with tempfile.TemporaryDirectory() as folder:
-        (run,) = training.train("bc", store, out=folder, quiet=True)
+        (run,) = loop.train("bc", store, out=folder, quiet=True)
         for guard, options in GUARDS.items():
             for agents in TEAMS[: 2 if guard == "full" else 3]:
                 took = acting(run, world, agents, options)

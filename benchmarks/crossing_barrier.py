@@ -14,9 +14,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from ringfence import tasks, worlds
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 from ringfence.envs.crossing import PUSH, RADIUS, SIGHT
+from ringfence.training import worlds
 
 OUT = Path(__file__).resolve().parent.parent / "docs" / "images" / "crossing-barrier.png"
 SPEEDS = (0.0, 0.5, 1.0)
@@ -24,7 +25,7 @@ REACH, FINE = 1.2, 121
 
 
 def main() -> None:
-    world = worlds.fit(make(tasks.get("crossing-hasty"))[0], quiet=False)
+    world = worlds.fit(make(registry.get("crossing-hasty"))[0], quiet=False)
     names, line = list(world.map.names), np.linspace(-REACH, REACH, FINE)
     x, y = np.meshgrid(line, line)
     figure, rows = plt.subplots(2, len(SPEEDS), figsize=(9, 6.2), sharex=True, sharey=True, layout="constrained")

@@ -10,16 +10,16 @@ from pathlib import Path
 
 from _rows import read, write
 
-from ringfence import tasks
-from ringfence.data.audit import disagreement
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.audit import disagreement
+from ringfence.datasets.make import make
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "data.csv"
 
 
 def row(name: str) -> dict:
     """Returns, costs and limits of a task's whole data set."""
-    task = tasks.get(name)
+    task = registry.get(name)
     store, _ = make(task)
     returns, costs, lengths = store.returns, store.episode_costs, store.lengths
     return {
@@ -43,12 +43,12 @@ def row(name: str) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("tasks", nargs="*", help="all by default")
-    wanted = parser.parse_args().tasks or list(tasks.TASKS)
+    wanted = parser.parse_args().tasks or list(registry.TASKS)
     found = {r["task"]: r for r in read(OUT)}
     for name in wanted:
         found[name] = row(name)
         print(*(f"{k}={v}" for k, v in found[name].items()), flush=True)
-        write(OUT, [found[name] for name in tasks.TASKS if name in found])
+        write(OUT, [found[name] for name in registry.TASKS if name in found])
 
 
 if __name__ == "__main__":

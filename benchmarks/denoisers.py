@@ -17,9 +17,12 @@ import jax.numpy as jnp
 import numpy as np
 from _common import record
 
-from ringfence import tasks, training, worlds
-from ringfence.data.make import make
-from ringfence.evaluate import evaluate_policy, make_policy
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import make_policy
+from ringfence.training import loop, worlds
+from ringfence.training.job import make_job
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "denoisers.json"
 ENTRIES = (
@@ -35,7 +38,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=45.0)
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
-    task = tasks.get("simple_spread-medium")
+    task = registry.get("simple_spread-medium")
     store, _ = make(task)
     rows = []
     for name, changes in ENTRIES:
@@ -58,13 +61,13 @@ def main() -> None:
 
 def trial(store, task, changes: dict, updates: int):
     """((job, state), ms per update) after `updates`, the first ten not timed."""
-    job = training.make_job("madiff", task, None, changes, store)
+    job = make_job("madiff", task, None, changes, store)
     c = job.config
     world = worlds.fit(store, **job.world)
-    data = training.windows_of(job, store, world)
+    data = loop.windows_of(job, store, world)
     state = job.algorithm.init(jax.random.key(0), job.spec, c, data, job.feature_map, job.hazard, world)
     scores = data.arrays["scores"][None]
-    advance, _ = training.make_program(job)
+    advance, _ = loop.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     state = jax.tree.map(lambda x: x[None], state)
     state, metrics = advance(state, roots, data.arrays, scores, 10)

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ringfence import algos, stats, tasks
+from ringfence import algos
 from ringfence.bench import rows
+from ringfence.datasets import registry
+from ringfence.evaluation import statistics
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 Row = tuple[str, str]  # algorithm and variant
@@ -41,7 +43,7 @@ def variant(task: str, row: Row) -> Row:
     name, _, rest = row[1].partition("+")
     if name != "default" or row[0] not in algos.ALGORITHMS:
         return row
-    preset = algos.get(row[0]).preset_for(tasks.get(task).presets)
+    preset = algos.get(row[0]).preset_for(registry.get(task).presets)
     return row[0], f"{preset}+{rest}" if rest else preset
 
 
@@ -81,12 +83,12 @@ def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Differen
     if key == "avoidable":
         fine = ~np.array(ours[seeds[0]]["per_episode"]["unsafe_start"], bool)
         d = d[:, fine]
-    told = stats.paired_test(d.mean(0), np.zeros(d.shape[1]))
-    low, high = stats.mean_of_runs(d) if len(seeds) > 1 else told["interval"]
+    told = statistics.paired_test(d.mean(0), np.zeros(d.shape[1]))
+    low, high = statistics.mean_of_runs(d) if len(seeds) > 1 else told["interval"]
     return Difference(task, seeds, float(d.mean()), low, high, told["p"])
 
 
 def family(found: list[Difference]) -> list[Difference]:
     """The same with p-values adjusted by Holm's method."""
-    adjusted = stats.holm(np.array([d.p for d in found])) if found else []
+    adjusted = statistics.holm(np.array([d.p for d in found])) if found else []
     return [replace(d, p=float(p)) for d, p in zip(found, adjusted)]

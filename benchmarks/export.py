@@ -21,9 +21,13 @@ import numpy as np
 import onnxruntime
 from readme import put
 
-from ringfence import evaluate, export, tasks
-from ringfence.data.make import make
-from ringfence.files import whole
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.deploy import export
+from ringfence.evaluation import rollout
+from ringfence.loading.resolve import load
+from ringfence.proposals.base import act_with
+from ringfence.utils.files import whole
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "export.csv"
 TASK, OTHER, STATES, CLOSE = "simple_spread-expert", "simple_spread-medium-replay", 500, 1e-5
@@ -44,9 +48,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     cells = parser.parse_args().folder / "cells" / TASK
-    env = tasks.get(TASK).env
-    state = env.reset(jax.random.fold_in(jax.random.key(evaluate.RESETS["test"]), 0), STATES)
-    store = make(tasks.get(OTHER))[0]
+    env = registry.get(TASK).env
+    state = env.reset(jax.random.fold_in(jax.random.key(rollout.RESETS["test"]), 0), STATES)
+    store = make(registry.get(OTHER))[0]
     some = np.random.default_rng(0).choice(len(store.observations), STATES, replace=False)
     seen = np.concatenate([env.observe(state), store.observations[some]])
     whole_states = np.concatenate([env.global_state(state), store.state[some]])
@@ -64,7 +68,7 @@ def main() -> None:
 
 def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarray) -> dict:
     """One policy in both formats, beside the controller."""
-    job, policy = evaluate.load(run, **options)
+    job, policy = load(run, **options)
     made = export.step_of(job, policy)
     play, row = {}, {}
     with tempfile.TemporaryDirectory() as folder:
@@ -73,7 +77,7 @@ def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarra
             file = export.export(run, Path(folder) / form, form, **options)
             row |= {f"{form}_s": time.perf_counter() - begun, f"{form}_kib": file.stat().st_size / 1024}
             play[form] = _player(file, form)
-    act, memory = jax.jit(evaluate.act_with), policy.start(1)
+    act, memory = jax.jit(act_with), policy.start(1)
     gaps, took = {f: [] for f in play}, {f: [] for f in ["controller", *play]}
     for k in range(len(seen)):
         key = jax.random.key(k)

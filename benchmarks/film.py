@@ -19,10 +19,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from ringfence.envs import film
 from ringfence.errors import UserError
-from ringfence.evaluate import load_job
+from ringfence.loading.resolve import load_job
 from ringfence.report import video
 from ringfence.report.table import NAMES
-from ringfence.runs import Run
+from ringfence.training.runs import Run
 
 STEPS = 160  # from the start
 HEAD, WIDEST = 20, 400  # pixels of the title's height, of a half

@@ -21,9 +21,12 @@ import matplotlib.pyplot as plt
 from _rows import append, read
 from readme import put
 
-from ringfence import algos, tasks, training, worlds
-from ringfence.data.make import make
-from ringfence.evaluate import evaluate_policy, load
+from ringfence import algos
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import load
+from ringfence.training import loop, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT, PICTURE = ROOT / "results" / "frontiers.csv", ROOT / "docs" / "images" / "frontiers.png"
@@ -61,18 +64,18 @@ def main() -> None:
 
 def trained(name: str, algorithm: str, out: Path) -> None:
     """A run for every limit."""
-    task, missing = tasks.get(name), _missing(name, TRAINED[algorithm], LIMITS[name], out)
+    task, missing = registry.get(name), _missing(name, TRAINED[algorithm], LIMITS[name], out)
     store = make(task)[0] if missing else None
     for limit in missing:
         with tempfile.TemporaryDirectory() as folder:
             changes = {algos.get(algorithm).limit: float(limit)}
-            (run,) = training.train(algorithm, store, seeds=(0,), out=folder, quiet=True, changes=changes)
+            (run,) = loop.train(algorithm, store, seeds=(0,), out=folder, quiet=True, changes=changes)
             _play(name, TRAINED[algorithm], "limit", limit, run, out)
 
 
 def guarded(name: str, algorithm: str, out: Path) -> None:
     """One run, whose guard is told the limit or the margin, and the run alone."""
-    task = tasks.get(name)
+    task = registry.get(name)
     values = ("alone", *(LIMITS[name] if task.protocol else MARGINS))
     missing = _missing(name, GUARDED[algorithm], values, out)
     if not missing:
@@ -80,7 +83,7 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
     store, _ = make(task)
     how = {"planner": "steady"} if task.protocol and algorithm == "icbf" else {}
     with tempfile.TemporaryDirectory() as folder:
-        (run,) = training.train(algorithm, store, seeds=(0,), out=folder, quiet=True)
+        (run,) = loop.train(algorithm, store, seeds=(0,), out=folder, quiet=True)
         for value in missing:
             if value == "alone":
                 _play(name, GUARDED[algorithm], "none", value, run, out, **how)
@@ -96,7 +99,7 @@ def _missing(name: str, who: str, values: tuple, out: Path) -> list:
 
 
 def _play(name: str, who: str, knob: str, value, run, out: Path, **how) -> None:
-    task = tasks.get(name)
+    task = registry.get(name)
     episodes = 20 if task.protocol else 200
     found = evaluate_policy(load(run, **how)[1], task, episodes, "test", 0)[0]
     row = dict(zip(FIELDS, (name, who, knob, value, episodes)))
@@ -130,7 +133,7 @@ def draw(rows: list[dict]) -> None:
             alone = [r for r in rows if (r["task"], r["who"], r["knob"]) == (name, who, "none")]
             for r in alone:
                 axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
-        if tasks.get(name).protocol:
+        if registry.get(name).protocol:
             axis.axvspan(-10, 25, color="0.93", zorder=0)
         axis.set_xscale("symlog", linthresh=limits[0])
         axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(-0.1 * limits[0], None))

@@ -39,7 +39,7 @@ def grid_of(out: Path, tasks, algorithms, seeds, episodes, steps=None):
 def command(out: Path, tasks, algorithms, seeds, episodes, steps=None) -> list[str]:
     told = ["--tasks", *tasks, "--algorithms", *algorithms, "--seeds", str(seeds), "--episodes", str(episodes)]
     told += [] if steps is None else ["--steps", str(steps)]
-    start = [sys.executable, "-c", "from ringfence.cli import main; main()", "bench", "simple_spread"]
+    start = [sys.executable, "-c", "from ringfence.cli.app import main; main()", "bench", "simple_spread"]
     return [*start, *told, "--workers", "1", "--out", str(out)]
 
 

@@ -13,9 +13,11 @@ from pathlib import Path
 
 from _common import Rows, record
 
-from ringfence import tasks, training, worlds
-from ringfence.data.make import make
-from ringfence.evaluate import load, plan_latency
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.latency import plan_latency
+from ringfence.loading.resolve import load
+from ringfence.training import loop, worlds
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "guard.json"
 GUARDS = ("none", "shield", "full")
@@ -30,15 +32,15 @@ def main() -> None:
     a = parser.parse_args()
     row = Rows()
     for name in a.tasks:
-        store, _ = make(tasks.get(name))
+        store, _ = make(registry.get(name))
         begun = time.perf_counter()
         world = worlds.fit(store, cached=False)
         row(f"{name}: fitting a World", time.perf_counter() - begun, "s")
         with tempfile.TemporaryDirectory() as folder:
-            (run,) = training.train("bc", store, out=folder, changes={"steps": 200}, quiet=True)
+            (run,) = loop.train("bc", store, out=folder, changes={"steps": 200}, quiet=True)
             for guard in GUARDS:
                 how = {} if guard == "none" else {"guard": guard, "world": world}
-                took = plan_latency(load(run, **how)[1], tasks.get(name))
+                took = plan_latency(load(run, **how)[1], registry.get(name))
                 row(f"{name}: cloning, guard {guard}, one joint action, p50", took["plan_ms_p50"], "ms")
                 row(f"{name}: cloning, guard {guard}, one joint action, p99", took["plan_ms_p99"], "ms")
     row("peak memory of this benchmark", resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, "GiB")

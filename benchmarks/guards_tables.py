@@ -12,7 +12,7 @@ import numpy as np
 from evidence import Row, of, tasks_of, variant
 from readme import put
 
-from ringfence.stats import upper_bound
+from ringfence.evaluation.statistics import upper_bound
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 # Columns: their heads, and their rows.

@@ -25,14 +25,17 @@ from readme import put
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from ringfence import evaluate, recordings, training, worlds  # noqa: E402
 from ringfence.bench import pack, rows  # noqa: E402
 from ringfence.bench.cells import statuses  # noqa: E402
-from ringfence.data.store import EpisodeStore  # noqa: E402
 from ringfence.errors import UserError  # noqa: E402
+from ringfence.evaluation import recordings  # noqa: E402
+from ringfence.loading import resolve  # noqa: E402
+from ringfence.loading.resolve import load  # noqa: E402
+from ringfence.logs.store import EpisodeStore  # noqa: E402
 from ringfence.report import board  # noqa: E402
 from ringfence.report.table import sections  # noqa: E402
-from ringfence.runs import Run  # noqa: E402
+from ringfence.training import loop, worlds  # noqa: E402
+from ringfence.training.runs import Run  # noqa: E402
 from tests import corpus  # noqa: E402
 from tests.corpus import TASK  # noqa: E402
 from tests.quick import QUICK_WORLD  # noqa: E402
@@ -114,7 +117,7 @@ def json_files(place: Path, times: int) -> Iterator[Case]:
     files = [run.path / f"{n}.json" for n in ("config", "results", "status", "env")]
     files += [folder / "bench.json", folder / "reference" / TASK / "reference.json"]
     readers = [lambda: rows(folder), lambda: board.read(folder), lambda: statuses(folder), lambda: sections([run])]
-    readers.append(lambda: evaluate.load_job(run))
+    readers.append(lambda: resolve.load_job(run))
     for file in files:
         raw = file.read_bytes()
         for what, content in corpus.broken_json(raw, random.Random(times), each=times):
@@ -136,7 +139,7 @@ def stores(place: Path, times: int) -> Iterator[Case]:
 
 def checkpoints(place: Path, times: int) -> Iterator[Case]:
     told = {"view": "decentralized", "steps": 4, "width": 16}
-    run = training.train("bc", corpus.small_store(), out=place / "runs", changes=told, quiet=True)[0]
+    run = loop.train("bc", corpus.small_store(), out=place / "runs", changes=told, quiet=True)[0]
     for _, old in run.checkpoints()[:-1]:
         old.unlink()
     file = run.checkpoints()[-1][1]
@@ -145,7 +148,7 @@ def checkpoints(place: Path, times: int) -> Iterator[Case]:
     for what, content in corpus.broken_bytes(raw, random.Random(times), 50 * times):
         file.write_bytes(content)
         same = len(content) == len(raw) and content[head:] == raw[head:]
-        yield what, lambda: evaluate.load(run), lambda _, same=same: same
+        yield what, lambda: load(run), lambda _, same=same: same
 
 
 def world_files(place: Path, times: int) -> Iterator[Case]:

@@ -15,11 +15,12 @@ import numpy as np
 from readme import put
 from scipy.stats import spearmanr
 
-from ringfence import tasks, worlds
-from ringfence.data.make import make
-from ringfence.files import whole
-from ringfence.judging import judge
-from ringfence.runs import Run
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.ope import estimate
+from ringfence.training import worlds
+from ringfence.training.runs import Run
+from ringfence.utils.files import whole
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "judging.csv"
 EPISODES, LOGS_SEED = 2000, 7  # of the logs that judge
@@ -53,7 +54,7 @@ def main() -> None:
         told = run.config
         if (args.tasks and told["task"] not in args.tasks) or told["seed"] >= args.seeds or not run.checkpoints():
             continue
-        task = tasks.get(told["task"])
+        task = registry.get(told["task"])
         store = make(task, EPISODES * task.env.episode_length, LOGS_SEED)[0]
         world = worlds.fit(store, seed=1)
         for variant, result in run.results.items():
@@ -65,7 +66,7 @@ def main() -> None:
             how = {"planner": result["planner"]}
             if result["guard"] != "none":
                 how |= {"guard": result["guard"], "danger": result["danger"], **result["guard_options"]}
-            found = judge(run, store, judge_world=world, compare=False, **how)
+            found = estimate(run, store, judge_world=world, compare=False, **how)
             numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
             numbers = [found["played"][k]["mean"] for k in PLAYED.values()] + numbers
             truth = [result["return_mean"], result["avoidable_cost"]]

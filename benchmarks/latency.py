@@ -10,8 +10,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from ringfence import evaluate, tasks
-from ringfence.runs import Run
+from ringfence.datasets import registry
+from ringfence.evaluation import latency
+from ringfence.loading.resolve import load
+from ringfence.training.runs import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "results" / "simple_spread"
 
@@ -29,8 +31,8 @@ def main() -> None:
         for variant, result in run.results.items():
             guard = {k: result[k] for k in ("guard", "danger", "sight")} | result["guard_options"]
             guard = guard if result.get("guard", "none") != "none" else {}
-            _, policy = evaluate.load(run, **result["options"], **guard)
-            took = evaluate.plan_latency(policy, tasks.get(a.task))
+            _, policy = load(run, **result["options"], **guard)
+            took = latency.plan_latency(policy, registry.get(a.task))
             run.add_result(variant, result | took)
             print(f"{folder.parent.name} {variant}: {took['plan_ms_p50']:.2f} ms, p99 {took['plan_ms_p99']:.2f}")
 

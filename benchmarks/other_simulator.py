@@ -26,10 +26,12 @@ import numpy as np
 import yaml
 from _rows import read, write
 
-from ringfence import EpisodeStore, Separation, tasks, training, worlds
-from ringfence.data.make import make
+from ringfence import EpisodeStore, Separation
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 from ringfence.envs.crossing import APART, DT, EFFORT, RADIUS, REACHED, Crossing, CrossingState
-from ringfence.parallel import play
+from ringfence.evaluation.play import play
+from ringfence.training import loop, worlds
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "other_simulator.csv"
 LENGTH = 100  # steps
@@ -198,7 +200,7 @@ def main() -> None:
         return logs
 
     sources = {
-        "crossing-hasty": lambda words: make(tasks.get("crossing-hasty"))[0],
+        "crossing-hasty": lambda words: make(registry.get("crossing-hasty"))[0],
         "logs of IR-SIM": lambda words: recorded(words, 0),
         "logs of IR-SIM, two of eight blind": lambda words: recorded(words, 2),
     }
@@ -206,7 +208,7 @@ def main() -> None:
         for words in a.of or sources:
             store = sources[words](words)
             world = worlds.fit(store, seed=a.seed, quiet=False)
-            (run,) = training.train("bc", store, seeds=(a.seed,), out=Path(folder), quiet=True)
+            (run,) = loop.train("bc", store, seeds=(a.seed,), out=Path(folder), quiet=True)
             played(words, run, world, 8)
             for n in (8, 16):
                 played(words, run, world, n, guard="shield", rows=3, future=True)

@@ -17,7 +17,7 @@ from _rows import write
 from readme import put
 
 import ringfence
-from ringfence import zoo
+from ringfence.deploy import zoo
 from ringfence.envs import SimpleSpread
 from ringfence.envs.mpe2 import Spread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel

@@ -17,20 +17,22 @@ import jax.numpy as jnp
 import numpy as np
 from _common import Rows, record
 
-from ringfence import tasks, training, worlds
-from ringfence.data import behaviour
-from ringfence.data.store import EpisodeStore
+from ringfence.datasets import behaviour, registry
+from ringfence.datasets.task import Task
 from ringfence.envs import SimpleSpread
-from ringfence.evaluate import make_policy, plan_latency
-from ringfence.guards import guard
-from ringfence.tasks import Task
+from ringfence.evaluation.latency import plan_latency
+from ringfence.guards import filter
+from ringfence.loading.resolve import make_policy
+from ringfence.logs.store import EpisodeStore
+from ringfence.training import loop, worlds
+from ringfence.training.job import make_job
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "planning.json"
 TEAMS = (3, 6, 12)
 
 
 def team_task(n: int) -> Task:
-    return Task(f"simple_spread-{n}-agents", SimpleSpread(n_agents=n), tasks.TASKS["simple_spread-random"].hazard)
+    return Task(f"simple_spread-{n}-agents", SimpleSpread(n_agents=n), registry.TASKS["simple_spread-random"].hazard)
 
 
 def random_store(task: Task, episodes: int) -> EpisodeStore:
@@ -50,12 +52,12 @@ def measure_team(n: int, updates: int) -> tuple[dict[str, float], tuple]:
     task = team_task(n)
     store = random_store(task, 400)
     quick = {f"{part}_updates": 10 for part in ("dynamics", "value", "barrier", "future")}
-    job = training.make_job("icbf", task, None, {}, store, quick)
+    job = make_job("icbf", task, None, {}, store, quick)
     world = worlds.fit(store, task=task, **job.world)
-    data = training.windows_of(job, store, world)
+    data = loop.windows_of(job, store, world)
     state = job.algorithm.init(jax.random.key(0), job.spec, job.config, data, job.feature_map, job.hazard, world)
     scores = data.arrays["scores"][None]
-    advance, _ = training.make_program(job)
+    advance, _ = loop.make_program(job)
     roots = jax.vmap(jax.random.key)(jnp.arange(1))
     stacked = jax.tree.map(lambda x: x[None], state)
     begun = time.perf_counter()
@@ -85,7 +87,7 @@ def main() -> None:
         row(f"compile time of the training step, {n} agents", cost["compile_s"], "s")
         planner = make_policy(job, state, {})
         for name in ("select", "full"):
-            policy = guard(planner, world, guard=name)
+            policy = filter(planner, world, guard=name)
             took = plan_latency(policy, job.task, a.calls)
             row(f"one joint action, guard {name}, {n} agents, p50", took["plan_ms_p50"], "ms")
             row(f"one joint action, guard {name}, {n} agents, p99", took["plan_ms_p99"], "ms")

@@ -14,10 +14,11 @@ import goal
 import matplotlib
 import numpy as np
 
-from ringfence import algos, tasks
+from ringfence import algos
 from ringfence.bench import paper, unpack
+from ringfence.datasets import registry
 from ringfence.report import board, export, standings
-from ringfence.runs import build_config
+from ringfence.utils.config import build_config
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
@@ -275,7 +276,7 @@ def spent(folder: Path) -> str:
         told, name = json.loads(file.read_text()), file.parent.parent.name
         if told["state"] != "done":
             continue
-        if "adopted" in told or (tasks.twin(file.parts[-4]) and not _reads_danger(file.parent)):
+        if "adopted" in told or (registry.twin(file.parts[-4]) and not _reads_danger(file.parent)):
             trained, name = told.get("train_seconds", 0.0), f"{name}, trained before"
         else:  # of a cell that was played again the last attempt trained nothing
             results = json.loads((file.parent / "results.json").read_text())

@@ -18,24 +18,26 @@ from pathlib import Path
 
 from _common import record
 
-from ringfence import tasks
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "robot_planner.json"
 MEASURED = """
 import json, resource, sys, time
 from pathlib import Path
 begun = time.perf_counter()
-from ringfence import evaluate, tasks, training
-from ringfence.data.make import make
-from ringfence.runs import Run
+from ringfence.datasets import registry as tasks
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.training import loop as training
+from ringfence.datasets.make import make
+from ringfence.training.runs import Run
 what, task, folder, steps = sys.argv[1], tasks.get(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])
 if what == "train":
     changes = {"steps": steps} if steps else {}
     training.train("icbf", make(task)[0], folder=lambda seed: folder, changes=changes, quiet=True)
 else:
     guard = {"guard": what} if what != "none" else {}
-    evaluate.evaluate(Run(folder), episodes=20, split="validation", planner="steady", **guard)
+    evaluate(Run(folder), episodes=20, split="validation", planner="steady", **guard)
 print(json.dumps([time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20]))
 """
 
@@ -48,7 +50,7 @@ def main() -> None:
     a = parser.parse_args()
     rows = []
     for task in a.tasks:
-        make(tasks.get(task))
+        make(registry.get(task))
         with tempfile.TemporaryDirectory() as folder:
             for what, name in (
                 ("train", "icbf, training one seed"),

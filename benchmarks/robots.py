@@ -28,8 +28,8 @@ OUT = Path(__file__).resolve().parent.parent / "results" / "performance" / "robo
 COLLECT = """
 import json, resource, sys, time
 begun = time.perf_counter()
-from ringfence import tasks
-from ringfence.data.make import make
+from ringfence.datasets import registry as tasks
+from ringfence.datasets.make import make
 store, _ = make(tasks.get(sys.argv[1]), int(sys.argv[2]), out=sys.argv[3], fresh=True)
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
 print(json.dumps([time.perf_counter() - begun, peak, store.steps]))

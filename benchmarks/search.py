@@ -144,19 +144,21 @@ STUDIES = {
 def one(job: tuple) -> dict:
     """Train and play one setting; a row of the file."""
     algorithm, preset, number, changes, name, episodes, planner = job
-    from ringfence import evaluate, tasks, training
-    from ringfence.data.make import make
+    from ringfence.datasets import registry
+    from ringfence.datasets.make import make
+    from ringfence.evaluation.evaluate import evaluate
+    from ringfence.training import loop
 
-    store, _ = make(tasks.get(name))
+    store, _ = make(registry.get(name))
     begun = time.perf_counter()
     played = planner if algorithm in ("icbf", "madiff") else "plain"
     guard = {"guard": "adapt"} if played == "steady" else {}  # robots' planners
     with tempfile.TemporaryDirectory() as folder:
-        (run,) = training.train(
+        (run,) = loop.train(
             algorithm, store, preset=preset or None, seeds=(SEED,), changes=changes, out=folder, quiet=True
         )
         seconds = time.perf_counter() - begun
-        r = evaluate.evaluate(run, episodes=episodes, split="validation", planner=played, **guard)
+        r = evaluate(run, episodes=episodes, split="validation", planner=played, **guard)
     return {
         "algorithm": algorithm,
         "preset": preset,

@@ -18,8 +18,8 @@ from _rows import write
 
 from ringfence import algos
 from ringfence.guards import GuardOptions
-from ringfence.policies import PlanOptions
-from ringfence.runs import Run
+from ringfence.proposals.options import PlanOptions
+from ringfence.training.runs import Run
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "mujoco.csv"
 

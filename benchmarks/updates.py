@@ -18,11 +18,13 @@ from pathlib import Path
 from _rows import append, read
 from readme import put
 
-from ringfence import tasks, training
-from ringfence.data.make import make
-from ringfence.evaluate import evaluate_policy, load
-from ringfence.runs import Run
-from ringfence.windows import returns_to_go
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import load
+from ringfence.logs.windows import returns_to_go
+from ringfence.training import loop
+from ringfence.training.runs import Run
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "tuning" / "updates.csv"
 FIELDS = ("task", "algorithm", "seed", "updates", "train_seconds", "return", "return_norm", "cost", "falls", "value")
@@ -53,7 +55,7 @@ def main() -> None:
 
 def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
     """Rows as the run passes each number of updates."""
-    task, wanted = tasks.get(name), RUNS[algorithm, name]
+    task, wanted = registry.get(name), RUNS[algorithm, name]
     store, chunk = make(task)[0], wanted[0] // 2
     heard = returns_to_go(store.rewards, store.lengths, DISCOUNT).mean()
     with tempfile.TemporaryDirectory() as folder:
@@ -71,7 +73,7 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
             print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
             append(out, row, FIELDS)
 
-        training.train(
+        loop.train(
             algorithm,
             store,
             seeds=(SEED,),

@@ -18,10 +18,10 @@ import numpy as np
 from readme import put
 
 import ringfence
-from ringfence.data.store import EpisodeStore
-from ringfence.files import whole
-from ringfence.hazards import Separation, to_dict
-from ringfence.stats import upper_bound
+from ringfence.evaluation.statistics import upper_bound
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem.constraints import Separation, to_dict
+from ringfence.utils.files import whole
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "examples"))

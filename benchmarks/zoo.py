@@ -14,9 +14,12 @@ from pathlib import Path
 
 from readme import put
 
-from ringfence import evaluate, worlds, zoo
-from ringfence.files import whole
-from ringfence.runs import Run
+from ringfence.deploy import zoo
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.loading import run_worlds
+from ringfence.training import worlds
+from ringfence.training.runs import Run
+from ringfence.utils.files import whole
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "zoo.csv"
 CELLS = {
@@ -40,8 +43,8 @@ def main() -> None:
     for name, cell in CELLS.items():
         task = name.split("/")[0]
         for run in (Run(p) for f in folders for p in (f / "cells" / task / cell).glob("seed-0-*")):
-            read = worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
-            print(*zoo.put(run, name, read, worlds.for_guard(run)))
+            read = run_worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
+            print(*zoo.put(run, name, read, run_worlds.for_guard(run)))
             for guard in ("none", GUARDS[task]):
                 found = [r for r in run.results.values() if _is(r, guard)]
                 before[name, guard] = {
@@ -54,7 +57,7 @@ def main() -> None:
             task, run = name.split("/")[0], zoo.get(name, there)
             planner = "steady" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "plain"
             for guard in ("none", GUARDS[task]):
-                told = evaluate.evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
+                told = evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
                 files = [zoo.FOLDER / f"{name}.safetensors", zoo.FOLDER / f"{name}-world.safetensors"]
                 old = before.get((name, guard), {})
                 rows.append(

@@ -32,10 +32,10 @@ import jax
 import numpy as np
 import pytest
 
-from ringfence import hazards
-from ringfence.data.behaviour import collect
-from ringfence.data.store import EpisodeStore
+from ringfence.datasets.behaviour import collect
 from ringfence.envs import SimpleSpread
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
 
 
 def pytest_unconfigure(config):
@@ -58,7 +58,7 @@ def own_store(played) -> EpisodeStore:
     """The same episodes as anybody's own logs: what agents see, by name, a hazard, and no state."""
     names = SimpleSpread().feature_map("decentralized").names
     seen = played["observations"][..., : len(names)]
-    card = {"task": "my-robots", "observation_names": list(names), "hazard": hazards.Separation(0.3)}
+    card = {"task": "my-robots", "observation_names": list(names), "hazard": constraints.Separation(0.3)}
     return EpisodeStore.from_episodes(seen, played["actions"], played["rewards"], played["costs"], card=card)
 
 
@@ -74,7 +74,7 @@ def small_store(played) -> EpisodeStore:
         card={
             "task": "simple_spread-random",
             "state_names": list(SimpleSpread().state_names),
-            "hazard": hazards.to_dict(hazards.Separation()),
+            "hazard": constraints.to_dict(constraints.Separation()),
             "provenance": "made by the tests",
         },
     )
@@ -83,7 +83,7 @@ def small_store(played) -> EpisodeStore:
 @pytest.fixture(scope="session")
 def small_world(small_store):
     """The World of the small store."""
-    from ringfence import worlds
+    from ringfence.training import worlds
     from tests.quick import QUICK_WORLD
 
     return worlds.fit(small_store, **QUICK_WORLD)

@@ -15,9 +15,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from ringfence import hazards, recordings
 from ringfence.bench.packed import ARCHIVES, unpack
-from ringfence.data.store import EpisodeStore
+from ringfence.evaluation import recordings
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
 
 TASK = "simple_spread-expert"
 RESULTS = Path(__file__).resolve().parent.parent / "results" / "guards"
@@ -98,7 +99,7 @@ def small_store(seed: int = 0) -> EpisodeStore:
         rng.uniform(-1, 1, (6, 5, 2, 2)).astype(np.float32),
         rng.normal(size=(6, 5, 2)),
         (rng.random((6, 5)) < 0.2).astype(float),
-        card={"task": "strange", "hazard": hazards.CostColumn()},
+        card={"task": "strange", "hazard": constraints.CostColumn()},
     )
 
 

@@ -8,14 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import tasks, training
 from ringfence.algos import actor_critic as ac
 from ringfence.algos import fisor, icbf, omar, td3bc
+from ringfence.datasets import registry
 from ringfence.errors import UserError
-from ringfence.normalise import Normaliser
-from ringfence.optim import Optimiser
-from ringfence.runs import build_config
+from ringfence.nets.optim import Optimiser
+from ringfence.problem.normalise import Normaliser
+from ringfence.training.job import make_job
 from ringfence.types import Batch, Spec
+from ringfence.utils.config import build_config
 from ringfence.world import Settings
 
 SPEC = Spec("t", 2, 2, ("a", "b", "c"), -1.0, 1.0, 25)
@@ -228,7 +229,7 @@ def test_a_bound_of_zero_on_gradients_is_none():
 
 
 def test_a_run_takes_the_preset_of_its_data(small_store):
-    task = tasks.from_store(small_store)
-    assert training.make_job("omar", task, None, {}).preset == task.tier
-    assert training.make_job("omar", task, "default", {}).preset == "default"
-    assert training.make_job("bc", task, None, {}).preset == "default"
+    task = registry.from_store(small_store)
+    assert make_job("omar", task, None, {}).preset == task.tier
+    assert make_job("omar", task, "default", {}).preset == "default"
+    assert make_job("bc", task, None, {}).preset == "default"

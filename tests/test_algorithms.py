@@ -10,13 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import algos, evaluate, tasks, training
+from ringfence import algos
 from ringfence.algos import icbf
-from ringfence.data.store import EpisodeStore
+from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, UserError
-from ringfence.runs import Run, build_config
+from ringfence.evaluation import protocol, rollout
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.loading import resolve
+from ringfence.loading.controller import Controller
+from ringfence.loading.resolve import asked, load, loaded
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import draw
+from ringfence.training import loop
+from ringfence.training.job import make_job
+from ringfence.training.runs import Run
 from ringfence.types import PolicyStep
-from ringfence.windows import draw
+from ringfence.utils.config import build_config
 from tests.quick import QUICK_WORLD
 
 TINY = {
@@ -48,7 +57,7 @@ def job_of(name):
 def trained(small_store, tmp_path_factory):
     """One tiny finished run of every algorithm."""
     out = tmp_path_factory.mktemp("runs")
-    return {name: training.train(name, small_store, out=out, chunk=6, **job_of(name))[0] for name in algos.ALGORITHMS}
+    return {name: loop.train(name, small_store, out=out, chunk=6, **job_of(name))[0] for name in algos.ALGORITHMS}
 
 
 @pytest.mark.parametrize("name", algos.ALGORITHMS)
@@ -59,11 +68,11 @@ def test_contract(name, trained):
     assert [r["step"] for r in rows] == [6, 12]
     assert all(np.isfinite(v) for r in rows for v in r.values())
     assert run.checkpoints()[-1][0] == 12
-    env = tasks.get("simple_spread-random").env
+    env = registry.get("simple_spread-random").env
     state = env.reset(jax.random.key(0), 5)
     actions = []
     for _ in range(2):
-        _, policy = evaluate.load(run, steps=2)
+        _, policy = load(run, steps=2)
         _, out = policy.act(policy.start(5), env.observe(state), env.global_state(state), jax.random.key(1))
         actions.append(np.asarray(out.action))
     assert actions[0].shape == (5, 3, 2) and np.abs(actions[0]).max() <= 1.0
@@ -73,8 +82,8 @@ def test_contract(name, trained):
 @pytest.mark.parametrize("name", algos.ALGORITHMS)
 def test_policies_act_within_any_bounds(name, trained):
     """What was learned between −1 and 1 is played between the bounds of the task."""
-    _, policy = evaluate.load(trained[name])
-    env, acted = tasks.get("simple_spread-random").env, []
+    _, policy = load(trained[name])
+    env, acted = registry.get("simple_spread-random").env, []
     state = env.reset(jax.random.key(0), 5)
     seen, whole = env.observe(state), env.global_state(state)
     for low, high in ((-1.0, 1.0), (2.0, 8.0)):
@@ -94,8 +103,8 @@ def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path)
 
     how = dict(out=tmp_path, **job_of("icbf"))
     with pytest.raises(KeyboardInterrupt):
-        training.train("icbf", small_store, chunk=4, checkpoint_every=4, on_chunk=stop, **how)
-    run = training.train("icbf", small_store, chunk=3, **how)[0]
+        loop.train("icbf", small_store, chunk=4, checkpoint_every=4, on_chunk=stop, **how)
+    run = loop.train("icbf", small_store, chunk=3, **how)[0]
     from safetensors.numpy import load_file
 
     a = load_file(run.checkpoints()[-1][1])
@@ -110,8 +119,8 @@ def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path)
 def test_no_weight_is_madiff(small_store, tmp_path):
     """λ = 0: the planner's networks are MADIFF's, but for how two programs round."""
     changes = {**TINY["icbf"], "condition": "return", "barrier_weight": 0.0}
-    zero = training.train("icbf", small_store, out=tmp_path, **job_of("icbf") | {"changes": changes})[0]
-    plain = training.train("madiff", small_store, out=tmp_path, **job_of("madiff"))[0]
+    zero = loop.train("icbf", small_store, out=tmp_path, **job_of("icbf") | {"changes": changes})[0]
+    plain = loop.train("madiff", small_store, out=tmp_path, **job_of("madiff"))[0]
     from safetensors.numpy import load_file
 
     a, b = (load_file(r.checkpoints()[-1][1]) for r in (zero, plain))
@@ -123,8 +132,8 @@ def test_no_weight_is_madiff(small_store, tmp_path):
 
 def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
     changes = TINY["bc"]
-    apart = training.train("bc", small_store, seeds=(0, 1), out=tmp_path / "a", changes=changes, quiet=True)
-    together = training.train(
+    apart = loop.train("bc", small_store, seeds=(0, 1), out=tmp_path / "a", changes=changes, quiet=True)
+    together = loop.train(
         "bc",
         small_store,
         seeds=(0, 1),
@@ -136,7 +145,7 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
     )
     assert all(list((run.path / "tensorboard").glob("events*")) for run in together)
     more = dict(changes=changes, quiet=True, together=True)
-    both = training.train("bc", small_store, seeds=(0, 2), out=tmp_path / "b", **more)  # a seed beside those there
+    both = loop.train("bc", small_store, seeds=(0, 2), out=tmp_path / "b", **more)  # a seed beside those there
     assert [run.metrics[-1]["step"] for run in both] == [12, 12]
     for x, y in zip(apart, together):
         assert x.metrics[-1]["loss/cloning"] == pytest.approx(y.metrics[-1]["loss/cloning"], rel=1e-4)
@@ -145,9 +154,9 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
 @pytest.mark.parametrize("gradient", ["ddim:2", "chain:2"])
 def test_gradient_depths(small_store, small_world, gradient):
     """The barrier's share of the loss reaches the denoiser through the sampler, too."""
-    task = tasks.from_store(small_store)
-    job = training.make_job("icbf", task, None, {**TINY["icbf"], "gradient": gradient}, small_store, QUICK_WORLD)
-    data = training.windows_of(job, small_store, small_world)
+    task = registry.from_store(small_store)
+    job = make_job("icbf", task, None, {**TINY["icbf"], "gradient": gradient}, small_store, QUICK_WORLD)
+    data = loop.windows_of(job, small_store, small_world)
     key = jax.random.key(0)
     state = job.algorithm.init(key, job.spec, job.config, data, job.feature_map, job.hazard, small_world)
     loss = icbf.make_loss(job.config, job.feature_map, job.hazard)
@@ -174,24 +183,24 @@ def test_gradient_depths(small_store, small_world, gradient):
 )
 def test_planner_options(trained, options):
     run = trained["icbf"]
-    result = evaluate.evaluate(run, **QUICK, record=2, **options)
+    result = evaluate(run, **QUICK, record=2, **options)
     assert result["episodes"] == 4 and np.isfinite(result["return_mean"])
     assert len(run.results) >= 1
 
 
 def test_a_controller_acts_like_the_policy(trained, small_store):
     how = dict(planner="climbing", guard="select", steps=2, plans=2, shield=1)
-    pilot = evaluate.Controller(trained["icbf"], **how)
+    pilot = Controller(trained["icbf"], **how)
     assert pilot.policy.proposal.options.ascent == 100.0 and pilot.policy.guard.options.plans == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
     assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["strange"].dtype == bool
-    again = evaluate.Controller(trained["icbf"], **how)
+    again = Controller(trained["icbf"], **how)
     np.testing.assert_array_equal(again.act(seen, state), first)
     again.reset()
     assert not np.array_equal(again.act(seen, state), first)  # a new draw of plans
     with pytest.raises(UserError, match="did you mean 'shield'"):
-        evaluate.Controller(trained["icbf"], guard="shild")
+        Controller(trained["icbf"], guard="shild")
 
 
 @pytest.mark.parametrize(
@@ -213,7 +222,7 @@ def test_a_controller_acts_like_the_policy(trained, small_store):
     ],
 )
 def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said):
-    pilot = evaluate.Controller(trained["madiff"], steps=2)
+    pilot = Controller(trained["madiff"], steps=2)
     with pytest.raises(UserError, match=said):
         pilot.act(seen, state)
 
@@ -228,7 +237,7 @@ def test_names_of_variants_follow_values(trained):
         ({"ascent": "1e1"}, "split+ascent10.0"),
         ({"guard": "adapt", "danger": "formula", "adapt": 0.2}, "split+adapt-formula+adapt0.2"),
     ):
-        assert evaluate.evaluate(run, episodes=1, **{"steps": 2, **options})["variant"].replace("+steps2", "") == (
+        assert evaluate(run, episodes=1, **{"steps": 2, **options})["variant"].replace("+steps2", "") == (
             name.replace("+steps2", "")
         )
 
@@ -245,16 +254,16 @@ def test_names_of_variants_follow_values(trained):
 )
 def test_settings_that_mean_nothing_are_refused(small_store, tmp_path, changes, said):
     with pytest.raises(UserError, match=said):
-        training.train("bc", small_store, out=tmp_path, changes=changes)
+        loop.train("bc", small_store, out=tmp_path, changes=changes)
     assert not list(tmp_path.iterdir())
 
 
 def test_no_seed_and_no_store_are_refused(small_store, tmp_path):
     for seeds in ((), (-1,)):
         with pytest.raises(UserError, match="must be one or more whole numbers from 0"):
-            training.train("bc", small_store, out=tmp_path, seeds=seeds)
+            loop.train("bc", small_store, out=tmp_path, seeds=seeds)
     with pytest.raises(UserError, match="data of type str; pass an EpisodeStore"):
-        training.train("bc", "simple_spread-random", out=tmp_path)
+        loop.train("bc", "simple_spread-random", out=tmp_path)
 
 
 def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
@@ -263,8 +272,8 @@ def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
     for observe in ("all", "single"):
         changes = {**TINY["madiff"], "view": "decentralized", "steps": 30, "observe": observe}
         asked = {"changes": changes, "world": {**QUICK_WORLD, "barrier": False}}
-        run = training.train("madiff", small_store, out=tmp_path / observe, **job_of("madiff") | asked)[0]
-        _, policy = evaluate.load(run)
+        run = loop.train("madiff", small_store, out=tmp_path / observe, **job_of("madiff") | asked)[0]
+        _, policy = load(run)
         seen, state = small_store.observations[:4], small_store.state[:4]
         other = seen.copy()
         other[:, 1] += 0.5
@@ -273,72 +282,72 @@ def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
         moved[observe] = np.abs(a - b)[:, 0].max()
     assert moved["all"] > 1e-5 and moved["single"] < 1e-7
     with pytest.raises(UserError, match="execution='centralized' needs a model"):
-        evaluate.load(run, execution="centralized")
+        load(run, execution="centralized")
 
 
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])
 def test_views(small_store, tmp_path, view, execution):
     changes = {**TINY["madiff"], "view": view, "steps": 2, "observe": "mixed"}
-    run = training.train(
+    run = loop.train(
         "madiff",
         small_store,
         out=tmp_path,
         **job_of("madiff") | {"changes": changes, "world": {**QUICK_WORLD, "barrier": False}},
     )[0]
-    result = evaluate.evaluate(run, **QUICK, execution=execution)
+    result = evaluate(run, **QUICK, execution=execution)
     assert np.isfinite(result["return_mean"])
 
 
 def test_paired_resets(trained):
     """All methods start from the same states, and the first n episodes do not depend on how many are played."""
-    task = tasks.get("simple_spread-random")
-    _, bc = evaluate.load(trained["bc"])
-    _, other = evaluate.load(trained["bc-safe"])
-    a = evaluate.rollout(bc, task.env, 60)["states"]
-    b = evaluate.rollout(other, task.env, 3)["states"]
+    task = registry.get("simple_spread-random")
+    _, bc = load(trained["bc"])
+    _, other = load(trained["bc-safe"])
+    a = rollout.rollout(bc, task.env, 60)["states"]
+    b = rollout.rollout(other, task.env, 3)["states"]
     np.testing.assert_array_equal(a[:3, 0], b[:, 0])
-    np.testing.assert_array_equal(a[:3], evaluate.rollout(bc, task.env, 3)["states"])
-    validation = evaluate.rollout(bc, task.env, 3, "validation")["states"]
+    np.testing.assert_array_equal(a[:3], rollout.rollout(bc, task.env, 3)["states"])
+    validation = rollout.rollout(bc, task.env, 3, "validation")["states"]
     assert not np.array_equal(a[:3, 0], validation[:, 0])
 
 
 def test_bad_input_is_refused(small_store, trained, tmp_path):
     run = trained["icbf"]
     with pytest.raises(UserError, match="did you mean 'icbf'"):
-        training.train("icfb", small_store, out=tmp_path)
+        loop.train("icfb", small_store, out=tmp_path)
     with pytest.raises(UserError, match="did you mean 'barrier_weight'"):
-        training.train("icbf", small_store, out=tmp_path, changes={"barier_weight": 1})
+        loop.train("icbf", small_store, out=tmp_path, changes={"barier_weight": 1})
     with pytest.raises(UserError, match="preset"):
-        training.train("icbf", small_store, out=tmp_path, preset="spilt")
+        loop.train("icbf", small_store, out=tmp_path, preset="spilt")
     with pytest.raises(UserError, match=r"retention m=1.0"):
-        training.train("icbf", small_store, out=tmp_path, changes={**TINY["icbf"], "retention": 1.0})
+        loop.train("icbf", small_store, out=tmp_path, changes={**TINY["icbf"], "retention": 1.0})
     with pytest.raises(UserError, match="another run"):
         changed = job_of("icbf") | {"changes": {**TINY["icbf"], "lr": 0.1}}
-        training.train("icbf", small_store, out=run.path.parents[2], **changed)
+        loop.train("icbf", small_store, out=run.path.parents[2], **changed)
     more = dataclasses.replace(small_store, rewards=small_store.rewards + 1)  # under the same name
     with pytest.raises(UserError, match="another run .its data's content differs"):
-        training.train("icbf", more, out=run.path.parents[2], **job_of("icbf"))
+        loop.train("icbf", more, out=run.path.parents[2], **job_of("icbf"))
     with pytest.raises(UserError, match="width=100 must be a multiple of 16"):
-        training.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100})
+        loop.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100})
     blank = {"card": {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}}}
     blank = dataclasses.replace(small_store, costs=0 * small_store.costs, **blank)
     for name in ("icbf", "fisor", "bc-safe", "ma-td3bc-lag"):
         with pytest.raises(UserError, match=f"{name} is told no danger"):
-            training.train(name, blank, out=tmp_path, changes=TINY[name])
+            loop.train(name, blank, out=tmp_path, changes=TINY[name])
     with pytest.raises(UserError, match="planner"):
-        evaluate.evaluate(run, planner="gaurded")
+        evaluate(run, planner="gaurded")
     with pytest.raises(UserError, match="danger is read by nothing without a guard"):
-        evaluate.evaluate(run, danger="formula")
+        evaluate(run, danger="formula")
     with pytest.raises(UserError, match="1 to 20 steps"):
-        evaluate.evaluate(run, steps=21)
+        evaluate(run, steps=21)
     with pytest.raises(UserError, match="trained with observe"):
-        evaluate.evaluate(run, execution="decentralized")
+        evaluate(run, execution="decentralized")
     with pytest.raises(UserError, match="carry='all'"):
-        evaluate.evaluate(run, reconcile=False)
+        evaluate(run, reconcile=False)
     with pytest.raises(UserError, match="did you mean 'paper'"):
-        training.train("icbf", small_store, out=tmp_path, changes={"routing": "papr"})
+        loop.train("icbf", small_store, out=tmp_path, changes={"routing": "papr"})
     with pytest.raises(UserError, match="rows=7 are judged, but plans hold 3 steps"):
-        evaluate.evaluate(run, guard="shield", rows=7)
+        evaluate(run, guard="shield", rows=7)
     assert not any(tmp_path.rglob("ckpt"))
 
 
@@ -355,30 +364,30 @@ def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
     stepped = {**load_file(file), "step": np.array(-7, np.int32)}
     for wrong in (whole[: len(whole) // 2], bytes(flipped), stepped):
         save_file(wrong, file) if isinstance(wrong, dict) else file.write_bytes(wrong)
-        assert evaluate.loaded(run, None, evaluate.asked())[2] == before
+        assert loaded(run, None, asked())[2] == before
         assert "the one before is used" in capsys.readouterr().err
         with pytest.raises(CheckpointError, match="truncated or damaged.*train the run again"):
-            evaluate.loaded(run, 12, evaluate.asked())
+            loaded(run, 12, asked())
     file.write_bytes(whole)
-    again = training.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))[0]
+    again = loop.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))[0]
     assert again.checkpoints()[-1] == (12, file) and file.read_bytes() == whole
     file.write_bytes(whole[:100])  # a finished run whose end was lost is finished again, to the same bits
-    training.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))
+    loop.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))
     assert file.read_bytes() == whole
     arrays = load_file(file)
     name = next(k for k in arrays if k.startswith("ema"))
     save_file({k: v for k, v in arrays.items() if k != name}, file)
     with pytest.raises(CheckpointError, match="lacks the array"):
-        evaluate.load(run)
+        load(run)
     save_file({**arrays, name: np.zeros((1, 2, 3), np.float32)}, file)
     with pytest.raises(CheckpointError, match="another task or config"):
-        evaluate.load(run)
+        load(run)
     with pytest.raises(UserError, match="no run folder"):
-        evaluate.load(Run(tmp_path / "nothing"))
+        load(Run(tmp_path / "nothing"))
 
 
 def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
-    from ringfence import runs
+    from ringfence.training import runs
 
     run = Run(tmp_path / "copy")
     shutil.copytree(trained["bc"].path, run.path)
@@ -398,14 +407,14 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     """Anybody's logs: a store with named features, a hazard, a policy that acts; nothing of Simple Spread is known."""
     store = own_store
     how = job_of("icbf") | {"changes": {**TINY["icbf"], "steps": 2}}
-    run = training.train("icbf", store, out=tmp_path, **how)[0]
-    _, policy = evaluate.load(run, guard="select", plans=2, steps=2)
+    run = loop.train("icbf", store, out=tmp_path, **how)[0]
+    _, policy = load(run, guard="select", plans=2, steps=2)
     seen = jnp.asarray(store.observations[:4])
     _, out = policy.act(policy.start(4), seen, None, jax.random.key(0))
     assert out.action.shape == (4, 3, 2)
     with pytest.raises(UserError, match="only as data"):
-        evaluate.evaluate(run)
-    pilot = evaluate.Controller(run, steps=2)
+        evaluate(run)
+    pilot = Controller(run, steps=2)
     assert pilot.act(store.observations[0]).shape == (3, 2)
     wide = store.observations.shape[2]
     for seen, state, said in (
@@ -418,11 +427,11 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     del told["widths"], told["team"], told["spec"]["alike"]  # as older versions wrote it
     del told["data"]["observation_names"]
     (run.path / "config.json").write_text(json.dumps(told))
-    pilot = evaluate.Controller(run, steps=2)
+    pilot = Controller(run, steps=2)
     assert pilot.act(store.observations[0]).shape == (3, 2)
     with pytest.raises(UserError, match="has 3 entries, this run reads entry"):
         pilot.act(store.observations[0][:, :3])
-    training.train("icbf", store, out=tmp_path, **how)  # is still that run
+    loop.train("icbf", store, out=tmp_path, **how)  # is still that run
 
 
 def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, capsys):
@@ -431,14 +440,14 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        training.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True, chunk=5, on_chunk=stop)
+        loop.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True, chunk=5, on_chunk=stop)
     run = Run(next(tmp_path.rglob("config.json")).parent)
-    assert evaluate.evaluate(run, episodes=2)["step"] == 5
+    assert evaluate(run, episodes=2)["step"] == 5
     assert "is at step 5 of 12; its training is unfinished" in capsys.readouterr().err
-    assert evaluate.evaluate(str(trained["bc"].path), episodes=2)["step"] == 12
+    assert evaluate(str(trained["bc"].path), episodes=2)["step"] == 12
     assert not capsys.readouterr().err
     with pytest.raises(CheckpointError, match="no checkpoint of step 7; take one of: 5"):
-        evaluate.evaluate(run, episodes=2, step=7)
+        evaluate(run, episodes=2, step=7)
 
 
 class Lost(eqx.Module):
@@ -453,16 +462,16 @@ class Lost(eqx.Module):
 
 def test_actions_that_are_no_numbers_do_not_pass_for_safe():
     with pytest.raises(UserError, match="Step 0 of episode 0 has a reward or state that is not finite"):
-        evaluate.evaluate_policy(Lost(), tasks.get("simple_spread-random"), episodes=2)
+        protocol.evaluate_policy(Lost(), registry.get("simple_spread-random"), episodes=2)
 
 
 def test_results_that_cannot_be_read_are_refused_before_an_episode_is_played(trained, tmp_path, monkeypatch):
     run = Run(tmp_path / "copy")
     shutil.copytree(trained["bc"].path, run.path)
     (run.path / "results.json").write_text("{")
-    monkeypatch.setattr(evaluate, "evaluate_policy", lambda *_: pytest.fail("it was played"))
+    monkeypatch.setattr(protocol, "evaluate_policy", lambda *_: pytest.fail("it was played"))
     with pytest.raises(UserError, match="holds a damaged results.json; delete that file"):
-        evaluate.evaluate(run, episodes=2)
+        evaluate(run, episodes=2)
 
 
 @pytest.mark.parametrize(
@@ -482,7 +491,7 @@ def test_results_that_cannot_be_read_are_refused_before_an_episode_is_played(tra
 )
 def test_what_training_is_told_wrongly_is_refused_before_a_folder_is_made(small_store, tmp_path, given, said):
     with pytest.raises(UserError, match=said):
-        training.train("bc", small_store, out=tmp_path / "runs", quiet=True, **given)
+        loop.train("bc", small_store, out=tmp_path / "runs", quiet=True, **given)
     assert not (tmp_path / "runs").exists()
 
 
@@ -492,9 +501,9 @@ def test_numbers_given_from_python_are_of_their_fields_type():
 
 
 def test_sizes_of_the_unet_are_refused_at_once(small_store):
-    task = tasks.from_store(small_store)
+    task = registry.from_store(small_store)
     with pytest.raises(UserError, match="depth=4 of the temporal U-Net"):
-        training.make_job("icbf", task, "madiff-unet", {"depth": 4}, small_store)
+        make_job("icbf", task, "madiff-unet", {"depth": 4}, small_store)
 
 
 def test_a_field_that_is_gone_is_another_config(trained, small_store, tmp_path):
@@ -504,7 +513,7 @@ def test_a_field_that_is_gone_is_another_config(trained, small_store, tmp_path):
     told = json.loads(file.read_text())
     file.write_text(json.dumps({**told, "config": {**told["config"], "momentum": 0.9}}))
     with pytest.raises(UserError, match="its momentum differs"):
-        training.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True)
+        loop.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True)
 
 
 def test_damaged_run_folders_are_refused(tmp_path):
@@ -519,7 +528,7 @@ def test_damaged_run_folders_are_refused(tmp_path):
     ):
         (tmp_path / "config.json").write_bytes(content)
         with pytest.raises(UserError, match=said):
-            evaluate.evaluate(run)
+            evaluate(run)
     for content, said in (
         (b"[]", "damaged results.json; delete .*got `array`"),
         (b"\xff", "damaged results.json"),
@@ -538,25 +547,25 @@ def test_damaged_run_folders_are_refused(tmp_path):
 
 def test_no_more_is_recorded_than_was_played(trained):
     with pytest.raises(UserError, match="record=-1 must be a whole number"):
-        evaluate.evaluate(trained["madiff"], episodes=2, record=-1)
-    evaluate.evaluate(trained["madiff"], episodes=2, steps=2, record=4)
+        evaluate(trained["madiff"], episodes=2, record=-1)
+    evaluate(trained["madiff"], episodes=2, steps=2, record=4)
     with np.load(trained["madiff"].path / "rollout-default+steps2.npz") as kept:
         assert {len(kept[k]) for k in kept} == {2}
-    _, policy = evaluate.load(trained["madiff"], steps=2)  # more than are played in one batch
-    played = evaluate.rollout(policy, tasks.get("simple_spread-random").env, evaluate.CHUNK + 3, record=51)
-    assert len(played["plans"]) == 51 and len(played["states"]) == evaluate.CHUNK + 3
+    _, policy = load(trained["madiff"], steps=2)  # more than are played in one batch
+    played = rollout.rollout(policy, registry.get("simple_spread-random").env, rollout.CHUNK + 3, record=51)
+    assert len(played["plans"]) == 51 and len(played["states"]) == rollout.CHUNK + 3
 
 
 def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trained, tmp_path, capsys, monkeypatch):
     from rich.console import Console
 
-    from ringfence import cli
+    from ringfence.cli import app
 
-    monkeypatch.setattr(cli, "out", Console(width=300))
+    monkeypatch.setattr(app, "out", Console(width=300))
     own = dataclasses.replace(small_store, card={**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}})
-    dark = training.train("bc", own, out=tmp_path, changes={**TINY["bc"], "steps": 2}, quiet=True)[0]
+    dark = loop.train("bc", own, out=tmp_path, changes={**TINY["bc"], "steps": 2}, quiet=True)[0]
     with pytest.raises(SystemExit) as stop:
-        cli.main(["eval", str(dark.path), str(trained["bc"].path), "--episodes", "2"])
+        app.main(["eval", str(dark.path), str(trained["bc"].path), "--episodes", "2"])
     told = capsys.readouterr()
     assert stop.value.code == 2 and "Task 'mine' exists only as data" in told.err
     assert str(trained["bc"].path) in told.out and str(dark.path) not in told.out
@@ -576,7 +585,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
     ],
 )
 def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsys):
-    from ringfence.cli import main
+    from ringfence.cli.app import main
 
     with pytest.raises(SystemExit) as stop:
         main(["eval", str(trained["madiff"].path), "--episodes", "2", *words])
@@ -586,9 +595,9 @@ def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsy
 @pytest.fixture(scope="module")
 def absolute(played):
     """Logs whose danger is about positions in the global state, which no agent observes; and as they are, no costs."""
-    from ringfence.data import EpisodeStore
     from ringfence.envs import SimpleSpread
-    from ringfence.hazards import Separation
+    from ringfence.logs.store import EpisodeStore
+    from ringfence.problem.constraints import Separation
 
     card = {"task": "yard", "state_names": list(SimpleSpread().state_names), "hazard": Separation(0.3)}
     arrays = played["observations"], played["actions"], played["rewards"]
@@ -597,17 +606,17 @@ def absolute(played):
 
 def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, absolute, tmp_path):
     store = absolute(played["costs"])
-    run = training.train("bc", store, out=tmp_path, changes=TINY["bc"], quiet=True)[0]
-    evaluate.load(run)
-    task = tasks.from_store(store)
+    run = loop.train("bc", store, out=tmp_path, changes=TINY["bc"], quiet=True)[0]
+    load(run)
+    task = registry.from_store(store)
     for name in ("madiff", "bc-safe", "ma-td3bc-lag", "omar"):
-        assert not training.make_job(name, task, None, {"view": "decentralized"}, store).hazard.has_formula
-    assert training.make_job("madiff", task, None, {"view": "centralized"}, store).hazard.has_formula
+        assert not make_job(name, task, None, {"view": "decentralized"}, store).hazard.has_formula
+    assert make_job("madiff", task, None, {"view": "centralized"}, store).hazard.has_formula
     for name in ("icbf", "fisor"):
         with pytest.raises(
             UserError, match="view 'decentralized' leaves out what the hazard Separation reads; set view="
         ):
-            training.make_job(name, task, None, {"view": "decentralized"}, store)
+            make_job(name, task, None, {"view": "decentralized"}, store)
 
 
 @pytest.mark.parametrize("name", ["bc", "ma-td3bc", "fisor"])
@@ -617,11 +626,11 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     store.card["action_sizes"] = [2, 1, 2]
     store = dataclasses.replace(store)
     told = {k: v for k, v in TINY[name].items() if k != "steps"} | {"view": "centralized"}
-    job = training.make_job(name, tasks.from_store(store), None, told, store)
+    job = make_job(name, registry.from_store(store), None, told, store)
     assert job.spec.action_sizes == (2, 1, 2) and type(job.spec).of(json.loads(json.dumps(job.spec.told()))) == job.spec
     state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
     state = jax.tree.map(lambda x: x + 0.1 if x.dtype == jnp.float32 else x, state)  # as if it had learned
-    policy = evaluate.make_policy(job, state, {})
+    policy = resolve.make_policy(job, state, {})
     seen, whole = store.observations[:4], store.state[:4]
     action = np.asarray(policy.act(policy.start(4), seen, whole, jax.random.key(0))[1].action)
     assert (action[:, 1, 1] == 0).all() and (np.abs(action[:, [0, 2]]) > 0).all() and (action[:, 1, 0] != 0).all()
@@ -636,30 +645,30 @@ def test_the_cards_cost_limit_is_what_learners_keep(absolute, played):
     told = dataclasses.replace(store, card={**store.card, "cost_limit": 7.0})
     for name, field, usual in (("bc-safe", "cost_limit", 0.0), ("ma-td3bc-lag", "limit", 1.0)):
         kept = [
-            getattr(training.make_job(name, tasks.from_store(s), None, changes, s).config, field)
+            getattr(make_job(name, registry.from_store(s), None, changes, s).config, field)
             for s, changes in ((store, {}), (told, {}), (told, {field: 3.0}))
         ]
         assert kept == [usual, 7.0, 3.0]
-    assert training.make_job("bc", tasks.from_store(told), None, {}, told).config.cost_limit is None
+    assert make_job("bc", registry.from_store(told), None, {}, told).config.cost_limit is None
     none = dataclasses.replace(store, card={**store.card, "cost_limit": 0.0})
     with pytest.raises(UserError, match=r"limit=0.0 must be positive; .* the data's card \(cost_limit\) unless"):
-        training.make_job("ma-td3bc-lag", tasks.from_store(none), None, {}, none)
+        make_job("ma-td3bc-lag", registry.from_store(none), None, {}, none)
 
 
 def test_costs_that_were_never_filled_in_are_refused_by_those_who_learn_from_them(absolute):
     store = absolute(None)
-    task = tasks.from_store(store)
+    task = registry.from_store(store)
     for name in ("bc-safe", "ma-td3bc-lag"):
         with pytest.raises(
             UserError, match=rf"{name} knows danger by costs alone.*calls [\d.]+ % of its states unsafe"
         ):
-            training.make_job(name, task, None, {}, store)
+            make_job(name, task, None, {}, store)
     for name, view in (("bc", "decentralized"), ("icbf", "centralized")):
-        training.make_job(name, task, None, {"view": view}, store)
+        make_job(name, task, None, {"view": view}, store)
 
 
 def test_trained_config_round_trip(trained):
-    job = evaluate.load_job(trained["icbf"])
+    job = resolve.load_job(trained["icbf"])
     told = trained["icbf"].config["config"]
     assert {k: v for k, v in dataclasses.asdict(job.config).items()} == told
 
@@ -684,8 +693,8 @@ def test_cloning_that_reads_returns_does_what_it_is_asked_for(tmp_path):
     }.items():
         algorithm = "bc-return" if "target" in changes else "bc-best"
         changes |= {"view": "decentralized", "steps": 150, "width": 32, "lr": 3e-3}
-        run = training.train(algorithm, store, out=tmp_path / name, changes=changes, quiet=True)[0]
-        policy = evaluate.load(run)[1]
+        run = loop.train(algorithm, store, out=tmp_path / name, changes=changes, quiet=True)[0]
+        policy = load(run)[1]
         acted = policy.act(policy.start(64), jnp.asarray(store.observations[:64]), None, jax.random.key(0))[1].action
         earned[name] = float(acted[..., 0].mean())
     assert earned["high"] > 0.2 and earned["low"] < -0.2

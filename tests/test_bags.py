@@ -10,8 +10,8 @@ import sys
 import numpy as np
 import pytest
 
-from ringfence.data.bags import read_bag
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.rosbag import read_bag
 
 pytest.importorskip("rosbags", reason="rosbags writes the bags of these tests")
 

@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import barrier as cbf
-from ringfence import hazards, normalise
 from ringfence.algos import icbf, joint
-from ringfence.diffusion import cosine_schedule
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
+from ringfence.logs.windows import WindowData, at
 from ringfence.nets import MLP
 from ringfence.nets.heads import barrier_on
-from ringfence.windows import WindowData, at
+from ringfence.problem import constraints, normalise
+from ringfence.proposals import retention as cbf
+from ringfence.proposals.diffusion import cosine_schedule
 
 BAR = cosine_schedule(200)
 RELAXATIONS = ("signal", "linear", "none")
@@ -125,7 +125,7 @@ def scene(small_store):
     unsafe states bite."""
     table = SimpleSpread().feature_map("pruned")
     data = WindowData(small_store, table)
-    hazard = hazards.bind(hazards.Separation(), table.names, 3)
+    hazard = constraints.bind(constraints.Separation(), table.names, 3)
     batch = jax.jit(at, static_argnums=(2, 3))(data.arrays, jnp.arange(0, data.steps, 40), 4, 0)
     norm = normalise.fit(np.asarray(batch.features), np.asarray(batch.valid), 0, "displacement")
     net = jax.jit(lambda key: MLP(key, (18, 8, 8, 8, 1), groups=3))(jax.random.key(0))
@@ -234,7 +234,7 @@ def test_means_do_not_depend_on_the_number_of_agents():
 
 
 def test_paper_needs_a_formula():
-    hazard = hazards.bind(hazards.CostColumn(), SimpleSpread().feature_map("pruned").names, 3)
+    hazard = constraints.bind(constraints.CostColumn(), SimpleSpread().feature_map("pruned").names, 3)
     with pytest.raises(UserError, match="routing='paper' labels generated states"):
         icbf.check(config("paper"), hazard)
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.data import behaviour, matd3
-from ringfence.data.behaviour import (
+from ringfence.datasets import behaviour, matd3
+from ringfence.datasets.behaviour import (
     BehaviourPolicy,
     MATD3Config,
     collect,

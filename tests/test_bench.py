@@ -17,7 +17,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ringfence import evaluate, files, reference, tasks, training
 from ringfence.bench import cells as grid
 from ringfence.bench import (
     cluster,
@@ -33,11 +32,16 @@ from ringfence.bench import (
     suites,
     write_csv,
 )
-from ringfence.cli import _runs, main
+from ringfence.cli.app import _runs, main
+from ringfence.datasets import registry
 from ringfence.errors import UserError
+from ringfence.evaluation import protocol, reference
+from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import GUARDS, GuardOptions
-from ringfence.hazards import Separation, to_dict
-from ringfence.runs import Run
+from ringfence.problem.constraints import Separation, to_dict
+from ringfence.training import loop
+from ringfence.training.runs import Run
+from ringfence.utils import files
 from ringfence.world import Settings
 
 QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], steps=20, transitions=500)
@@ -86,7 +90,7 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
     """Results that the named planner of today would not give do not count."""
     cell = grid.Cell("simple_spread-random", "bc", "default", 0, (), (("default+shield-learned", "shield-learned"),))
     options = grid.dataclasses.asdict(GuardOptions(**{**GUARDS["shield"], "margin": 1.0}))
-    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}, "guard_options": options}
+    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "guard_options": options}
     Run(cell.folder(tmp_path)).add_result("default+shield-learned", told)
     assert cell.state(tmp_path, 4) == "done"
     assert cell.state(tmp_path, 5) == "to do"
@@ -117,7 +121,7 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
 
 def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
     cell = grid.Cell("simple_spread-expert", "bc", "default", 0, (), (("default", "plain"),))
-    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}, "step": 7}
+    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "step": 7}
     Run(cell.folder(tmp_path)).add_result("default", told)
     assert cell.state(tmp_path, 4) == "to do"
     Run(cell.folder(tmp_path)).add_result("default", {**told, "step": cell.config.steps})
@@ -127,7 +131,7 @@ def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
 @pytest.mark.parametrize(("task", "state"), [("ant_4x2-poor", "to do"), ("halfcheetah_2x3-poor", "done")])
 def test_a_result_that_hides_falls_is_played_again(tmp_path, task, state):
     cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "plain"),))
-    told = {"episodes": 4, "protocol": evaluate.PROTOCOL, "options": {}}
+    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}}
     Run(cell.folder(tmp_path)).add_result("mujoco", told)
     assert cell.state(tmp_path, 4) == state
     Run(cell.folder(tmp_path)).add_result("mujoco", {**told, "termination_rate": 0.0})
@@ -251,13 +255,13 @@ def test_one_cell_under_two_settings_is_no_table(made):
 
 
 def test_reference_rows_follow_the_size_of_the_data(made, tmp_path):
-    task, place = tasks.get("simple_spread-random"), made.out / "reference"
+    task, place = registry.get("simple_spread-random"), made.out / "reference"
     n = made.episodes
     assert reference.there(task, place, n, 500)
     assert not reference.there(task, place, n, 600) and not reference.there(task, place, n)
     assert not reference.there(task, place, n + 1, 500)
     assert not reference.there(dataclasses.replace(task, hazard=Separation(0.4)), place, n, 500)
-    assert not reference.there(tasks.get("simple_spread-expert"), place, n, 500)
+    assert not reference.there(registry.get("simple_spread-expert"), place, n, 500)
     # a card that tells no size asked for: whole episodes, a little more
     file = tmp_path / task.name / "reference.json"
     file.parent.mkdir()
@@ -298,7 +302,7 @@ def test_bad_names_and_folders_are_refused(made, tmp_path):
 def test_a_failing_cell_is_recorded_and_stops_nobody(tmp_path, monkeypatch):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
     g.open()
-    real, broken = evaluate.evaluate, g.cells[0].folder(g.out)
+    real, broken = evaluate, g.cells[0].folder(g.out)
 
     def fails(run, **options):
         if run.path == broken:
@@ -321,7 +325,7 @@ def test_a_worker_that_outgrows_its_memory_is_stopped_and_said_so(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
     (tmp_path / "out" / "reference" / "simple_spread-random").mkdir(parents=True)
     grid.write_json(g.out / "bench.json", grid.about(g.suite, g.episodes))
-    card = {"size": 500, "hazard": to_dict(tasks.get("simple_spread-random").hazard)}
+    card = {"size": 500, "hazard": to_dict(registry.get("simple_spread-random").hazard)}
     known = {"behaviour data": {"data": card}, "do-nothing": {"episodes": g.episodes}}
     (tmp_path / "out" / "reference" / "simple_spread-random" / "reference.json").write_text(json.dumps(known))
     assert run_local(g, workers=1, memory=0.05, quiet=True) == {"done": 0, "failed": 1, "to do": 0}
@@ -364,7 +368,9 @@ def test_one_runner_per_folder(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
     g.open()
     with files.owned(g.out, "not said"):
-        code = f"import pathlib, ringfence.files as x\nwith x.owned(pathlib.Path({str(g.out)!r}), {g.taken!r}): pass"
+        code = (
+            f"import pathlib, ringfence.utils.files as x\nwith x.owned(pathlib.Path({str(g.out)!r}), {g.taken!r}): pass"
+        )
         second = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "Another runner works on" in second.stderr
     with files.owned(g.out, "not said"):
@@ -376,7 +382,7 @@ def test_one_training_per_run_folder(small_store, tmp_path):
     folder = tmp_path / "simple_spread-random" / "bc" / "seed-0"
     with files.owned(folder, "not said"):
         with pytest.raises(UserError, match="Another process trains '.*seed-0'; wait for it or stop it"):
-            training.train("bc", small_store, preset="default", **told)
+            loop.train("bc", small_store, preset="default", **told)
     assert not (folder / "metrics.jsonl").exists()
 
 
@@ -464,7 +470,7 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     g.open()
     grid.run_group([native], g.out, 1, lambda event, cell: None)
     with monkeypatch.context() as m:
-        m.setattr(training, "_loop", lambda *_: pytest.fail("it was trained again"))
+        m.setattr(loop, "_loop", lambda *_: pytest.fail("it was trained again"))
         grid.run_group([other], g.out, 1, lambda event, cell: None)
     assert other.status(g.out)["adopted"] == str(native.folder(g.out).relative_to(g.out))
     weights = {c.task: Run(c.folder(g.out)).checkpoints()[-1][1].read_bytes() for c in g.cells}
@@ -505,7 +511,7 @@ def test_a_stale_cell_is_named_and_stops_no_other(tmp_path):
 
 
 def test_reference_rows_tell_the_data_from_its_safe_part(small_store, tmp_path):
-    task = tasks.get("simple_spread-random")
+    task = registry.get("simple_spread-random")
     found = reference.make(task, small_store, tmp_path, 2)
     safe = small_store.episode_costs <= task.cost_limit
     assert 0 < safe.sum() < small_store.episodes

@@ -13,15 +13,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import algos, cli, evaluate, tasks
+from ringfence import algos
+from ringfence.cli import app
+from ringfence.datasets import registry
 from ringfence.errors import UserError
+from ringfence.evaluation import protocol
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
 from ringfence.report.board import Method, read
 from ringfence.report.board_page import published, rankings
 from ringfence.report.page import danger
 from ringfence.report.published import PUBLISHED, matches
 from ringfence.report.standings import aggregate, aggregates, contests, references, standings
-from ringfence.words import latex, markdown, shell, spreadsheet, terminal
+from ringfence.utils.escape import latex, markdown, shell, spreadsheet, terminal
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
 LOW, HIGH = 159.8, 516.8  # Simple Spread's normalisation
@@ -33,7 +36,7 @@ def summary(returns, costs, task=EXPERT, unsafe=(0, 0, 0, 0), **more) -> dict:
     rewards = np.stack([np.asarray(returns, float), np.zeros(len(returns))], 1)
     steps = np.stack([np.asarray(costs, float), np.zeros(len(costs))], 1)
     played = {"rewards": rewards, "costs": steps, "steps": np.full(4, 2), "terminated": np.zeros(4, bool)}
-    made = evaluate.summarise(played, tasks.get(task), np.asarray(unsafe, bool))
+    made = protocol.summarise(played, registry.get(task), np.asarray(unsafe, bool))
     made |= {"protocol": 1, "task": task, "split": "test", "parameters": 1234, "train_seconds": 10.0}
     return made | more
 
@@ -538,11 +541,11 @@ def test_validation_boards_say_so(folder, tmp_path):
 
 
 def test_the_command_line_makes_the_board(folder, tmp_path, capsys):
-    cli.main(["report", str(folder), "--out", str(tmp_path / "page.html")])
+    app.main(["report", str(folder), "--out", str(tmp_path / "page.html")])
     assert "page.html" in capsys.readouterr().out
     assert "Leaderboard: simple spread" in (tmp_path / "page.html").read_text()
     with pytest.raises(SystemExit):
-        cli.main(["report", str(folder), str(folder / "cells"), "--out", str(tmp_path / "two.html")])
+        app.main(["report", str(folder), str(folder / "cells"), "--out", str(tmp_path / "two.html")])
     assert "give it alone" in capsys.readouterr().err
 
 

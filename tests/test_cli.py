@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import pytest
 
-from ringfence import demo, evaluate
-from ringfence.cli import main
-from ringfence.data import EpisodeStore
+from ringfence.cli import demo
+from ringfence.cli.app import main
 from ringfence.errors import UserError
+from ringfence.evaluation import protocol
 from ringfence.guards import GUARDS
+from ringfence.logs.store import EpisodeStore
 
 
 def test_lists_tasks(capsys):
@@ -92,12 +93,12 @@ def test_errors_of_the_system_are_told_in_one_sentence(monkeypatch, capsys, tmp_
 
 
 def test_it_is_said_which_of_several_runs_was_refused(monkeypatch, capsys, tmp_path):
-    import ringfence.evaluate
+    import ringfence.evaluation.protocol
 
     def refuse(run, **told):
         raise UserError("this policy has diverged." if run.path.name != "b" else f"'{run.path}' is damaged.")
 
-    monkeypatch.setattr(ringfence.evaluate, "evaluate", refuse)
+    monkeypatch.setattr(ringfence.evaluation.protocol, "evaluate", refuse)
     for name in "abc":
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text("{}")
@@ -110,8 +111,8 @@ def test_it_is_said_which_of_several_runs_was_refused(monkeypatch, capsys, tmp_p
 
 def test_every_set_counts(monkeypatch):
     heard = []
-    monkeypatch.setattr("ringfence.training.train", lambda *_, changes, **__: heard.append(changes) or [])
-    monkeypatch.setattr("ringfence.cli._store", lambda data: None)
+    monkeypatch.setattr("ringfence.training.loop.train", lambda *_, changes, **__: heard.append(changes) or [])
+    monkeypatch.setattr("ringfence.cli.app._store", lambda data: None)
     main(["train", "bc", "mine.h5", "--set", "steps=3", "batch=4", "--set", "width=8", "--seeds", "2"])
     assert heard == [{"steps": "3", "batch": "4", "width": "8"}]
 
@@ -145,7 +146,7 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
 def test_the_whole_job(tmp_path, monkeypatch, capsys):
     """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(evaluate, "CHUNK", 10)
+    monkeypatch.setattr(protocol, "CHUNK", 10)
     monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "rows": 2, "starts": 2, "shield": 1})
     monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
     page = demo.run(tmp_path / "demo", "random", quick=True)

@@ -11,11 +11,13 @@ import pytest
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
-from ringfence import cli, guard, play, record, training, world, worlds
-from ringfence.data.audit import audit
-from ringfence.data.store import EpisodeStore
+from ringfence import guard, play, record, world
+from ringfence.cli import app
+from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.store import EpisodeStore
 from ringfence.report import build_report
+from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 
 LIMITS = {"wall": 0.0, "fast": 10.0}
@@ -182,13 +184,13 @@ def test_learners_keep_every_limit(logs):
 
 def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path, capsys):
     changes = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
-    run = training.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
     told = play(run, Sleds, episodes=3, keep=True)["constraints"]
     assert {k: v["limit"] for k, v in told.items()} == LIMITS
     page = build_report([run], tmp_path / "page.html").read_text()
     shown = re.findall(r"<td>(wall|fast)</td><td>([\d.]+)</td><td>(\d+)</td>", page)
     assert shown == [(k, f"{told[k]['cost_mean']:.3f}", f"{v:g}") for k, v in LIMITS.items()]
-    cli.main(["play", str(run.path), "--env", "tests.test_constraints:Sleds", "--episodes", "2"])
+    app.main(["play", str(run.path), "--env", "tests.test_constraints:Sleds", "--episodes", "2"])
     shown = capsys.readouterr().out
     assert "wall" in shown and "fast" in shown
 
@@ -219,10 +221,10 @@ def test_columns_of_a_table_are_constraints(tmp_path, capsys):
     (tmp_path / "fleet.csv").write_text("\n".join(rows))
     words = "data import-table fleet.csv --out fleet.h5 --time t --agent id --episode run --state x y --cost hit fast"
     given = [str(tmp_path / w) if w.startswith("fleet") else w for w in words.split()]
-    cli.main([*given, "--limits", "0", "2"])
+    app.main([*given, "--limits", "0", "2"])
     store = EpisodeStore.load(tmp_path / "fleet.h5")
     assert store.limits == {"hit": 0, "fast": 2} and store.constraints.shape == (44, 2, 2)
     assert store.episode_costs_of("hit").tolist() == [1] * 4 and store.episode_costs_of("fast").tolist() == [3] * 4
     with pytest.raises(SystemExit):
-        cli.main([*given, "--limits", "1"])
+        app.main([*given, "--limits", "1"])
     assert "gives 1 numbers for 2 columns" in capsys.readouterr().err

@@ -9,19 +9,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import tasks, training, worlds
-from ringfence.data.make import make
-from ringfence.data.recipes import crossing as recipe
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.datasets.recipes import crossing as recipe
 from ringfence.envs import Crossing
 from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
 from ringfence.envs.film import RED
 from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import UserError
-from ringfence.evaluate import Controller, evaluate, unsafe_starts
-from ringfence.guards import guard
-from ringfence.parallel import play
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.play import play
+from ringfence.evaluation.protocol import unsafe_starts
+from ringfence.guards import filter
+from ringfence.loading.controller import Controller
+from ringfence.training import loop, worlds
 from ringfence.world import save
-from ringfence.world.fitting import held_out
+from ringfence.world.fit import held_out
 from tests.quick import QUICK_WORLD
 
 
@@ -152,30 +155,30 @@ def test_a_unicycle_is_steered_as_a_disc_is_pushed():
 
 
 def test_unicycles_drive_to_their_goals_in_logs_of_their_own():
-    store = make(tasks.get("crossing_unicycle-hasty"), 2000)[0]
+    store = make(registry.get("crossing_unicycle-hasty"), 2000)[0]
     assert store.card["observation_names"][2:4] == ["own.cos", "own.sin"] and store.returns.min() > 0.5
     with pytest.raises(UserError, match="obstacles or walls"):
-        task = tasks.get("crossing_unicycle-hasty")
+        task = registry.get("crossing_unicycle-hasty")
         make(dataclasses.replace(task, env=Crossing(walls=True)), 2000)
 
 
 @pytest.fixture(scope="module")
 def logs():
-    return make(tasks.get("crossing-hasty"), 2000)[0]
+    return make(registry.get("crossing-hasty"), 2000)[0]
 
 
 def test_logs_tell_whom_they_cost(logs):
     assert logs.costs.shape == (2000, 8) and logs.card["observation_names"][0] == "own.vx"
-    same = make(tasks.get("crossing-hasty"), 2000, fresh=True)[0]
+    same = make(registry.get("crossing-hasty"), 2000, fresh=True)[0]
     assert same.content == logs.content
-    starts = unsafe_starts(tasks.get("crossing-hasty"), logs.state[::101])
+    starts = unsafe_starts(registry.get("crossing-hasty"), logs.state[::101])
     assert not starts.any()
 
 
 def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypatch):
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
-    monkeypatch.setattr(sys.modules["ringfence.evaluate"], "CHUNK", 2)
-    run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    monkeypatch.setattr(sys.modules["ringfence.evaluation.protocol"], "CHUNK", 2)
+    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card["data"]["episodes"] == 20
     result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, shield=1, rows=1)
@@ -191,12 +194,12 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     order = np.array([3, 1, 4, 0, 2])  # who is asked first changes nothing
     pilot.reset()
     np.testing.assert_allclose(pilot.act(seen[order]), acted[order], atol=1e-6)
-    mine = guard(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
+    mine = filter(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
     assert mine.act(seen).shape == (5, 2) and mine.info["infeasible"].shape == ()
     with pytest.raises(UserError, match="no sight='all'"):
         evaluate(run, episodes=2, guard="shield", world=world, sight="all")
     with pytest.raises(UserError, match="say with agents="):
-        guard(lambda seen, state: np.zeros((len(seen), 2)), world)
+        filter(lambda seen, state: np.zeros((len(seen), 2)), world)
 
 
 def test_episodes_are_drawn():
@@ -217,7 +220,7 @@ def test_it_keeps_pettingzoos_api(logs, tmp_path):
     parallel_api_test(env, num_cycles=20)
     seen, _ = env.reset(seed=1)
     assert env.render().shape == (480, 480, 3) and seen["agent_0"].shape == (env.core.observation_dim,)
-    run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     assert play(run, lambda: CrossingParallel(n_agents=3), episodes=1, agents=3)["episodes"] == 1
     with pytest.raises(UserError, match="has 3 agents, the run was trained with 8; pass agents=3"):
         play(run, lambda: CrossingParallel(n_agents=3), episodes=1)
@@ -250,7 +253,7 @@ def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     """The card says so, and what was learned of eight plays five."""
     card = {k: logs.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
     mine = dataclasses.replace(logs, state=None, card=card)
-    run = training.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(mine, **QUICK_WORLD)
     assert world.map.solitary and world.map.dt == pytest.approx(0.1)  # as names and steps tell
     assert world.map.own == Crossing().feature_map("pruned").own

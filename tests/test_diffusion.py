@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import diffusion
 from ringfence.errors import UserError
+from ringfence.proposals import diffusion
 
 BAR = diffusion.cosine_schedule(200)
 SAMPLERS = ("ddpm", "ddim", "dpm++")

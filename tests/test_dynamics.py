@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.features import FeatureMap
+from ringfence.problem.features import FeatureMap
 from ringfence.world.dynamics import blank_dynamics, fit_dynamics
 
 EPISODES, STEPS, AGENTS = 40, 50, 2

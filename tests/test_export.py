@@ -17,11 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import evaluate, training
-from ringfence import export as exporting
-from ringfence.cli import main
+from ringfence.cli.app import main
+from ringfence.deploy import export as exporting
 from ringfence.errors import UserError
-from ringfence.policies import Constant
+from ringfence.loading.controller import Controller
+from ringfence.loading.resolve import load
+from ringfence.proposals.base import Constant
+from ringfence.training import loop
 from tests.quick import QUICK_WORLD
 
 SHIELD = dict(guard="shield", rows=1, shield=3, margin=4.0)
@@ -33,7 +35,7 @@ STEPS = 12
 def run(small_store, tmp_path_factory):
     """Cloning of the small store."""
     out = tmp_path_factory.mktemp("runs")
-    return training.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=out)[0]
+    return loop.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=out)[0]
 
 
 @pytest.fixture(scope="module")
@@ -41,12 +43,12 @@ def planner(small_store, tmp_path_factory):
     """A diffusion planner of the small store."""
     changes = dict(steps=2, batch=8, width=16, depth=1, diffusion_steps=10)
     out = tmp_path_factory.mktemp("runs")
-    return training.train("madiff", small_store, changes=changes, world=QUICK_WORLD, quiet=True, out=out)[0]
+    return loop.train("madiff", small_store, changes=changes, world=QUICK_WORLD, quiet=True, out=out)[0]
 
 
 def played(run, store, noisy: bool = False, **options) -> list[tuple[dict, dict]]:
     """What a controller is given along some steps of the logs, with the noise that it draws, and what it tells."""
-    controller = evaluate.Controller(run, **options)
+    controller = Controller(run, **options)
     draw = exporting.step_of(controller.job, controller.policy).draw if noisy else lambda key: []
     key, steps = jax.random.key(0), []
     for t in range(STEPS):
@@ -166,12 +168,12 @@ def test_agents_who_are_alike(own_store, tmp_path):
     card = {k: own_store.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
     costs = np.repeat(own_store.costs[:, None], 3, 1)
     store = dataclasses.replace(own_store, costs=costs, card=card)
-    run = training.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
+    run = loop.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
     call, told = of_stablehlo(exporting.export(run, tmp_path / "5", "stablehlo", agents=5))
     assert told["inputs"] == [{"name": "observations", "shape": [5, 14], "dtype": "float32"}] and told["n_agents"] == 5
     assert told["names"] == {"observations": list(own_store.card["observation_names"])} and told["sight"] == "own"
     seen = own_store.observations[:5, 0]
-    action = evaluate.Controller(run, agents=5).act(seen)
+    action = Controller(run, agents=5).act(seen)
     np.testing.assert_allclose(call({"observations": seen})["action"], action, atol=1e-6)
 
 
@@ -211,7 +213,7 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
 
 
 def test_what_cannot_be_exported_is_named(run, tmp_path):
-    job, _ = evaluate.load(run)
+    job, _ = load(run)
     with pytest.raises(UserError, match="draws more than normal noise"):
         exporting.step_of(job, Constant(job.spec, random=True))
     pytest.importorskip("jax2onnx")
@@ -255,7 +257,7 @@ def test_the_node_plays_the_file(run, small_store, small_world, tmp_path):
     spec.loader.exec_module(node)  # without rclpy, which main() alone needs
     options = {**SHIELD, "adapt": 0.1, "world": small_world}
     main_file = exporting.export(run, tmp_path / "p.onnx", **options)
-    pilot, controller = node.Pilot(str(main_file)), evaluate.Controller(run, **options)
+    pilot, controller = node.Pilot(str(main_file)), Controller(run, **options)
     for episode in range(2):
         pilot.reset(), controller.reset()
         for t in range(3):
@@ -287,10 +289,10 @@ def test_the_c_example_plays_the_file(run, small_store, tmp_path):
     where = ["-I", str(Path(root, "include", there[0]).parent), f"-L{root}/lib", f"-Wl,-rpath,{root}/lib"]
     subprocess.run(["g++", "-std=c++17", str(code), *where, "-lonnxruntime", "-o", str(play)], check=True)
     file = exporting.export(run, tmp_path / "p.onnx")
-    reads = [x.name for x in exporting.step_of(*evaluate.load(run)).inputs]
+    reads = [x.name for x in exporting.step_of(*load(run)).inputs]
     rows = [{"observations": small_store.observations[t], "state": small_store.state[t]} for t in range(3)]
     told = [" ".join(str(x) for name in reads for x in row[name].ravel()) for row in rows]
     out = subprocess.run([play, file, "3"], input="\n".join(told), capture_output=True, text=True, check=True).stdout
     acted = np.array([[float(x) for x in line.split()] for line in out.splitlines()])
-    controller = evaluate.Controller(run)
+    controller = Controller(run)
     np.testing.assert_allclose(acted, [controller.act(**row).ravel() for row in rows], atol=1e-4)

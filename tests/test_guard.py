@@ -9,19 +9,24 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence import evaluate, hazards, tasks, training, worlds
+from ringfence.datasets import registry
 from ringfence.errors import UserError
+from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import Danger, Guard, GuardOptions
-from ringfence.guards.guard import pick
+from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
-from ringfence.policies import Constant
+from ringfence.loading import run_worlds
+from ringfence.loading.resolve import load
+from ringfence.problem import constraints
+from ringfence.proposals.base import Constant
+from ringfence.training import loop, worlds
 from ringfence.world import Card
 from tests.quick import QUICK_WORLD
 
 
 @pytest.fixture(scope="module")
 def bound(small_world):
-    return hazards.bind(hazards.Separation(), small_world.spec.feature_names, 3)
+    return constraints.bind(constraints.Separation(), small_world.spec.feature_names, 3)
 
 
 def make(world, bound, source="formula", **options) -> Guard:
@@ -148,7 +153,7 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     world = worlds.fit(small_store, sight="own", **QUICK_WORLD)
     assert world.alone and world.map.view == "decentralized"
     seen = jnp.asarray(small_store.observations[:16])
-    bound = hazards.bind(hazards.Separation(), world.spec.feature_names, 3)
+    bound = constraints.bind(constraints.Separation(), world.spec.feature_names, 3)
     guard = make(world, bound, shield=4, refine=3, starts=3, select=True)
     plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
     last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3, 1)), jax.random.key(0)
@@ -180,7 +185,7 @@ def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
 
 
 def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
-    policy = build(Constant(small_world.spec), small_world, hazards.Separation(), "adapt", "formula")
+    policy = build(Constant(small_world.spec), small_world, constraints.Separation(), "adapt", "formula")
     seen, state = small_store.observations[:2], small_store.state[:2]
     memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))
     assert (memory["margin"] == np.float32(0.6)).all()  # nobody chose the first state
@@ -239,27 +244,27 @@ def test_any_callable_is_guarded(small_world, small_store):
 
 def test_a_world_of_other_data_is_refused(small_store, tmp_path):
     tiny = dict(changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)
-    run = training.train("bc", small_store, **tiny)[0]
+    run = loop.train("bc", small_store, **tiny)[0]
     card = {**small_store.card, "task": "other"}
     other = worlds.fit(dataclasses.replace(small_store, card=card), **QUICK_WORLD)
     with pytest.raises(UserError, match="The World is of 'other', the run .* of other data"):
-        evaluate.load(run, guard="shield", world=other)
+        load(run, guard="shield", world=other)
     with pytest.raises(UserError, match="needs the World of its data"):
-        evaluate.load(run, guard="shield")  # nothing that this package regenerates
+        load(run, guard="shield")  # nothing that this package regenerates
     alone = worlds.fit(small_store, sight="own", **QUICK_WORLD)
     with pytest.raises(UserError, match="fitted with sight=own, the guard is to have sight=all"):
-        evaluate.load(run, guard="shield", world=alone)
+        load(run, guard="shield", world=alone)
     same = worlds.fit(small_store, **QUICK_WORLD)
-    result = evaluate.evaluate(run, episodes=2, guard="shield", world=same)
+    result = evaluate(run, episodes=2, guard="shield", world=same)
     assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible"] <= 1
-    assert tasks.get("simple_spread-random").name == result["task"]
+    assert registry.get("simple_spread-random").name == result["task"]
 
 
 def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_path, monkeypatch):
     """A planner whose training read values of its own discount is guarded by the task's World, not by those."""
     changes = dict(steps=2, batch=8, width=16, depth=1, barrier_batch=4, barrier_width=8)
     far, usual = (
-        training.train(
+        loop.train(
             "icbf",
             small_store,
             out=tmp_path / f"{d}",
@@ -269,9 +274,9 @@ def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_p
         )[0]
         for d in (0.8, 0.9)
     )
-    assert worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
+    assert run_worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
     monkeypatch.setattr(worlds, "_made_here", lambda run: True)
     monkeypatch.setattr(worlds, "_of_data", lambda run, sight, quiet: "the task's")
-    assert worlds.for_guard(far) == "the task's"
-    assert worlds.for_guard(usual).values.discount == 0.9
-    assert worlds.of_run(far).values.discount == 0.8
+    assert run_worlds.for_guard(far) == "the task's"
+    assert run_worlds.for_guard(usual).values.discount == 0.9
+    assert run_worlds.of_run(far).values.discount == 0.8

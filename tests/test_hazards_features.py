@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import features, hazards, tasks
-from ringfence.data import EpisodeStore
+from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
-from ringfence.windows import NOT_ARRIVED
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import NOT_ARRIVED
+from ringfence.problem import constraints, features
 
 VIEWS = features.VIEWS
 
@@ -46,7 +47,7 @@ def distances(state):
 @pytest.mark.parametrize("view", VIEWS)
 def test_clearance_is_distance_less_radius(rows, view):
     table, x = views_of(rows, view)
-    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
+    bound = constraints.bind(constraints.Separation(0.30), table.names, 3)
     expected = distances(rows[1]) - 0.30
     np.testing.assert_allclose(bound.clearance(jnp.asarray(x)), expected, atol=1e-5)
     unsafe, safe = bound.labels(jnp.asarray(x))
@@ -61,7 +62,7 @@ def test_clearance_is_distance_less_radius(rows, view):
 @pytest.mark.parametrize("view", VIEWS)
 def test_gradient_of_clearance_is_finite_even_where_agents_coincide(rows, view):
     table, x = views_of(rows, view)
-    bound = hazards.bind(hazards.Separation(0.30), table.names, 3)
+    bound = constraints.bind(constraints.Separation(0.30), table.names, 3)
     x = np.concatenate([x[:20], np.zeros_like(x[:1])])  # the last row: everybody at the same point
     gradient = jax.jit(jax.grad(lambda x: bound.clearance(x).sum()))(jnp.asarray(x))
     assert np.isfinite(gradient).all()
@@ -71,17 +72,17 @@ def test_gradient_of_clearance_is_finite_even_where_agents_coincide(rows, view):
 def test_absent_features_are_named_with_the_nearest():
     names = SimpleSpread().feature_map("pruned").names
     with pytest.raises(UserError, match=r"'other2\.dx'.*did you mean 'other[01]\.d.'"):
-        hazards.bind(hazards.Separation(), names, 4)
+        constraints.bind(constraints.Separation(), names, 4)
     with pytest.raises(UserError, match=r"SpeedLimit reads the feature 'own\.vz'.*did you mean 'own\.v.'"):
-        hazards.bind(hazards.SpeedLimit(1.0, ("own.vx", "own.vz")), names, 3)
+        constraints.bind(constraints.SpeedLimit(1.0, ("own.vx", "own.vz")), names, 3)
     with pytest.raises(UserError, match="at least 2 agents"):
-        hazards.bind(hazards.Separation(), SimpleSpread(n_agents=1).feature_map("pruned").names, 1)
+        constraints.bind(constraints.Separation(), SimpleSpread(n_agents=1).feature_map("pruned").names, 1)
 
 
 def test_speed_limit(rows):
     table, x = views_of(rows, "pruned")
     x = np.concatenate([x, np.zeros_like(x[:5])])  # some at rest
-    bound = hazards.bind(hazards.SpeedLimit(0.8, ("own.vx", "own.vy")), table.names, 3)
+    bound = constraints.bind(constraints.SpeedLimit(0.8, ("own.vx", "own.vy")), table.names, 3)
     speed = np.hypot(x[..., 0], x[..., 1])
     labels = jax.jit(bound.labels)
     np.testing.assert_allclose(jax.jit(bound.clearance)(x), 0.8 - speed, atol=1e-5)
@@ -93,10 +94,10 @@ def test_speed_limit(rows):
 
 def test_all_is_the_smallest_clearance(rows):
     table, x = views_of(rows, "pruned")
-    parts = hazards.Separation(), hazards.SpeedLimit(0.8, ("own.vx", "own.vy"))
-    bound = hazards.bind(hazards.All(parts), table.names, 3)
-    each = [np.asarray(jax.jit(hazards.bind(p, table.names, 3).clearance)(x)) for p in parts]
-    labels = [hazards.bind(p, table.names, 3).labels(x) for p in parts]
+    parts = constraints.Separation(), constraints.SpeedLimit(0.8, ("own.vx", "own.vy"))
+    bound = constraints.bind(constraints.All(parts), table.names, 3)
+    each = [np.asarray(jax.jit(constraints.bind(p, table.names, 3).clearance)(x)) for p in parts]
+    labels = [constraints.bind(p, table.names, 3).labels(x) for p in parts]
     unsafe, safe = bound.labels(x)
     np.testing.assert_array_equal(unsafe, labels[0][0] | labels[1][0])
     np.testing.assert_array_equal(safe, labels[0][1] & labels[1][1])  # metres and m/s by margins of their own
@@ -104,16 +105,16 @@ def test_all_is_the_smallest_clearance(rows):
     np.testing.assert_allclose(clearance(x), np.minimum(each[0], each[1] * 0.075 / 0.16), atol=1e-6)
     np.testing.assert_array_equal(safe, clearance(x) >= bound.safe_margin)  # so one share of the margin suits both
     with pytest.raises(UserError, match="safe_margin above 0"):
-        hazards.bind(hazards.All((parts[0], hazards.SpeedLimit(0.8, ("own.vx",), 0.0))), table.names, 3)
+        constraints.bind(constraints.All((parts[0], constraints.SpeedLimit(0.8, ("own.vx",), 0.0))), table.names, 3)
     with pytest.raises(UserError, match="a formula for each"):
-        hazards.bind(hazards.All((hazards.CostColumn(),)), table.names, 3)
+        constraints.bind(constraints.All((constraints.CostColumn(),)), table.names, 3)
     with pytest.raises(UserError, match="at least one hazard"):
-        hazards.bind(hazards.All(()), table.names, 3)
+        constraints.bind(constraints.All(()), table.names, 3)
 
 
 def test_cost_column_labels_only_what_was_logged(rows):
     table, x = views_of(rows, "pruned")
-    bound = hazards.bind(hazards.CostColumn(), table.names, 3)
+    bound = constraints.bind(constraints.CostColumn(), table.names, 3)
     assert not bound.has_formula
     unsafe, safe = bound.labels(jnp.asarray(x[:3]), jnp.array([0.0, 2.0, NOT_ARRIVED]))
     assert unsafe.tolist() == [[False] * 3, [True] * 3, [False] * 3]
@@ -125,9 +126,14 @@ def test_cost_column_labels_only_what_was_logged(rows):
 def test_hazards_survive_json():
     import json
 
-    speed = hazards.SpeedLimit(2.5, ("own.vx",), 0.1)
-    for hazard in (hazards.Separation(0.4), speed, hazards.CostColumn(), hazards.All((hazards.Separation(), speed))):
-        assert hazards.from_dict(json.loads(json.dumps(hazards.to_dict(hazard)))) == hazard
+    speed = constraints.SpeedLimit(2.5, ("own.vx",), 0.1)
+    for hazard in (
+        constraints.Separation(0.4),
+        speed,
+        constraints.CostColumn(),
+        constraints.All((constraints.Separation(), speed)),
+    ):
+        assert constraints.from_dict(json.loads(json.dumps(constraints.to_dict(hazard)))) == hazard
 
 
 # ---------------------------------------------------------------------------------------------------------------------
@@ -195,7 +201,7 @@ def test_entries_that_vary_late_in_a_log_are_kept():
     observations[:25_000, :, 2] = observations[:25_000, :, 0]
     steps = len(observations) - 1
     store = EpisodeStore.from_episodes(observations[None], np.zeros((1, steps, 2, 1)), np.zeros((1, steps)), None)
-    assert tasks.from_store(store).feature_map("decentralized", store).names == ("obs0", "obs1", "obs2")
+    assert registry.from_store(store).feature_map("decentralized", store).names == ("obs0", "obs1", "obs2")
 
 
 def test_a_view_of_the_state_needs_it(rows):

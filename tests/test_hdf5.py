@@ -13,13 +13,13 @@ import h5py
 import numpy as np
 import pytest
 
-from ringfence import training
-from ringfence.cli import main
-from ringfence.data import arrays
-from ringfence.data.columns import read as read_columns
-from ringfence.data.hdf5 import import_hdf5
-from ringfence.data.store import EpisodeStore
+from ringfence.cli.app import main
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.columns import read as read_columns
+from ringfence.logs.io.hdf5 import import_hdf5
+from ringfence.logs.store import EpisodeStore
+from ringfence.training import loop
+from ringfence.utils import arrays
 from tests import corpus
 
 LENGTHS = (5, 3, 7, 2)
@@ -539,7 +539,7 @@ def test_an_imported_store_is_told_and_trained(tmp_path, capsys):
     assert "3, 2 per agent" in said and "DSRL" in said and "note agents of different sizes" in said
     store = EpisodeStore.load(out)
     assert store.card["cost_limit"] == 5 and store.card["columns"] == PAIR
-    run = training.train("bc", store, out=tmp_path / "runs", changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", store, out=tmp_path / "runs", changes={"steps": 4, "width": 16}, quiet=True)[0]
     assert run.metrics[-1]["step"] == 4 and np.isfinite(list(run.metrics[-1].values())).all()
 
 

@@ -11,14 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import evaluate, recordings
 from ringfence.bench import pack, rows
 from ringfence.bench.cells import statuses
-from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
+from ringfence.evaluation import recordings
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.loading import resolve
+from ringfence.loading.resolve import load
+from ringfence.logs.store import EpisodeStore
 from ringfence.report import board
 from ringfence.report.table import sections
-from ringfence.runs import Run
+from ringfence.training.runs import Run
 from tests import corpus
 from tests.corpus import TASK
 
@@ -47,7 +50,7 @@ def test_json_of_strangers(results, tmp_path, name):
     places = {"bench": folder / "bench.json", "reference": folder / "reference" / TASK / "reference.json"}
     file = places.get(name, run.path / f"{name}.json")
     readers = [lambda: rows(folder), lambda: board.read(folder), lambda: statuses(folder), lambda: sections([run])]
-    readers += [lambda: evaluate.load_job(run)] if name == "config" else []
+    readers += [lambda: resolve.load_job(run)] if name == "config" else []
     raw, refused, count = file.read_bytes(), 0, 0
     for what, content in corpus.broken_json(raw, random.Random(0)):
         file.write_bytes(content)
@@ -66,16 +69,16 @@ def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
     (run.path / "config.json").write_text(json.dumps(told | {"preset": "/../../../../victim"}))
     for record in (0, 1):
         with pytest.raises(UserError, match="no run folder that can be read"):
-            evaluate.evaluate(run, episodes=2, record=record)
+            evaluate(run, episodes=2, record=record)
     assert victim.read_text() == "mine"
 
 
 @pytest.fixture(scope="module")
 def trained_run(tmp_path_factory):
-    from ringfence import training
+    from ringfence.training import loop
 
     told = {"view": "decentralized", "steps": 4, "width": 16}
-    return training.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=told, quiet=True)[0]
+    return loop.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=told, quiet=True)[0]
 
 
 def test_stores_of_strangers(tmp_path):
@@ -106,7 +109,7 @@ def test_opening_a_file_takes_no_more_than_it_holds(tmp_path):
     for what in ("costs huge", "all huge"):
         path = next(p for w, p in corpus.broken_stores(raw, tmp_path) if w == what)
         code = (
-            "import resource, sys\nfrom ringfence.data.store import EpisodeStore\n"
+            "import resource, sys\nfrom ringfence.logs.store import EpisodeStore\n"
             "from ringfence.errors import StoreError\n"
             "before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
             "try:\n    EpisodeStore.load(sys.argv[1])\nexcept StoreError:\n"
@@ -139,7 +142,7 @@ def test_checkpoints_of_strangers(trained_run, tmp_path):
     head = 8 + int.from_bytes(raw[:8], "little")
     for what, content in corpus.broken_bytes(raw, random.Random(2), 120):
         file.write_bytes(content)
-        refused = tried(what, lambda: evaluate.load(run))
+        refused = tried(what, lambda: load(run))
         changed = len(content) < len(raw) or content[head:] != raw[head:]
         assert refused or not changed, what
 
@@ -227,7 +230,7 @@ def test_cards_of_strangers(field, value):
 
 def test_results_of_several_processes_are_all_kept(tmp_path):
     code = (
-        "import sys\nfrom pathlib import Path\nfrom ringfence.runs import Run\nrun = Run(Path(sys.argv[1]))\n"
+        "import sys\nfrom pathlib import Path\nfrom ringfence.training.runs import Run\nrun = Run(Path(sys.argv[1]))\n"
         "for k in range(50):\n    run.add_result(f'{sys.argv[2]}-{k}', {'episodes': 1})"
     )
     started = [subprocess.Popen([sys.executable, "-c", code, str(tmp_path), str(k)]) for k in range(4)]
@@ -236,7 +239,7 @@ def test_results_of_several_processes_are_all_kept(tmp_path):
 
 
 def test_what_is_no_regular_file_is_not_replaced(tmp_path):
-    from ringfence.files import whole
+    from ringfence.utils.files import whole
 
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "folder").mkdir()
@@ -262,24 +265,26 @@ NUMBERS = (None, "x", 2.5, float("nan"), -1, True, {}, 10**30)
 @pytest.mark.parametrize("value", NUMBERS, ids=repr)
 def test_numbers_of_strangers(trained_run, value, tmp_path):
     """None, floats, words and what no machine can count, where a whole number belongs."""
-    from ringfence import Controller, play, tasks, training
+    from ringfence import Controller, play
     from ringfence.bench import make_grid
-    from ringfence.data.make import make
+    from ringfence.datasets import registry
+    from ringfence.datasets.make import make
+    from ringfence.training import loop
 
     store = corpus.small_store()
     for attempt in (
-        lambda: evaluate.evaluate(trained_run, episodes=value),
-        lambda: evaluate.evaluate(trained_run, record=value),
-        lambda: evaluate.load(value),
+        lambda: evaluate(trained_run, episodes=value),
+        lambda: evaluate(trained_run, record=value),
+        lambda: load(value),
         lambda: Controller(trained_run, seed=value),
         lambda: Controller(trained_run, agents=value or -1),
         lambda: play(trained_run, object, episodes=value),
-        lambda: training.train("bc", store, out=tmp_path, seeds=value),
-        lambda: training.train("bc", store, out=tmp_path, seeds=(value,)),
-        lambda: training.train("bc", store, out=tmp_path, changes={"batch": value}),
-        lambda: training.train("bc", store, out=tmp_path, changes={"steps": value}),
-        lambda: make(tasks.get("simple_spread-random"), value if value is not None else 0),
-        lambda: make(tasks.get("simple_spread-random"), 25, value),
+        lambda: loop.train("bc", store, out=tmp_path, seeds=value),
+        lambda: loop.train("bc", store, out=tmp_path, seeds=(value,)),
+        lambda: loop.train("bc", store, out=tmp_path, changes={"batch": value}),
+        lambda: loop.train("bc", store, out=tmp_path, changes={"steps": value}),
+        lambda: make(registry.get("simple_spread-random"), value if value is not None else 0),
+        lambda: make(registry.get("simple_spread-random"), 25, value),
         lambda: make_grid("guards", tmp_path, seeds=value),
     ):
         assert tried(f"{value!r}", attempt), attempt.__code__.co_names
@@ -289,7 +294,7 @@ def test_numbers_of_strangers(trained_run, value, tmp_path):
 @pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"PYTHONIOENCODING": "cp1252"}, {"HOME": ""}])
 def test_terminals_of_few_letters_and_users_without_a_home(environment):
     told = {k: v for k, v in os.environ.items() if k not in ("HOME", "RINGFENCE_HOME", "XDG_CACHE_HOME")}
-    code = "from ringfence.cli import main; main(['tasks'])"
+    code = "from ringfence.cli.app import main; main(['tasks'])"
     done = subprocess.run([sys.executable, "-c", code], env={**told, **environment}, capture_output=True)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
 
@@ -297,7 +302,8 @@ def test_terminals_of_few_letters_and_users_without_a_home(environment):
 def test_ctrl_c_is_not_swallowed():
     """One that falls into a destructor, where Python prints and forgets it, ends the work at its next step."""
     code = (
-        "import os, signal, time\nfrom ringfence import interrupts\nfrom ringfence.progress import Progress\n"
+        "import os, signal, time\nfrom ringfence.utils import interrupts\n"
+        "from ringfence.utils.progress import Progress\n"
         "class Last:\n    def __del__(self):\n        os.kill(os.getpid(), signal.SIGINT)\n        time.sleep(0.01)\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background would ignore it
         "interrupts.listen()\nx = Last()\ndel x\n"

@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence import cli, hazards, judging, training, worlds
-from ringfence.data.store import EpisodeStore
+from ringfence.cli import app
 from ringfence.errors import UserError
-from ringfence.judging.logs import Logs
-from ringfence.judging.worth import worth
+from ringfence.evaluation import ope
+from ringfence.evaluation.ope.fqe import worth
+from ringfence.evaluation.ope.logs import Logs
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
+from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 
 QUICK = dict(states=100, transitions=400, updates=20, members=2, episodes=8, steps=5)
@@ -28,7 +31,7 @@ def logs():
     costs = (x[:, 1:, :, 0] > 0.5).any(-1)
     return EpisodeStore.from_episodes(
         np.concatenate([x, x**2], -1), actions, actions[..., 0], costs.astype(float),
-        card={"task": "line", "hazard": hazards.CostColumn(), "observation_names": ["own.x", "own.square"]},
+        card={"task": "line", "hazard": constraints.CostColumn(), "observation_names": ["own.x", "own.square"]},
     )  # fmt: skip
 
 
@@ -40,7 +43,7 @@ def world(logs):
 @pytest.fixture(scope="module")
 def run(logs, tmp_path_factory):
     told = {"view": "pruned", "steps": 4, "width": 16}
-    return training.train("bc", logs, out=tmp_path_factory.mktemp("judged"), changes=told, quiet=True)[0]
+    return loop.train("bc", logs, out=tmp_path_factory.mktemp("judged"), changes=told, quiet=True)[0]
 
 
 @pytest.mark.parametrize("action", [0.6, -0.4])
@@ -70,7 +73,7 @@ def test_a_judgement_says_what_the_policy_does(run, logs, world):
     assert told["not_surely_safe"] >= told["foreseen_unsafe"]
     again = ringfence.judge(run, other, judge_world=beside, guard="shield", world=guarded, shield=1, **QUICK)
     assert again == told
-    assert any("the guard steps in" in line for line in judging.words(told))
+    assert any("the guard steps in" in line for line in ope.words(told))
 
 
 def test_others_logs_and_worlds_are_refused(run, logs, world):
@@ -88,10 +91,10 @@ def test_pages_of_logs_and_of_policies_open_anywhere(run, logs, world, tmp_path,
     monkeypatch.setattr(worlds, "fit", lambda *_, **__: world)
     file = logs.save(tmp_path / "line.h5")
     few = ["--states", "100", "--transitions", "400", "--updates", "20"]
-    cli.main(["judge", str(run.path), str(file), *few, "--report", str(tmp_path / "judge.html")])
+    app.main(["judge", str(run.path), str(file), *few, "--report", str(tmp_path / "judge.html")])
     said = capsys.readouterr().out
     assert "that it was trained on" in said and "danger is foreseen within 3 steps" in said
-    cli.main(["fit", str(file), "--report", str(tmp_path / "fit.html")])
+    app.main(["fit", str(file), "--report", str(tmp_path / "fit.html")])
     for name in ("judge", "fit"):
         page = (tmp_path / f"{name}.html").read_text()
         assert "What a margin means" in page and "http" not in page and "mathdefault" not in page

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import normalise
 from ringfence.envs import SimpleSpread
-from ringfence.windows import WindowData, at
+from ringfence.logs.windows import WindowData, at
+from ringfence.problem import normalise
 
 
 @pytest.fixture(scope="module", params=[0, 2], ids=["present", "history"])

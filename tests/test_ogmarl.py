@@ -8,12 +8,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ringfence import evaluate, hazards, tasks, training
-from ringfence.data import EpisodeStore, ogmarl
-from ringfence.data.audit import audit
-from ringfence.data.ogmarl import import_madiff, import_vault
+from ringfence.datasets import registry
+from ringfence.datasets.audit import audit
+from ringfence.datasets.importers import ogmarl
+from ringfence.datasets.importers.ogmarl import import_madiff, import_vault
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import StoreError, UserError
+from ringfence.evaluation import protocol
+from ringfence.loading.resolve import load
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
+from ringfence.training import loop
 
 TASKS = {"halfcheetah_2x3": "2x3", "ant_2x4": "2x4", "ant_4x2": "4x2"}
 
@@ -145,11 +150,11 @@ def test_a_recording_can_be_read_under_another_limit(tmp_path):
     log = recorded("2x3")
     vault = write_vault(tmp_path, log)
     store = import_vault(vault, "halfcheetah_2x3", "quantile")
-    assert tasks.from_store(store) == tasks.get("halfcheetah_2x3-good-quantile") and store.hazard.limit == 7.903
+    assert registry.from_store(store) == registry.get("halfcheetah_2x3-good-quantile") and store.hazard.limit == 7.903
     assert store.card["protocol"] == "quantile" and not store.costs.any()
     slow = import_vault(vault, "halfcheetah_2x3", 0.5)
     np.testing.assert_array_equal(slow.costs, log["speed"] > 0.5)
-    task = tasks.from_store(slow)
+    task = registry.from_store(slow)
     assert task.name == "halfcheetah_2x3-good-below-0.5" and task.env.limit == 0.5 and slow.card["protocol"] == "own"
     with pytest.raises(UserError, match="no quantile limit for 'halfcheetah_2x3-imported'; name the tier with --tier"):
         import_vault(vault.rename(tmp_path / "mine"), "halfcheetah_2x3", "quantile")
@@ -175,23 +180,23 @@ def test_data_that_is_not_what_its_name_says_is_refused(tmp_path):
     store = import_vault(write_vault(tmp_path, recorded("2x3")), "halfcheetah_2x3")
     named = lambda **card: replace(store, card={**store.card, **card})  # noqa: E731
     with pytest.raises(UserError, match="called 'halfcheetah_2x3-good', whose danger is .*3.227.* but defines .*1.0"):
-        tasks.from_store(named(hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vx"]}))
-    wide = hazards.to_dict(replace(store.hazard, safe_margin=1.0))  # the same danger
-    assert tasks.from_store(named(hazard=wide)).hazard.safe_margin == 1.0
-    bare = tasks.from_store(named(hazard={"kind": "CostColumn"}))
-    assert bare == tasks.get("halfcheetah_2x3-good")
+        registry.from_store(named(hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vx"]}))
+    wide = constraints.to_dict(replace(store.hazard, safe_margin=1.0))  # the same danger
+    assert registry.from_store(named(hazard=wide)).hazard.safe_margin == 1.0
+    bare = registry.from_store(named(hazard={"kind": "CostColumn"}))
+    assert bare == registry.get("halfcheetah_2x3-good")
     shifted = np.concatenate([np.zeros((len(store.state), 1), np.float32), store.state], 1)
     with pytest.raises(StoreError, match="has 18 state entries, its simulator 17; bring it into that layout"):
-        tasks.from_store(replace(store, state=shifted, card={**store.card, "state_names": None}))
+        registry.from_store(replace(store, state=shifted, card={**store.card, "state_names": None}))
     names = list(store.card["state_names"])
     names[:2] = names[1::-1]
     with pytest.raises(StoreError, match="its state entry 0 is 'torso.pitch', of its simulator 'torso.z'"):
-        tasks.from_store(named(state_names=names))
+        registry.from_store(named(state_names=names))
     report = audit(named(state_names=names))
     assert report.warnings[0].startswith("Nothing can be trained on this: The data is called")
     # danger that the robot's simulator does not count: data alone
     own = named(task="halfcheetah_2x3-mine", hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vz"]})
-    task = tasks.from_store(own)
+    task = registry.from_store(own)
     assert task.env is None and task.cost_limit == 25.0 and task.presets == ("mujoco",)
 
 
@@ -200,19 +205,19 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     vault = write_vault(tmp_path, recorded("2x3"))
     vault.rename(tmp_path / "replay")
     store = import_vault(tmp_path / "replay", "halfcheetah_2x3")
-    task = tasks.from_store(store)
+    task = registry.from_store(store)
     assert import_vault(tmp_path / "replay", "halfcheetah_2x3", tier="mine").card["task"] == "halfcheetah_2x3-mine"
     assert task.name == "halfcheetah_2x3-replay" and task.env == SafeMuJoCo("2x3", 3.227)
     assert (task.cost_limit, task.return_max, task.presets) == (25.0, 9132.25, ("mujoco",))
     small = {"steps": 2, "batch": 4, "width": 8}
-    (run,) = training.train("bc", store, out=tmp_path / "runs", changes=small, quiet=True)
-    job, policy = evaluate.load(run)
+    (run,) = loop.train("bc", store, out=tmp_path / "runs", changes=small, quiet=True)
+    job, policy = load(run)
     assert job.task.env.limit == 3.227
-    played, _ = evaluate.evaluate_policy(policy, replace(job.task, env=SafeMuJoCo("2x3", 3.227, 5)), 1, "test", 0)
+    played, _ = protocol.evaluate_policy(policy, replace(job.task, env=SafeMuJoCo("2x3", 3.227, 5)), 1, "test", 0)
     assert played["task"] == "halfcheetah_2x3-replay" and np.isfinite(played["return_norm"])
     # a store of that name without the robot's states is anybody's own data
     own = replace(store, state=None, card={**store.card, "state_names": []})
-    assert tasks.from_store(own).env is None
+    assert registry.from_store(own).env is None
 
 
 def test_a_tier_is_named_by_its_own_folder_alone(tmp_path, monkeypatch):
@@ -304,7 +309,7 @@ def test_madiffs_ant_says_what_it_lacks(tmp_path):
     assert store.lengths.tolist() == [19, 19, 19] and "falls are not marked" in told
     vx = log["rewards"].mean(1) - 1.0 + 0.5 * (log["actions"] ** 2).sum((1, 2))
     np.testing.assert_array_equal(store.costs, (abs(vx) > 2.418)[~log["last"]])
-    task = tasks.from_store(store)
+    task = registry.from_store(store)
     assert task.env is None and (task.cost_limit, task.presets) == (25.0, ("mujoco",))
     assert store.hazard.features == ("torso.vx",) and store.card["task"] == "ant_4x2-medium-observations"
 

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import hazards, tasks
-from ringfence.cli import main
-from ringfence.data.omar import import_omar
-from ringfence.data.store import EpisodeStore
+from ringfence.cli.app import main
+from ringfence.datasets import registry
+from ringfence.datasets.importers.omar import import_omar
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
 
 
 def write(folder, played, dtype=np.float64, following=True, extra=0):
@@ -59,8 +60,8 @@ def test_import_equals_the_episodes(tmp_path, few, dtype):
     assert store.costs.any() and not store.terminated.any()
     assert store.card["task"] == "simple_spread-medium-replay"
     assert store.card["provenance"].startswith("imported from OMAR arrays") and store.card["warnings"] == []
-    assert store.hazard == hazards.Separation()
-    assert tasks.from_store(store).name == "simple_spread-medium-replay"
+    assert store.hazard == constraints.Separation()
+    assert registry.from_store(store).name == "simple_spread-medium-replay"
 
 
 def test_five_agents_and_an_unfinished_episode(tmp_path):
@@ -82,10 +83,10 @@ def test_five_agents_and_an_unfinished_episode(tmp_path):
     assert store.card["task"] == "simple_spread-imported"  # the shipped tasks have three agents
     with pytest.raises(StoreError, match="5 agents, the task 'simple_spread-expert' has 3"):
         import_omar(tmp_path / "expert", task="simple_spread-expert")
-    task = tasks.from_store(store)
+    task = registry.from_store(store)
     for view in ("pruned", "decentralized"):  # the hazard finds its features by name
         names = task.feature_map(view, store).names
-        assert hazards.bind(task.hazard, names, 5).has_formula
+        assert constraints.bind(task.hazard, names, 5).has_formula
 
 
 def test_without_next_obs_the_last_steps_are_dropped(tmp_path, few):
@@ -119,7 +120,7 @@ def test_another_danger_from_the_command_line_needs_a_name(tmp_path, few, capsys
     assert "give the data a name with --task" in capsys.readouterr().err and not out.exists()
     main([*arguments, "--task", "mine"])
     wide = EpisodeStore.load(out)
-    assert wide.card["task"] == "mine" and wide.hazard == hazards.Separation(0.5, 0.125)
+    assert wide.card["task"] == "mine" and wide.hazard == constraints.Separation(0.5, 0.125)
     assert wide.costs.sum() > import_omar(folder).costs.sum()
 
 
@@ -219,13 +220,13 @@ def test_actions_are_clipped_only_against_rounding(tmp_path, few):
 
 def test_other_hazards_and_bad_values(tmp_path, few):
     folder = write(tmp_path / "d", few)
-    wide = import_omar(folder, hazard=hazards.Separation(0.6))
-    assert wide.costs.sum() > few["costs"].sum() and wide.hazard == hazards.Separation(0.6)
+    wide = import_omar(folder, hazard=constraints.Separation(0.6))
+    assert wide.costs.sum() > few["costs"].sum() and wide.hazard == constraints.Separation(0.6)
     with pytest.raises(StoreError, match="hold no costs"):
-        import_omar(folder, hazard=hazards.CostColumn())
+        import_omar(folder, hazard=constraints.CostColumn())
     with pytest.raises(UserError, match="SpeedLimit reads the feature 'torso.vx'"):
-        import_omar(folder, hazard=hazards.SpeedLimit(1.0))
-    assert import_omar(folder, hazard=hazards.SpeedLimit(0.5, ("own.vx", "own.vy"))).costs.any()
+        import_omar(folder, hazard=constraints.SpeedLimit(1.0))
+    assert import_omar(folder, hazard=constraints.SpeedLimit(0.5, ("own.vx", "own.vy"))).costs.any()
     change(folder / "rews_0.npy", lambda x: np.where(np.arange(len(x)) == 7, np.nan, x))
     with pytest.raises(StoreError, match=r"rewards\[7, 0\] is nan"):
         import_omar(folder)

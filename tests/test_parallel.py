@@ -9,11 +9,14 @@ import shutil
 import numpy as np
 import pytest
 
-from ringfence import cli, evaluate, guard, play, training
+from ringfence import guard, play
+from ringfence.cli import app
 from ringfence.envs import SimpleSpread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
-from ringfence.runs import Run
+from ringfence.loading import resolve
+from ringfence.training import loop
+from ringfence.training.runs import Run
 
 TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -23,7 +26,7 @@ def run(small_store, tmp_path_factory):
     """Cloning of data that nobody here simulates: another name, costs instead of a formula."""
     card = {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}, "cost_limit": 3}
     own = dataclasses.replace(small_store, card=card)
-    return training.train("bc", own, out=tmp_path_factory.mktemp("own"), changes=TINY, quiet=True)[0]
+    return loop.train("bc", own, out=tmp_path_factory.mktemp("own"), changes=TINY, quiet=True)[0]
 
 
 class Watched(SimpleSpreadParallel):
@@ -82,7 +85,7 @@ class Own(SimpleSpreadParallel):
 
 
 def test_the_hazard_counts_where_the_simulator_does_not(own_store, tmp_path):
-    run = training.train("bc", own_store, out=tmp_path, changes=TINY, quiet=True)[0]
+    run = loop.train("bc", own_store, out=tmp_path, changes=TINY, quiet=True)[0]
     counted = []
 
     class Counted(Own):
@@ -148,7 +151,7 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         play(run, lambda: shared, episodes=2)
     with pytest.raises(UserError, match="episodes=0 must be a whole number from 1"):
         play(run, SimpleSpreadParallel, episodes=0)
-    assert evaluate.load_job(run).task.cost_limit == 3
+    assert resolve.load_job(run).task.cost_limit == 3
 
 
 class Odd(SimpleSpreadParallel):
@@ -198,7 +201,7 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     folder = shutil.copytree(run.path, tmp_path / "mine" / "bc" / "seed-0")
     monkeypatch.chdir(tmp_path)
     for split in ("test", "validation"):
-        cli.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
+        app.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
     assert "violations/" in capsys.readouterr().out
     told = Run(folder).results
     assert [*told] == ["default", "default@validation"]
@@ -206,7 +209,7 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     again = play(folder, SimpleSpreadParallel, episodes=2)
     assert again["per_episode"] == told["default"]["per_episode"]
     assert told["default@validation"]["per_episode"] != told["default"]["per_episode"]
-    cli.main(["report", str(folder), "--out", "page.html"])
+    app.main(["report", str(folder), "--out", "page.html"])
     assert f"play {folder} --env theirs.py:Theirs --episodes 2" in html.unescape((tmp_path / "page.html").read_text())
     for env, said in (
         ("theirs.py", "names no simulator"),
@@ -215,10 +218,10 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
         ("nothing_like_it:Mine", "cannot be imported"),
     ):
         with pytest.raises(SystemExit):
-            cli.main(["play", str(folder), "--env", env])
+            app.main(["play", str(folder), "--env", env])
         assert said in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        cli.main(["eval", str(folder)])
+        app.main(["eval", str(folder)])
     assert "--env FILE.py:NAME" in capsys.readouterr().err
 
 

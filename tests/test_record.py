@@ -8,10 +8,10 @@ from gymnasium.spaces import Box, Discrete
 from pettingzoo import ParallelEnv
 
 import ringfence
-from ringfence.data.store import EpisodeStore
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import StoreError, UserError
-from ringfence.progress import Progress
+from ringfence.logs.store import EpisodeStore
+from ringfence.utils.progress import Progress
 
 
 class Drift(ParallelEnv):
@@ -78,7 +78,7 @@ def test_what_is_told_is_what_is_kept():
 
 
 def test_an_interrupted_recording_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr("ringfence.recorder.EACH", 4)
+    monkeypatch.setattr("ringfence.logs.collect.EACH", 4)
     whole = ringfence.record(Drift, None, episodes=11, seed=1)
     advance, count = Progress.advance, []
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ringfence import stats
 from ringfence.algos import ICBF
 from ringfence.errors import UserError
+from ringfence.evaluation import statistics
 from ringfence.report import animation, build_report
 from ringfence.report import page as page_of
 from ringfence.report.table import sections
-from ringfence.runs import Run
+from ringfence.training.runs import Run
 
 TASK = "simple_spread-medium"
 CONSTANTS = {"return_min": 159.8, "return_max": 516.8, "cost_limit": 1.0, "cost_offset": 0.0}
@@ -32,7 +32,7 @@ def result(returns, costs, unsafe=None, **more) -> dict:
         "return_interval": [returns.min(), returns.max()],
         "cost_mean": costs.mean(),
         "cost_interval": [costs.min(), costs.max()],
-        "cost_cvar10": stats.cvar(costs),
+        "cost_cvar10": statistics.cvar(costs),
         "violation_rate": float((costs > 0).mean()),
         "unsafe_starts": int(unsafe.sum()),
         "avoidable_cost": fine.mean(),
@@ -178,7 +178,7 @@ def test_seeds_are_pooled(runs):
     assert high - low > abs(returns[0].mean() - returns[1].mean())  # two seeds know little of a third
     assert plain.cost == pytest.approx(costs.mean()) and plain.avoidable == 0.0
     assert plain.violations == int(costs.sum())
-    assert plain.violation_upper == stats.upper_bound(int((costs > 0).any(0).sum()), 20)  # resets, not episodes
+    assert plain.violation_upper == statistics.upper_bound(int((costs > 0).any(0).sum()), 20)  # resets, not episodes
     assert plain.returns_norm == pytest.approx((returns.mean() - 159.8) / 357.0)
     assert chosen.violation_upper == pytest.approx(1 - 0.05 ** (1 / 20)) and chosen.plan_ms == 7.25
     assert chosen.safe and not bc.safe

@@ -15,15 +15,16 @@ import numpy as np
 import pytest
 
 import ringfence.envs.mujoco as simulator
-from ringfence import evaluate, features, hazards, tasks
 from ringfence.bench import unpack
-from ringfence.data import matd3, robots
-from ringfence.data.make import make
-from ringfence.data.matd3 import MATD3Config
-from ringfence.data.rules import ARRAYS
+from ringfence.datasets import matd3, registry, robots
+from ringfence.datasets.make import make
+from ringfence.datasets.matd3 import MATD3Config
 from ringfence.envs import SafeMuJoCo
 from ringfence.errors import UserError
-from ringfence.policies import Constant
+from ringfence.evaluation import protocol, rollout
+from ringfence.logs.schema import ARRAYS
+from ringfence.problem import constraints, features
+from ringfence.proposals.base import Constant
 from ringfence.report import video
 from ringfence.report.video import animate
 from ringfence.types import PolicyStep
@@ -52,8 +53,8 @@ def test_views_show_every_agent_its_own_joints_first(parts):
     own = view_of(env, "decentralized")
     assert own(seen, None).shape == seen.shape and len(set(own.names)) == len(own.names)
     assert view_of(env, "centralized")(None, state).shape == (5, env.n_agents, len(env.state_names))
-    limit = hazards.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",))
-    clear = hazards.bind(limit, view.names, env.n_agents).clearance(x)
+    limit = constraints.SpeedLimit(env.limit, ("torso.vx", "torso.vy") if env.ant else ("torso.vx",))
+    clear = constraints.bind(limit, view.names, env.n_agents).clearance(x)
     assert clear.shape == (5, env.n_agents) and np.allclose(clear, clear[:, :1])
 
 
@@ -113,25 +114,25 @@ class Wait(Push):
 def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     monkeypatch.setattr(simulator, "HEALTHY_Z", (0.6, 1.0))  # it soon comes to rest below
     env = SafeMuJoCo("4x2", episode_length=150)
-    played = evaluate.rollout(Push(), env, 6)
+    played = rollout.rollout(Push(), env, 6)
     assert played["rewards"].shape == played["costs"].shape == (6, 150)
     assert played["states"].shape == (6, 151, len(env.state_names))
-    again = evaluate.rollout(Push(), env, 3)
+    again = rollout.rollout(Push(), env, 3)
     np.testing.assert_array_equal(again["rewards"], played["rewards"][:3])  # a reset is the same in any batch
-    other = evaluate.rollout(Push(), env, 3, split="validation")
+    other = rollout.rollout(Push(), env, 3, split="validation")
     assert not np.array_equal(other["states"][:, 0], played["states"][:3, 0])
     ends = [int(np.flatnonzero(r)[-1]) + 1 for r in played["rewards"]]
     assert max(ends) < 150 and len(set(ends)) > 1
     assert played["steps"].tolist() == ends and played["terminated"].all()
-    told = evaluate.summarise(played, tasks.get("ant_4x2-good"), np.zeros(6, bool))
+    told = protocol.summarise(played, registry.get("ant_4x2-good"), np.zeros(6, bool))
     assert told["termination_rate"] == 1 and told["steps_mean"] == np.mean(ends)
     assert told["cost_rate"] == pytest.approx(played["costs"].sum() / sum(ends))
     for end, rewards, states in zip(ends, played["rewards"], played["states"]):
         assert states[end, 0] < 0.6 and (states[:end, 0] >= 0.6).all()
         assert (rewards[end:] == 0).all() and (states[end:] == states[end]).all()
-    task = tasks.get("halfcheetah_2x3-poor")
+    task = registry.get("halfcheetah_2x3-poor")
     idle = Constant(task.spec(task.feature_map("pruned")))
-    cheetah = evaluate.rollout(idle, replace(task.env, episode_length=5), 2)
+    cheetah = rollout.rollout(idle, replace(task.env, episode_length=5), 2)
     assert cheetah["steps"].tolist() == [5, 5] and not cheetah["terminated"].any()
 
 
@@ -147,11 +148,11 @@ class Outside:
 
 
 def test_any_object_can_play_a_robot():
-    task = tasks.get("halfcheetah_2x3-poor")
-    told, _ = evaluate.evaluate_policy(Outside(), replace(task, env=replace(task.env, episode_length=4)), 2)
+    task = registry.get("halfcheetah_2x3-poor")
+    told, _ = protocol.evaluate_policy(Outside(), replace(task, env=replace(task.env, episode_length=4)), 2)
     assert np.isfinite(told["return_mean"]) and told["steps_mean"] == 4
     with pytest.raises(UserError, match="Outside is no pytree; make it an equinox.Module"):
-        evaluate.evaluate_policy(Outside(), tasks.get("simple_spread-expert"), 2)
+        protocol.evaluate_policy(Outside(), registry.get("simple_spread-expert"), 2)
 
 
 def test_behaviour_learning_is_reproducible():
@@ -210,9 +211,9 @@ def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
         robots.pack(env, [tmp_path / "none"], tmp_path)
 
 
-@pytest.mark.parametrize("name", [t.name for t in tasks.TASKS.values() if t.protocol])
+@pytest.mark.parametrize("name", [t.name for t in registry.TASKS.values() if t.protocol])
 def test_tasks_and_their_limits(name):
-    task = tasks.get(name)
+    task = registry.get(name)
     policies = robots.shipped_policies(task.env, task.tier)
     assert len(policies) == robots.MIXED and policies[0].info["level"] == task.tier
     earned = np.mean([p["return"] for p in policies[0].info["policies"]])
@@ -229,7 +230,7 @@ def test_tasks_and_their_limits(name):
 
 def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
-    task = tasks.get("halfcheetah_2x3-poor-quantile")
+    task = registry.get("halfcheetah_2x3-poor-quantile")
     task = replace(task, env=replace(task.env, episode_length=60))
     store, path = make(task, 300)
     again, _ = make(task, 300, fresh=True)
@@ -256,7 +257,7 @@ def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
 def test_another_limit_counts_anew_what_is_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
     names = "halfcheetah_2x3-good", "halfcheetah_2x3-good-quantile"
-    native, quantile = (replace(t, env=replace(t.env, episode_length=60)) for t in map(tasks.get, names))
+    native, quantile = (replace(t, env=replace(t.env, episode_length=60)) for t in map(registry.get, names))
     make(native, 300)
     with monkeypatch.context() as m:
         m.setattr(robots, "collect", lambda *_: pytest.fail("it was simulated again"))
@@ -289,7 +290,7 @@ def test_an_episode_becomes_a_picture_or_a_reason(tmp_path):
     from PIL import Image
 
     env = SafeMuJoCo("2x4", episode_length=10)
-    played = evaluate.rollout(Wait(), env, 1)
+    played = rollout.rollout(Wait(), env, 1)
     states, costs = played["states"][0], played["costs"][0]
     fallen = np.concatenate([states, np.repeat(states[-1:], 30, 0)])  # the film ends there
     try:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import ringfence
-from ringfence.tasks import TASKS
+from ringfence.datasets.registry import TASKS
 
 ROOT = Path(__file__).resolve().parent.parent
 TOOLS = ROOT / "docs" / "tools"
@@ -89,9 +89,9 @@ def test_pages_of_the_root_lead_into_the_site():
 
 def test_links_to_what_the_site_does_not_hold_become_names(tmp_path):
     tools = load("pages")
-    (copy := tmp_path / "PAGE.md").write_text("[the store](src/ringfence/data/store.py) and [x](docs/data.md#rules)")
+    (copy := tmp_path / "PAGE.md").write_text("[the store](src/ringfence/logs/store.py) and [x](docs/data.md#rules)")
     tools.ROOT = tmp_path
-    assert tools.from_root(copy) == "the store (`src/ringfence/data/store.py`) and [x](data.md#rules)"
+    assert tools.from_root(copy) == "the store (`src/ringfence/logs/store.py`) and [x](data.md#rules)"
 
 
 BUILT = """<html><head><link rel="stylesheet" href="{style}"></head><body><h1 id="top">x</h1>{body}</body></html>"""

@@ -5,18 +5,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import hazards, tasks, training, worlds
-from ringfence.data.make import make
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
 from ringfence.envs import SimpleSpread, SpreadAlike
 from ringfence.envs.pettingzoo import SpreadAlikeParallel
 from ringfence.envs.simple_spread import SpreadState
 from ringfence.envs.spread_alike import SIGHT
 from ringfence.errors import UserError
-from ringfence.evaluate import evaluate
-from ringfence.parallel import play
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.play import play
+from ringfence.problem import constraints
+from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 
-TASK = tasks.get("spread_alike-expert")
+TASK = registry.get("spread_alike-expert")
 
 
 @pytest.fixture(scope="module")
@@ -69,20 +71,20 @@ def test_every_team_sees_alike_in_a_room_as_crowded(agents):
 
 
 def test_the_same_play_told_otherwise(logs):
-    plain = make(tasks.get("simple_spread-expert"), 2000)[0]
+    plain = make(registry.get("simple_spread-expert"), 2000)[0]
     np.testing.assert_array_equal(logs.state, plain.state)
     np.testing.assert_array_equal(logs.actions, plain.actions)
     np.testing.assert_array_equal(logs.costs.max(1), plain.costs)
     assert logs.costs.any() and logs.card["agents"] == ["agent0", "agent1", "agent2"]
     each = logs.apart()
-    hazard = hazards.bind(TASK.hazard, TASK.feature_map("pruned").names, 1)
+    hazard = constraints.bind(TASK.hazard, TASK.feature_map("pruned").names, 1)
     ends = np.arange(1, 26) + 26 * np.arange(each.episodes)[:, None]  # rows that steps lead to
     unsafe = hazard.labels(jnp.asarray(each.observations[ends.ravel()]))[0]
     np.testing.assert_array_equal(np.asarray(unsafe).reshape(-1), each.costs > 0)  # what is seen tells what is paid
 
 
 def test_one_checkpoint_plays_teams_of_another_size(logs, tmp_path):
-    run = training.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.map.solitary
     for agents in (2, 6):
@@ -96,5 +98,5 @@ def test_what_cannot_be_is_refused():
     with pytest.raises(UserError, match="n_agents=0 must be at least 1"):
         SpreadAlike(n_agents=0)
     with pytest.raises(UserError, match="played by 3, so agents=4 have no data"):
-        make(tasks.of_team(TASK, 4), 100, fresh=True)
+        make(registry.of_team(TASK, 4), 100, fresh=True)
     assert SimpleSpread().half_width == SpreadAlike().half_width == 1.0

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ringfence.data import arrays
-from ringfence.data.rules import ARRAYS
-from ringfence.data.store import EpisodeStore
 from ringfence.errors import StoreError, UserError
-from ringfence.hazards import CostColumn
-from ringfence.scores import return_scores
-from ringfence.windows import NOT_ARRIVED, WindowData, at, returns_to_go
+from ringfence.logs.schema import ARRAYS
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import NOT_ARRIVED, WindowData, at, returns_to_go
+from ringfence.problem.constraints import CostColumn
+from ringfence.proposals.conditions import return_scores
+from ringfence.utils import arrays
 
 
 def logs(lengths=(3, 1, 4), agents=2, seed=0, **card) -> EpisodeStore:
@@ -444,7 +444,7 @@ def test_a_file_larger_than_memory_is_refused_before_it_is_read(tmp_path, small_
 
 
 def test_places_far_from_the_origin_are_warned_of(small_store):
-    from ringfence.data.audit import audit
+    from ringfence.datasets.audit import audit
 
     def coarse(store):
         return [w for w in audit(store).warnings if "subtract an origin" in w]
@@ -456,7 +456,7 @@ def test_places_far_from_the_origin_are_warned_of(small_store):
 
 def test_entries_that_vary_for_one_agent_alone_are_no_constants(small_store):
     """100 000 rows of all agents and more are thinned out by rows."""
-    from ringfence.data.audit import audit
+    from ringfence.datasets.audit import audit
 
     def constant(store):
         return [w for w in audit(store).warnings if "never vary" in w]

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence import cli
-from ringfence.data.store import EpisodeStore
-from ringfence.data.tables import from_layout, from_table, observe
-from ringfence.data.tracks import cut, nearest, resample, teams
+from ringfence.cli import app
 from ringfence.errors import UserError
-from ringfence.hazards import CostColumn, Separation
+from ringfence.logs.io.table import from_layout, from_table, observe
+from ringfence.logs.io.tracks import cut, nearest, resample, teams
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem.constraints import CostColumn, Separation
 from tests.quick import QUICK_WORLD
 
 NAMES = dict(time="t", agent="id", episode="run", state=["x", "y", "vx", "vy"], action=["ax", "ay"], cost="hit")
@@ -330,15 +330,15 @@ def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
     import pandas as pd
 
     pd.DataFrame(fleet()).to_csv(tmp_path / "fleet.csv", index=False)
-    cli.main(
+    app.main(
         ["data", "import-table", str(tmp_path / "fleet.csv"), "--time", "t", "--agent", "id", "--episode", "run"]
         + ["--state", "x", "y", "vx", "vy", "--action", "ax", "ay", "--cost", "hit", "--out", str(tmp_path / "f.h5")]
     )
     assert "6 episodes, 66 steps" in capsys.readouterr().out
     assert EpisodeStore.load(tmp_path / "f.h5").content == from_table(fleet(), **NAMES).content
-    cli.main(["data", "info", str(tmp_path / "f.h5")])
+    app.main(["data", "info", str(tmp_path / "f.h5")])
     with pytest.raises(SystemExit):
-        cli.main(["data", "import-table", str(tmp_path / "fleet.csv"), "--state", "x", "--out", str(tmp_path / "g.h5")])
+        app.main(["data", "import-table", str(tmp_path / "fleet.csv"), "--state", "x", "--out", str(tmp_path / "g.h5")])
     assert "column of the table" in capsys.readouterr().err and not (tmp_path / "g.h5").exists()
 
     from tests.test_bags import command, odometry, write
@@ -349,7 +349,7 @@ def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
             logs.append(odometry(f"/robot_{i}/odom", 0.1 * k, x=0.05 * k, y=float(i), twist=(0.5, 0.0, 0.0)))
             logs.append(command(f"/robot_{i}/cmd_vel", 0.1 * k - 0.01, vx=0.5 + 0.001 * k))
     bag = write(tmp_path / "bag", logs)
-    cli.main(
+    app.main(
         ["data", "import-bag", str(bag), "--agents", "/robot_{i}", "--separation", "1.5", "--longest", "20"]
         + ["--out", str(tmp_path / "bag.h5")]
     )

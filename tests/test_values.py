@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import scores
-from ringfence.data.store import EpisodeStore
 from ringfence.envs import SimpleSpread
-from ringfence.hazards import Separation
-from ringfence.windows import WindowData
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import WindowData
+from ringfence.problem.constraints import Separation
+from ringfence.proposals import conditions
 from ringfence.world import values
 
 
@@ -20,7 +20,7 @@ def test_advantages_match_their_definition():
     team, value = rng.normal(size=11), rng.normal(size=14)
     row = np.arange(11) + np.repeat(np.arange(3), lengths)
     last = np.repeat(ends + np.arange(3), lengths)
-    got = scores.advantages(value, team, row, last, horizon, discount)
+    got = conditions.advantages(value, team, row, last, horizon, discount)
     for t in range(11):
         left = last[t] - row[t]
         n = min(horizon - 1, left)
@@ -32,7 +32,7 @@ def test_advantages_match_their_definition():
 
 def test_normal_scores_are_ordered_and_standard():
     x = np.random.default_rng(0).exponential(size=5000)
-    z = scores.normal_scores(x)
+    z = conditions.normal_scores(x)
     assert (np.diff(z[np.argsort(x)]) > 0).all()
     assert abs(z.mean()) < 1e-6 and abs(z.std() - 1) < 0.01
 

@@ -9,12 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import features, hazards, tasks, world, worlds
+from ringfence import world
+from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
-from ringfence.features import FeatureMap
+from ringfence.problem import constraints, features
+from ringfence.problem.features import FeatureMap
+from ringfence.training import worlds
 from ringfence.world import barrier as cbf
-from ringfence.world import card
+from ringfence.world import validate
 from tests.quick import QUICK_WORLD
 
 
@@ -58,13 +61,13 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     arrays = {"features": jnp.asarray(x, jnp.float32), "actions": jnp.zeros((20, 2, 1))}
     arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
     entered = np.array([19])  # the step that ends with a gap below 0
-    found = card._avoidable(Head(), SimpleNamespace(arrays=arrays), entered)
-    assert found["before"] == list(card.BEFORE) and found["rows"] == 7
+    found = validate._avoidable(Head(), SimpleNamespace(arrays=arrays), entered)
+    assert found["before"] == list(validate.BEFORE) and found["rows"] == 7
     assert found["avoided"] == [0, 0, 0, 0, 1, 1, 1]
 
 
 def test_held_out_episodes_are_whole_and_differ_between_seeds(small_store):
-    from ringfence.world.fitting import held_out
+    from ringfence.world.fit import held_out
 
     a, b = held_out(small_store, 0), held_out(small_store, 1)
     assert a.sum() == b.sum() == 4 and (a != b).any()
@@ -98,7 +101,7 @@ def test_names_tell_who_is_who():
         ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"]
     )
     assert "own.x" in [spread.names[d] for d in shape.own]
-    body = cbf.shape_of(tasks.get("ant_4x2-poor").feature_map("pruned"))
+    body = cbf.shape_of(registry.get("ant_4x2-poor").feature_map("pruned"))
     assert body.joint and body.blame == "all" and body.both_ends and not body.pairs
     table = np.zeros((2, 3), int)
     unnamed = FeatureMap("pruned", ("a", "b", "c"), "observations", table, table - 1)
@@ -155,9 +158,9 @@ def test_danger_is_seen_ahead():
 
 def test_conformal_quantiles_cover_what_they_say():
     rng = np.random.default_rng(0)
-    covered = [rng.normal() <= card.conformal(rng.normal(size=99), 0.9) for _ in range(4000)]
+    covered = [rng.normal() <= validate.conformal(rng.normal(size=99), 0.9) for _ in range(4000)]
     assert np.mean(covered) == pytest.approx(0.9, abs=0.02)
-    assert card.conformal(np.arange(5.0), 0.99) == 4.0  # too few to say more
+    assert validate.conformal(np.arange(5.0), 0.99) == 4.0  # too few to say more
 
 
 def test_own_entries_tell_the_rest_where_the_logs_agree(played):
@@ -180,17 +183,17 @@ def test_own_entries_tell_the_rest_where_the_logs_agree(played):
 
 
 def test_a_hazard_keeps_what_it_reads(small_store):
-    card = {**small_store.card, "task": "mine", "observation_names": None, "hazard": hazards.Separation(0.3)}
-    card = {**card, "hazard": hazards.to_dict(card["hazard"])}
+    card = {**small_store.card, "task": "mine", "observation_names": None, "hazard": constraints.Separation(0.3)}
+    card = {**card, "hazard": constraints.to_dict(card["hazard"])}
     own = dataclasses.replace(small_store, card=card)
-    task = tasks.from_store(own)
+    task = registry.from_store(own)
     assert {"agent0.x", "agent2.y"} <= set(task.feature_map("pruned", own).names)
 
 
 def test_costs_per_agent_label_agents(small_store):
     """(T, N) costs: the team's is the largest, and every agent learns from its own."""
     view = SimpleSpread().feature_map("pruned")
-    bound = hazards.bind(hazards.Separation(), view.names, 3)
+    bound = constraints.bind(constraints.Separation(), view.names, 3)
     row = np.arange(small_store.steps) + small_store.episode_of_step + 1
     each = np.asarray(bound.labels(jnp.asarray(view(None, small_store.state[row])))[0])
     own = with_costs(small_store, each)

@@ -7,9 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from ringfence import cli, evaluate, training, worlds, zoo
+from ringfence.cli import app
+from ringfence.deploy import zoo
 from ringfence.errors import UserError
-from ringfence.runs import Run
+from ringfence.loading import run_worlds
+from ringfence.loading.controller import Controller
+from ringfence.loading.resolve import load
+from ringfence.training import loop, worlds
+from ringfence.training.runs import Run
 
 
 @pytest.mark.parametrize("name", zoo.names())
@@ -17,7 +22,7 @@ def test_every_one_is_loaded_with_the_world_that_guards_it(name, tmp_path, monke
     """Nothing is regenerated, fitted or trained for it."""
     monkeypatch.setattr(worlds, "_of_data", lambda *_: pytest.fail("asked for its data"))
     run = zoo.get(name, tmp_path)
-    job, policy = evaluate.load(run, guard="shield")
+    job, policy = load(run, guard="shield")
     assert (job.task.name, job.algorithm.name) == tuple(name.split("/"))
     assert policy.start(2)
     assert run.path == tmp_path / name / "seed-0" and zoo.get(name, tmp_path).path == run.path
@@ -29,7 +34,7 @@ def test_they_are_few_and_small():
 
 
 def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
-    run = training.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path / "runs")[0]
+    run = loop.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path / "runs")[0]
     other = dataclasses.replace(small_world, strange=2 * small_world.strange)
     assert len(zoo.put(run, "mine/bc", small_world, small_world, tmp_path)) == 2
     made = zoo.put(run, "mine/bc", other, small_world, tmp_path)
@@ -38,9 +43,9 @@ def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
         patch.setattr(zoo, "FOLDER", tmp_path)
         back = zoo.get("mine/bc", tmp_path / "got")
     seen, state = small_store.observations[0], small_store.state[0]
-    was, now = (evaluate.Controller(r, guard="shield", rows=1, shield=1, world=small_world) for r in (run, back))
+    was, now = (Controller(r, guard="shield", rows=1, shield=1, world=small_world) for r in (run, back))
     np.testing.assert_allclose(now.act(seen, state), was.act(seen, state), atol=0.02)
-    assert worlds.of_run(back).strange == 2 * worlds.for_guard(back).strange
+    assert run_worlds.of_run(back).strange == 2 * run_worlds.for_guard(back).strange
     assert back.checkpoints()[0][0] == 4 and back.config == run.config
 
 
@@ -48,7 +53,7 @@ def test_what_does_not_fit_or_is_not_there_is_refused(tmp_path, capsys):
     with pytest.raises(UserError, match="beyond 65504"):
         zoo.half(np.float32([1e6]), "ema/actor")
     with pytest.raises(SystemExit):
-        cli.main(["get", "crossing-hasty/bd"])
+        app.main(["get", "crossing-hasty/bd"])
     assert "did you mean 'crossing-hasty/bc'" in capsys.readouterr().err
     (tmp_path / "crossing-hasty/bc/seed-0").mkdir(parents=True)
     config = zoo.get("simple_spread-expert/bc", tmp_path).path / "config.json"
@@ -56,5 +61,5 @@ def test_what_does_not_fit_or_is_not_there_is_refused(tmp_path, capsys):
     with pytest.raises(UserError, match="holds another run"):
         zoo.get("crossing-hasty/bc", tmp_path)
     assert not Run(tmp_path / "crossing-hasty/bc/seed-0").checkpoints()
-    cli.main(["get"])
+    app.main(["get"])
     assert capsys.readouterr().out.split() == zoo.names()

@@ -1,4 +1,4 @@
-"""What MkDocs asks while it builds the site: the pages that no file holds. One per task, from `ringfence.tasks` and the
+"""What MkDocs asks while it builds the site: the pages that no file holds. One per task, from the registry and the
 committed results; the Python reference, from docstrings; the changelog and the like, from the repository's root."""
 
 from __future__ import annotations
@@ -10,43 +10,44 @@ from collections import defaultdict
 from pathlib import Path
 
 import ringfence
-from ringfence import hazards
+from ringfence.datasets.registry import TASKS
+from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
-from ringfence.tasks import TASKS, Task
+from ringfence.problem import constraints
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
 
 # --- the Python reference: pages of modules that belong together ---
 REFERENCE = {
-    "Logs": ("ringfence.data.store", "ringfence.data.make", "ringfence.data.audit"),
+    "Logs": ("ringfence.logs.store", "ringfence.datasets.make", "ringfence.datasets.audit"),
     "Importers": (
-        "ringfence.data.tables",
-        "ringfence.data.bags",
-        "ringfence.data.hdf5",
-        "ringfence.data.omar",
-        "ringfence.data.ogmarl",
+        "ringfence.logs.io.table",
+        "ringfence.logs.io.rosbag",
+        "ringfence.logs.io.hdf5",
+        "ringfence.datasets.importers.omar",
+        "ringfence.datasets.importers.ogmarl",
     ),
-    "Danger": ("ringfence.hazards",),
-    "Training": ("ringfence.training", "ringfence.runs"),
+    "Danger": ("ringfence.problem.constraints",),
+    "Training": ("ringfence.training.loop", "ringfence.training.runs"),
     "Playing": (
-        "ringfence.evaluate",
-        "ringfence.parallel",
-        "ringfence.recorder",
-        "ringfence.reference",
-        "ringfence.zoo",
+        "ringfence.evaluation.protocol",
+        "ringfence.evaluation.play",
+        "ringfence.logs.collect",
+        "ringfence.evaluation.reference",
+        "ringfence.deploy.zoo",
     ),
-    "Judging": ("ringfence.judging.judge",),
-    "Export": ("ringfence.export",),
-    "World": ("ringfence.worlds", "ringfence.world"),
+    "Judging": ("ringfence.evaluation.ope.estimate",),
+    "Export": ("ringfence.deploy.export",),
+    "World": ("ringfence.training.worlds", "ringfence.world"),
     "Parts of a World": (
-        "ringfence.world.fitting",
+        "ringfence.world.fit",
         "ringfence.world.dynamics",
         "ringfence.world.values",
         "ringfence.world.barrier",
     ),
-    "Guards": ("ringfence.guards.policy", "ringfence.guards.guard", "ringfence.guards.danger"),
-    "Planners": ("ringfence.policies",),
+    "Guards": ("ringfence.guards.policy", "ringfence.guards.filter", "ringfence.guards.danger"),
+    "Planners": ("ringfence.proposals.planner",),
     "Algorithms": (
         "ringfence.types",
         "ringfence.algos",
@@ -58,15 +59,15 @@ REFERENCE = {
         "ringfence.algos.icbf",
         "ringfence.algos.mpc",
     ),
-    "Tasks": ("ringfence.tasks", "ringfence.features"),
+    "Tasks": ("ringfence.datasets.registry", "ringfence.problem.features"),
     "Simulators": ("ringfence.envs", "ringfence.envs.pettingzoo"),
-    "Statistics": ("ringfence.stats",),
+    "Statistics": ("ringfence.evaluation.statistics",),
     "Benchmark": ("ringfence.bench",),
     "Reports": ("ringfence.report",),
-    "Errors and files": ("ringfence.errors", "ringfence.files"),
+    "Errors and files": ("ringfence.errors", "ringfence.utils.files"),
 }
 # Of an algorithm's module its settings and its values: losses and updates are read in the source.
-VALUES = ("ringfence.algos.", "ringfence.world.fitting")
+VALUES = ("ringfence.algos.", "ringfence.world.fit")
 
 # --- tasks ---
 # Of a simulator's tasks, in words; of another one the first line of its docstring.
@@ -204,11 +205,11 @@ def groups() -> dict[str, list[Task]]:
     return dict(found)
 
 
-def danger(hazard: hazards.Hazard) -> str:
+def danger(hazard: constraints.Hazard) -> str:
     """A hazard in words."""
-    if isinstance(hazard, hazards.SpeedLimit):
+    if isinstance(hazard, constraints.SpeedLimit):
         return f"a speed above {hazard.limit:g} m/s"
-    if isinstance(hazard, hazards.Separation):
+    if isinstance(hazard, constraints.Separation):
         return f"two centres nearer than {hazard.radius:g} m"
     return str(hazard)
 

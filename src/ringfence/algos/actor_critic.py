@@ -11,12 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import normalise
+from ringfence.logs.windows import WindowData, at
 from ringfence.nets import MLP
-from ringfence.optim import Optimiser, fresh
-from ringfence.policies import Direct
+from ringfence.nets.optim import Optimiser, fresh
+from ringfence.problem import normalise
+from ringfence.proposals.base import Direct
 from ringfence.types import Array, Batch, Key, PyTree, Spec
-from ringfence.windows import WindowData, at
 
 
 class Critics(eqx.Module):

@@ -9,17 +9,17 @@ from typing import Literal
 import jax
 import numpy as np
 
-from ringfence import features
 from ringfence.algos import actor_critic as ac
-from ringfence.data.store import EpisodeStore
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import WindowData
 from ringfence.nets import MLP
-from ringfence.normalise import Normaliser
-from ringfence.optim import Optimiser, average, fresh
-from ringfence.policies import Direct
+from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.problem import features
+from ringfence.problem.constraints import BoundHazard
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals.base import Direct
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
-from ringfence.windows import WindowData
 
 
 @dataclass(frozen=True)

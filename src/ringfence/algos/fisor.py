@@ -21,17 +21,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import diffusion, features
 from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
+from ringfence.logs.windows import WindowData
 from ringfence.nets import MLP
 from ringfence.nets.embedding import sinusoidal
-from ringfence.normalise import Normaliser
-from ringfence.optim import Optimiser
-from ringfence.policies import from_unit
+from ringfence.nets.optim import Optimiser
+from ringfence.problem import features
+from ringfence.problem.constraints import BoundHazard
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals import diffusion
+from ringfence.proposals.base import from_unit
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
-from ringfence.windows import WindowData
 
 DANGER = 25.0  # h of an unsafe state; a safe one has −1
 LEVEL_WIDTH = 16  # entries of the embedding of k

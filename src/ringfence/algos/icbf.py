@@ -19,18 +19,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import barrier as cbf
-from ringfence import diffusion, features, normalise, scores
 from ringfence.algos.joint import joint_losses
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
+from ringfence.logs.windows import WindowData, at
 from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import infer_action
-from ringfence.optim import Optimiser, average, fresh
-from ringfence.policies import Planner
+from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.problem import features, normalise
+from ringfence.problem.constraints import BoundHazard
+from ringfence.proposals import conditions, diffusion
+from ringfence.proposals import retention as cbf
+from ringfence.proposals.planner import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
-from ringfence.windows import WindowData, at
 from ringfence.world import World
 from ringfence.world.barrier import Barrier
 
@@ -45,7 +46,7 @@ class Config:
     history: int = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    condition: scores.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
+    condition: conditions.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
     discount: float = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
@@ -240,7 +241,7 @@ def prepare(store, config: Config, feature_map: features.FeatureMap, world: Worl
     seen = feature_map(store.observations, store.state) if config.condition == "advantage" else None
     if seen is not None:
         seen = jnp.asarray(seen, jnp.float32)
-    found = scores.scores_of(store, config.condition, config.horizon, config.discount, world.values, seen)
+    found = conditions.scores_of(store, config.condition, config.horizon, config.discount, world.values, seen)
     return WindowData(store, feature_map, found)
 
 

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from ringfence.barrier import Retention, mean_over
-from ringfence.hazards import BoundHazard
 from ringfence.nets import MLP
 from ringfence.nets.heads import barrier_on
-from ringfence.normalise import Normaliser
+from ringfence.problem.constraints import BoundHazard
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals.retention import Retention, mean_over
 from ringfence.types import Array, Batch, Metrics
 
 

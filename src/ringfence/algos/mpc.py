@@ -10,8 +10,8 @@ from typing import Literal
 import equinox as eqx
 import jax.numpy as jnp
 
-from ringfence import features
 from ringfence.algos import actor_critic as ac
+from ringfence.problem import features
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
 from ringfence.world import World
 

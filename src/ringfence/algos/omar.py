@@ -16,13 +16,13 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 
-from ringfence import features
 from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
-from ringfence.optim import Optimiser
+from ringfence.logs.windows import WindowData
+from ringfence.nets.optim import Optimiser
+from ringfence.problem import features
+from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
-from ringfence.windows import WindowData
 
 
 @dataclass(frozen=True)

@@ -14,14 +14,15 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import features, scores
 from ringfence.algos import actor_critic as ac
 from ringfence.algos import bc
-from ringfence.data.store import EpisodeStore
-from ringfence.hazards import BoundHazard
-from ringfence.policies import Direct
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import WindowData
+from ringfence.problem import features
+from ringfence.problem.constraints import BoundHazard
+from ringfence.proposals import conditions
+from ringfence.proposals.base import Direct
 from ringfence.types import Algorithm, Array, Key, PyTree, Spec
-from ringfence.windows import WindowData
 from ringfence.world import World
 
 
@@ -46,7 +47,7 @@ class Config(bc.Config):
     """L = E ‖a_i − π_i(s̃_i, y)‖² with y the score of what followed; played with y = `target`."""
 
     view: features.View = "pruned"  # the planner's
-    condition: scores.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
+    condition: conditions.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
     discount: float = 0.9  # of what y scores
     ahead: int = 8  # rows, of the advantage
     target: float = 1.5  # y when it acts, as a normal score: the best 7 %
@@ -87,7 +88,7 @@ def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMa
     seen, values = None, None
     if config.condition == "advantage":
         seen, values = jnp.asarray(feature_map(store.observations, store.state), jnp.float32), world.values
-    y = scores.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
+    y = conditions.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
     return WindowData(store, feature_map, y)
 
 

@@ -21,17 +21,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ringfence import __version__, algos, evaluate, hazards, reference, schemas, tasks, training, worlds
+from ringfence import __version__, algos
 from ringfence.bench.packed import unpack
 from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
-from ringfence.data.make import make
-from ringfence.data.origin import other_data
-from ringfence.data.store import EpisodeStore
+from ringfence.datasets import registry
+from ringfence.datasets.make import make
+from ringfence.datasets.task import Task
 from ringfence.errors import RunConflict, UserError, unknown, whole_number
-from ringfence.files import whole
+from ringfence.evaluation import protocol, reference
+from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import GuardOptions, options_of
-from ringfence.policies import PLANNERS, PlanOptions, plan_defaults
-from ringfence.runs import Run, build_config, write_json
+from ringfence.loading.resolve import asked
+from ringfence.logs.provenance import other_data
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
+from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
+from ringfence.training import loop, worlds
+from ringfence.training.runs import Run, write_json
+from ringfence.utils import schemas
+from ringfence.utils.config import build_config
+from ringfence.utils.files import whole
 from ringfence.world import Settings
 
 FORMAT = 1  # of a results folder
@@ -65,10 +74,10 @@ class Cell:
     @property
     def id(self) -> str:
         """Hash of what training is told; how the run is played does not count."""
-        task = tasks.get(self.task)
+        task = registry.get(self.task)
         content = {
             "format": FORMAT,
-            "data": [__version__, self.task, self.transitions or task.transitions, hazards.to_dict(task.hazard)],
+            "data": [__version__, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
             "algorithm": self.algorithm,
             "config": dataclasses.asdict(self.config),
             "seed": self.seed,
@@ -84,7 +93,7 @@ class Cell:
         reads none: it learned the same there."""
         if algos.get(self.algorithm).reads(self.config) != "nothing":
             return None
-        other = tasks.twin(self.task)
+        other = registry.twin(self.task)
         return None if other is None else dataclasses.replace(self, task=other)
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
@@ -93,9 +102,9 @@ class Cell:
 
         def there(variant: str, name: str) -> bool:
             r = known.get(variant, {})
-            same = r.get("episodes") == episodes and r.get("protocol") == evaluate.PROTOCOL
-            same = same and evaluate.complete(r, tasks.get(self.task)) and evaluate.of_last_step(r, config)
-            return same and same_options(r, EVALUATIONS[name], tasks.get(self.task), plan_defaults(self.config))
+            same = r.get("episodes") == episodes and r.get("protocol") == protocol.PROTOCOL
+            same = same and protocol.complete(r, registry.get(self.task)) and protocol.of_last_step(r, config)
+            return same and same_options(r, EVALUATIONS[name], registry.get(self.task), plan_defaults(self.config))
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -110,11 +119,11 @@ class Cell:
         return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {}
 
 
-def same_options(stored: dict, evaluation: dict, task: tasks.Task, defaults: dict) -> bool:
+def same_options(stored: dict, evaluation: dict, task: Task, defaults: dict) -> bool:
     """Whether a result was played with the options of planner and guard that an evaluation's name stands for on a task
     today, given the planner's defaults, and in a World of the settings that it has there. What labels come from follows
     from the data."""
-    how = evaluate.asked(**evaluation)
+    how = asked(**evaluation)
     plan = dataclasses.asdict(PlanOptions(**{**defaults, **PLANNERS[how.planner], **how.plan}))
     if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
         return False
@@ -159,7 +168,7 @@ class Grid:
     def references(self) -> dict[str, int | None]:
         """Tasks whose reference rows are not there yet, with the size of their data."""
         sizes, folder = {c.task: c.transitions for c in self.cells}, self.out / "reference"
-        return {t: n for t, n in sizes.items() if not reference.there(tasks.get(t), folder, self.episodes, n)}
+        return {t: n for t, n in sizes.items() if not reference.there(registry.get(t), folder, self.episodes, n)}
 
     def open(self) -> None:
         """Make the folder, if it is not there."""
@@ -187,7 +196,7 @@ class Grid:
 
 def about(suite: str, episodes: int) -> dict:
     """Contents of bench.json."""
-    return {"format": FORMAT, "protocol": evaluate.PROTOCOL, "suite": suite, "episodes": episodes, "split": "test"}
+    return {"format": FORMAT, "protocol": protocol.PROTOCOL, "suite": suite, "episodes": episodes, "split": "test"}
 
 
 RESTORE = "restore that file, e.g. from another results folder of this suite and number of episodes"
@@ -229,7 +238,7 @@ def statuses(out: str | Path) -> list[dict]:
 def entry_names(suite: str) -> set[str]:
     """What entries of a suite are chosen by."""
     chosen = SUITES[suite]
-    return {name for task in chosen.tasks for e in chosen.entries for name in e.names(tasks.get(task))}
+    return {name for task in chosen.tasks for e in chosen.entries for name in e.names(registry.get(task))}
 
 
 def make_grid(
@@ -260,7 +269,7 @@ def make_grid(
     changes = () if steps is None else (("steps", steps),)
     cells = []
     for name in names:
-        task = tasks.get(name)
+        task = registry.get(name)
         for e in chosen.entries:
             if not e.plays(task.tier) or (only and not set(only) & set(e.names(task))):
                 continue
@@ -320,7 +329,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
             trained = time.perf_counter() - begun
             for variant, name in current.missing(out, episodes):
                 record = 4 if current.seed == 0 else 0
-                found = evaluate.evaluate(run, episodes=episodes, record=record, **EVALUATIONS[name])
+                found = evaluate(run, episodes=episodes, record=record, **EVALUATIONS[name])
                 if found["variant"] != variant:
                     raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
             told = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
@@ -342,7 +351,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
             for cell in left:
                 if twin := adopt(cell, out, store.card):
                     adopted[cell] = {"adopted": str(twin.folder(out).relative_to(out))}
-            training.train(
+            loop.train(
                 current.algorithm,
                 store,
                 preset=current.preset,
@@ -364,7 +373,7 @@ def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, 
 def data_of(task: str, transitions: int | None) -> EpisodeStore:
     """The data set of a task. The last one is kept: groups of one task follow each other, and what was computed from a
     store (windows, critic) is found again by the store itself."""
-    return make(tasks.get(task), transitions, must_keep=False)[0]
+    return make(registry.get(task), transitions, must_keep=False)[0]
 
 
 def adopt(cell: Cell, out: Path, card: dict) -> Cell | None:
@@ -404,4 +413,4 @@ def tell_lost(what: str, why: str) -> None:
 
 def make_reference(task: str, out: Path, episodes: int, transitions: int | None = None) -> None:
     """Reference rows of a task, once."""
-    reference.make(tasks.get(task), data_of(task, transitions), out / "reference", episodes)
+    reference.make(registry.get(task), data_of(task, transitions), out / "reference", episodes)

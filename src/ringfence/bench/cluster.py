@@ -15,8 +15,8 @@ from pathlib import Path
 
 from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
 from ringfence.errors import UserError
-from ringfence.files import owned
-from ringfence.progress import Progress
+from ringfence.utils.files import owned
+from ringfence.utils.progress import Progress
 
 RETRIES = 3
 

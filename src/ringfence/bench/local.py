@@ -18,8 +18,8 @@ from pathlib import Path
 from ringfence.bench.cells import Cell, Grid, record_failure, tell_lost
 from ringfence.bench.worker import decode, encode
 from ringfence.errors import UserError
-from ringfence.files import owned
-from ringfence.progress import Progress
+from ringfence.utils.files import owned
+from ringfence.utils.progress import Progress
 
 DEATHS = 2  # of workers on one cell, after which it is left
 

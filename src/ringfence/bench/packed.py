@@ -16,10 +16,10 @@ import lzma
 import tarfile
 from pathlib import Path, PurePosixPath
 
-from ringfence import schemas
 from ringfence.errors import UserError
-from ringfence.files import whole
-from ringfence.runs import write_json
+from ringfence.training.runs import write_json
+from ringfence.utils import schemas
+from ringfence.utils.files import whole
 
 PLACES = ("cells", "reference")
 ARCHIVES = {

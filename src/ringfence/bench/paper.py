@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from ringfence import tasks
 from ringfence.bench.cells import Grid, make_grids, narrowed
 from ringfence.bench.suites import SUITES
 from ringfence.bench.table import rows
+from ringfence.datasets import registry
 from ringfence.errors import UserError
-from ringfence.files import whole
+from ringfence.utils.files import whole
 
 FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
 SEEDS = 5  # of the paper
@@ -107,7 +107,7 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
     out = []
     for task, (_, values) in PRINTED.items():
-        presets = ("split", *tasks.get(task).presets, "default")  # of rows that may stand there
+        presets = ("split", *registry.get(task).presets, "default")  # of rows that may stand there
         for (method, (algorithm, endings)), printed in zip(OURS.items(), values):
             wanted = [preset + ending for ending in endings for preset in presets]
             variant = next((v for v in wanted if (task, algorithm, v) in found), "")

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ringfence import algos
-from ringfence.tasks import TASKS, Task
+from ringfence.datasets.registry import TASKS
+from ringfence.datasets.task import Task
 
 # Named sets of evaluation-time choices; keyword arguments of evaluate.evaluate.
 EVALUATIONS: dict[str, dict] = {

@@ -9,13 +9,13 @@ import csv
 import io
 from pathlib import Path
 
-from ringfence import schemas
 from ringfence.bench.cells import read_about
 from ringfence.errors import UserError
-from ringfence.evaluate import of_last_step
-from ringfence.files import whole
-from ringfence.runs import Run
-from ringfence.words import spreadsheet
+from ringfence.evaluation.protocol import of_last_step
+from ringfence.training.runs import Run
+from ringfence.utils import schemas
+from ringfence.utils.escape import spreadsheet
+from ringfence.utils.files import whole
 
 TOLD = ("split", "protocol", "episodes", "task", "algorithm", "seed", "variant", "constants")  # by every evaluation
 COLUMNS = (

@@ -51,8 +51,8 @@ def main() -> None:
     def say(**message) -> None:
         print(json.dumps(message), file=wire, flush=True)
 
-    from ringfence import interrupts
     from ringfence.bench import cells as grid
+    from ringfence.utils import interrupts
 
     interrupts.listen()
     say(event="ready")

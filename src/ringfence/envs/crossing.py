@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.envs import discs
 from ringfence.errors import UserError
-from ringfence.features import FeatureMap, solitary
+from ringfence.problem.features import FeatureMap, solitary
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s
@@ -67,6 +68,7 @@ class Crossing:
     action_dim: ClassVar[int] = 2  # push along x and y; of a unicycle push along its heading, and turn
     terminates: ClassVar[bool] = False
     dt: ClassVar[float] = DT
+    radius: ClassVar[float] = RADIUS
     world: ClassVar[dict] = {"dynamics_width": 32}  # all that a push moves is one's own velocity
     # Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row. Who climbs
     # drives as nobody in the logs does, all the more the farther, and others no longer go on as the World foresees.
@@ -122,8 +124,6 @@ class Crossing:
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
         """Pictures of an episode (discs.py)."""
-        from ringfence.envs import discs
-
         return discs.frames(self, states, moments)
 
     def reset(self, key: Key, batch: int) -> CrossingState:

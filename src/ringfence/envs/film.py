@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from ringfence.envs.mujoco import SafeMuJoCo
+
+class Filmed(Protocol):
+    """What of a robot's simulator its pictures need."""
+
+    ant: bool
+    dt: float
+    limit: float  # m/s
+    state_names: tuple[str, ...]
+
+    def model(self) -> Any: ...
+
 
 WIDTH, HEIGHT = 320, 240  # pixels
 DRAWN = EMPTY, RED, BLUE, DARK, PAPER = (225, 225, 225), (190, 50, 40), (70, 100, 200), (20, 20, 20), (255, 255, 255)
 
 
-def frames(env: SafeMuJoCo, states: np.ndarray, moments: list[tuple[int, bool]]):
+def frames(env: Filmed, states: np.ndarray, moments: list[tuple[int, bool]]):
     """Pictures of an episode, states (T+1, S), at `moments`: (step, whether it is shown as above the limit). The planar
     position is not in the state, so it is summed up from the velocity."""
     import mujoco

@@ -26,10 +26,11 @@ from typing import ClassVar, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import interrupts
+from ringfence.envs import film
 from ringfence.errors import UserError, unknown
-from ringfence.features import VIEWS, FeatureMap, others
+from ringfence.problem.features import VIEWS, FeatureMap, others
 from ringfence.types import Array
+from ringfence.utils import interrupts
 
 FRAME_SKIP = 5  # substeps of an environment step
 DT = 0.05  # s of an environment step
@@ -197,8 +198,6 @@ class SafeMuJoCo:
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
         """Pictures of an episode (film.py)."""
-        from ringfence.envs import film
-
         return film.frames(self, states, moments)
 
     def model(self):

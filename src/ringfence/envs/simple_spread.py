@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.features import VIEWS, FeatureMap, derived, following
+from ringfence.problem.features import VIEWS, FeatureMap, derived, following
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s

@@ -17,7 +17,7 @@ import numpy as np
 
 from ringfence.envs.simple_spread import DT, SimpleSpread, SpreadState, in_contact
 from ringfence.errors import UserError
-from ringfence.features import FeatureMap, solitary
+from ringfence.problem.features import FeatureMap, solitary
 from ringfence.types import Array, Key, Transition
 
 SIGHT = 1.5  # m: in a room of 2 m a side, one thing in six is farther away, so what is not there is nothing new

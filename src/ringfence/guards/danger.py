@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
-from ringfence.hazards import BoundHazard
+from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
 from ringfence.world import World
 

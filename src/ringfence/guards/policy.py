@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence import hazards, normalise
-from ringfence.each import Each, apart, look, together
 from ringfence.errors import UserError, unknown
-from ringfence.features import translation
 from ringfence.guards.danger import Danger
-from ringfence.guards.guard import GUARDS, Guard, GuardOptions
+from ringfence.guards.filter import Guard
+from ringfence.guards.options import GUARDS, GuardOptions
+from ringfence.problem import constraints, normalise
+from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, PyTree
 from ringfence.world import World
 
@@ -129,112 +129,6 @@ def _of_team(cost: Array) -> Array:
     return cost if cost.ndim == 1 else cost.max(-1)
 
 
-def held(action: Array, rows: int) -> Array:
-    """(B, 1, K, N, A): one action (B, N, A), held."""
-    return jnp.broadcast_to(action[:, None, None], (action.shape[0], 1, rows, *action.shape[1:]))
-
-
-def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, present: Array, rows: int) -> Array:
-    """(B, 1, K, N, A): what a policy `act`, of features in its own view `own`, does now (`seen`) and along the rows
-    that the World foresees from `present`; the first action held where the views cannot be translated."""
-    index = translation(own, world.map)
-    first = act(seen)
-    if index is None or rows == 1:
-        return held(first, rows)
-    x, action, actions = present, first, [first]
-    for _ in range(rows - 1):
-        x, _ = world.dynamics.step(x, action)
-        action = act(jnp.take_along_axis(x, jnp.broadcast_to(index, (*x.shape[:-1], index.shape[1])), -1))
-        actions.append(action)
-    return jnp.stack(actions, 1)[:, None]
-
-
-class Callback:
-    """Anybody's function (observations, state) -> actions under guard, as a policy (types.Policy) outside JAX: it is
-    asked with the whole batch, NumPy in, NumPy out."""
-
-    def __init__(self, function: Callable, guarded: Guarded, agents: int):
-        self.function, self.guarded, self.agents = function, guarded, agents
-        self._decide = jax.jit(lambda g, memory, present, action, key: g.decided(memory, present, action, key))
-
-    @property
-    def _team(self) -> Guarded | Each:
-        """Who hears of costs: one guard, or that of each agent."""
-        return Each(self.guarded, self.agents) if self.guarded.guard.world.spec.alike else self.guarded
-
-    def start(self, batch: int) -> PyTree:
-        return self._team.start(batch)
-
-    def hear(self, memory: PyTree, cost) -> PyTree:
-        return self._team.hear(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
-
-    def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
-        wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
-        return self.decided(memory, observations, state, wanted, key)
-
-    def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
-        """What becomes of the function's actions (B, N, A)."""
-        world = self.guarded.guard.world
-        spec, batch = world.spec, len(observations)
-        try:
-            wanted = np.asarray(wanted, np.float32)
-        except (TypeError, ValueError):
-            raise UserError("The policy under guard returned no array of numbers; return actions (N, A).") from None
-        expected = (batch, self.agents, spec.action_dim)
-        if wanted.shape != expected:
-            raise UserError(
-                f"The policy under guard returned actions of shape {wanted.shape[1:]}; this World takes {expected[1:]}."
-            )
-        if not np.isfinite(wanted).all():
-            raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
-        action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
-        given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
-        present = look(world.map, spec.alike, *given)
-        plan = held(apart(action) if spec.alike else action, self.guarded.guard.options.rows)
-        memory, step = self._decide(self.guarded, memory, present, plan, key)
-        return memory, together(step, (batch, self.agents)) if spec.alike else step
-
-
-class Pilot:
-    """Anybody's function (observations, state) -> actions under guard at run time: one environment, NumPy in, NumPy
-    out, as `Controller`.
-
-    pilot.reset()                                  # at the start of every episode
-    action = pilot.act(observations, state)        # (N, O), (S,) or None -> (N, A)
-
-    `info` says of the last action what the guard knows of it. `policy` is what simulators of whole batches play.
-    """
-
-    def __init__(self, policy: Callback, seed: int = 0):
-        self.policy = policy
-        self._key = jax.random.key(seed)
-        self.info: dict[str, np.ndarray] = {}
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin an episode."""
-        self._memory = self.policy.start(1)
-
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
-        """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, in all or
-        by each constraint's name, which an adapting guard follows."""
-        wanted = self.policy.function(observations, state)
-        self._key, key = jax.random.split(self._key)
-        if cost is not None:
-            self._memory = self.policy.hear(self._memory, costs_of_one(cost))
-        shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
-        self._memory, step = self.policy.decided(self._memory, *shown, np.asarray(wanted)[None], key)
-        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
-        return np.asarray(step.action[0])
-
-
-class Nothing(eqx.Module):
-    """Stands where a callback's proposals come from outside."""
-
-    def start(self, batch: int) -> PyTree:
-        return {}
-
-
 def options_of(name: str, danger: str, usual: Mapping[str, dict] = MappingProxyType({}), **changes) -> dict:
     """Fields of GuardOptions that a named guard has, where `usual` holds what a task's simulator asks for by name. The
     margin, unless another is asked for, is a calibrated one of what is learned; of a formula less than its safe margin,
@@ -259,7 +153,7 @@ def far_sighted(world: World) -> dict[str, dict]:
 def build(
     proposal: Any,
     world: World,
-    hazard: hazards.Hazard | None,
+    hazard: constraints.Hazard | None,
     name: str,
     danger: str,
     usual: Mapping[str, dict] | None = None,
@@ -267,7 +161,7 @@ def build(
 ) -> Guarded:
     """A policy under the named guard with changed options; `usual` as in `options_of`, by default what the World's card
     asks for."""
-    from ringfence.runs import build_config
+    from ringfence.utils.config import build_config
 
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
@@ -278,43 +172,5 @@ def build(
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
-    bound = None if hazard is None else hazards.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
+    bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
     return Guarded(proposal, Guard(Danger(world, danger, bound, options.future), options))
-
-
-def guard(
-    policy: Any,
-    world: World,
-    *,
-    guard: str = "shield",
-    danger: str = "learned",
-    hazard: hazards.Hazard | None = None,
-    seed: int = 0,
-    agents: int | None = None,
-    **options,
-):
-    """Any policy under guard.
-
-    policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
-    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Pilot`, for a team of `agents` where the World is of agents who are alike. `guard` is a name in
-    GUARDS, `danger` formula, learned or both, `options` fields of GuardOptions; `hazard` is the formula's definition,
-    where one is to be used.
-    """
-    if not isinstance(world, World):
-        raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
-    if isinstance(policy, Each):
-        return Each(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
-    if hasattr(policy, "start") and hasattr(policy, "act"):
-        return build(policy, world, hazard, guard, danger, **options)
-    if not callable(policy):
-        raise UserError(
-            f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
-        )
-    spec = world.spec
-    if agents is None and spec.alike:
-        raise UserError("The World is of agents who are alike; say with agents= how many of them there are.")
-    if agents not in (None, spec.n_agents) and not spec.alike:
-        raise UserError(f"The World is of {spec.n_agents} agents who are not alike; leave agents={agents} out.")
-    guarded = build(Nothing(), world, hazard, guard, danger, **options)
-    return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)

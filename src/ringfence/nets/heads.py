@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.nets.mlp import MLP
-from ringfence.normalise import Normaliser
+from ringfence.problem.normalise import Normaliser
 from ringfence.types import Array, Key
 
 

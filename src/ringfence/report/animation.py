@@ -6,9 +6,10 @@ import base64
 
 import numpy as np
 
-from ringfence import recordings, tasks
+from ringfence.datasets import registry
+from ringfence.evaluation import recordings
 from ringfence.report.table import Row, Section
-from ringfence.runs import Run
+from ringfence.training.runs import Run
 
 EPISODES = 4  # per variant
 VARIANTS = 2  # per task
@@ -72,7 +73,7 @@ def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) 
     if states.shape[-1] != 6 * n or "radius" not in section.hazard:
         return None
     plans = tracks(arrays, spec["feature_names"], n, run.config["config"].get("history", 0))
-    arena = getattr(tasks.TASKS[section.task].env, "half_width", 1.0) if section.task in tasks.TASKS else 1.0
+    arena = getattr(registry.TASKS[section.task].env, "half_width", 1.0) if section.task in registry.TASKS else 1.0
     episodes = []
     for e in range(len(states)):
         places = np.abs(np.concatenate([states[e, :, : 2 * n].ravel(), states[e, 0, 4 * n :]]))

@@ -15,14 +15,15 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringfence import schemas, tasks
 from ringfence.bench import suites
 from ringfence.bench.cells import read_about
-from ringfence.data.origin import other_data
+from ringfence.datasets import registry
 from ringfence.errors import UserError
-from ringfence.evaluate import of_last_step
+from ringfence.evaluation.protocol import of_last_step
+from ringfence.logs.provenance import other_data
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
-from ringfence.runs import Run
+from ringfence.training.runs import Run
+from ringfence.utils import schemas
 
 FILE = "bench.json"
 CELL = re.compile(r"seed-(\d+)(?:-(.+))?")
@@ -142,7 +143,7 @@ def read(folder: str | Path) -> Board:
         )
     _check(entries, references, told, folder)
     names = {task for _, task, _, _ in cells} | {task for task, _ in references.values()}
-    known = list(tasks.TASKS)
+    known = list(registry.TASKS)
     ordered = sorted(names, key=lambda t: (known.index(t) if t in known else len(known), t))
     seeds = tuple(sorted({seed for *_, seed in cells}))
     done = {(task, _job(task, job), seed) for _, task, job, seed in finished}
@@ -184,7 +185,7 @@ def _status(path: Path) -> tuple[str, str]:
 
 
 def _tier(task: str) -> str:
-    return tasks.TASKS[task].tier if task in tasks.TASKS else ""
+    return registry.TASKS[task].tier if task in registry.TASKS else ""
 
 
 def _job(task: str, job: str) -> str:
@@ -195,7 +196,7 @@ def _job(task: str, job: str) -> str:
 
 
 def _presets(task: str) -> tuple[str, ...]:
-    return tasks.TASKS[task].presets if task in tasks.TASKS else ()
+    return registry.TASKS[task].presets if task in registry.TASKS else ()
 
 
 def _suite(name: str) -> tuple[suites.Entry, ...]:

@@ -10,10 +10,9 @@ from urllib.parse import quote
 import numpy as np
 from markupsafe import Markup
 
-from ringfence import stats
 from ringfence.algos import ALGORITHMS
-from ringfence.data.origin import regenerated
-from ringfence.files import whole
+from ringfence.evaluation import statistics
+from ringfence.logs.provenance import regenerated
 from ringfence.report import board_figures, figures
 from ringfence.report.board import Board, Method, read
 from ringfence.report.page import WORDS, danger, environments, facts, headline, render
@@ -29,7 +28,8 @@ from ringfence.report.standings import (
     standings,
 )
 from ringfence.report.table import Section
-from ringfence.runs import Run
+from ringfence.training.runs import Run
+from ringfence.utils.files import whole
 
 
 def build_board(folder: str | Path, out: str | Path, title: str | None = None) -> Path:
@@ -96,7 +96,7 @@ def _ranks(board: Board, tasks: list[str], tables: dict[str, list[Standing]]) ->
     for k, task in enumerate(tasks):
         told = [cells[m][k] for m in complete]
         limit = board.constants.get(task, {}).get("cost_limit", 0.0)  # a task may have no result yet
-        places = stats.places([r.returns for r in told], [r.cost_interval[1] for r in told], limit)
+        places = statistics.places([r.returns for r in told], [r.cost_interval[1] for r in told], limit)
         for m, place in zip(complete, places):
             among[m].append(place)
     for m, row in cells.items():

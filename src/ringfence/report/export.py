@@ -7,12 +7,12 @@ import io
 from pathlib import Path
 
 from ringfence.errors import plain, unknown
-from ringfence.files import whole
 from ringfence.report.board import Board, Method, read
 from ringfence.report.board_page import rankings, short
 from ringfence.report.page import share
 from ringfence.report.standings import Standing, references, standings
-from ringfence.words import latex, markdown, spreadsheet
+from ringfence.utils.escape import latex, markdown, spreadsheet
+from ringfence.utils.files import whole
 
 # CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
 COLUMNS = (

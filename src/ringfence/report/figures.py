@@ -16,7 +16,7 @@ from matplotlib.ticker import LogFormatter, MaxNLocator
 
 from ringfence.errors import UserError
 from ringfence.report.table import Row, Section
-from ringfence.runs import Run
+from ringfence.training.runs import Run
 
 COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
@@ -280,15 +280,16 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
     import jax
     import jax.numpy as jnp
 
-    from ringfence import evaluate, worlds
+    from ringfence.loading import run_worlds
+    from ringfence.loading.resolve import load
     from ringfence.nets.heads import barrier_on
 
     if not run.checkpoints():
         raise UserError(f"'{run.path}' holds no checkpoint.")
-    job, policy = evaluate.load(run)
+    job, policy = load(run)
     networks, names = getattr(policy, "networks", {}), job.spec.feature_names
     n, radius = job.spec.n_agents, getattr(job.hazard.hazard, "radius", None)
-    learned = worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
+    learned = run_worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
     if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
         return None
     agent, other = 0, 1

@@ -10,18 +10,22 @@ from pathlib import Path
 import jinja2
 from markupsafe import Markup
 
-from ringfence import __version__, algos, hazards, recordings, schemas, tasks
-from ringfence.data.origin import regenerated
+from ringfence import __version__, algos
+from ringfence.datasets import registry
 from ringfence.errors import UserError
-from ringfence.evaluate import of_last_step
-from ringfence.files import whole
+from ringfence.evaluation import recordings
+from ringfence.evaluation.protocol import of_last_step
 from ringfence.guards import GuardOptions, options_of
-from ringfence.policies import PLANNERS, PlanOptions
+from ringfence.logs.provenance import regenerated
+from ringfence.problem import constraints
+from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.report import animation, figures
 from ringfence.report.pooling import mean_of
 from ringfence.report.table import NAMES, Row, Section, sections
-from ringfence.runs import Run
-from ringfence.words import shell
+from ringfence.training.runs import Run
+from ringfence.utils import schemas
+from ringfence.utils.escape import shell
+from ringfence.utils.files import whole
 
 HERE = Path(__file__).parent
 WORDS = {  # hazard -> (what the cost counts, what a violation is)
@@ -75,7 +79,7 @@ def _write(path: Path, text: str) -> Path:
 
 def _film_shows(section: Section) -> str:
     """What films of a task show, in words; empty where its simulator draws none."""
-    task = tasks.simulated(section.task, hazards.from_dict(section.hazard)) if section.hazard else None
+    task = registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
     return "" if task is None else getattr(task.env, "film_shows", "")
 
 
@@ -93,7 +97,7 @@ def _section(section: Section, k: int, out: Path) -> dict:
                 "split": split,
                 "rows": rows,
                 "references": section.references if split == "test" else [],
-                "constraints": constraints(rows),
+                "constraints": constraint_table(rows),
             }
             for split, rows in section.tables.items()
         ],
@@ -118,7 +122,7 @@ def _section(section: Section, k: int, out: Path) -> dict:
     }
 
 
-def constraints(rows: list[Row]) -> list[dict]:
+def constraint_table(rows: list[Row]) -> list[dict]:
     """What each named constraint cost the rows whose simulator told them apart, mean of their runs."""
     found = []
     for row in rows:
@@ -283,7 +287,7 @@ def commands(section: Section, out: Path) -> list[str]:
     data = shell(section.task)
     if regenerated(card):
         steps = card.get("size", card.get("transitions"))
-        full = tasks.TASKS[section.task].transitions if section.task in tasks.TASKS else None
+        full = registry.TASKS[section.task].transitions if section.task in registry.TASKS else None
         if card.get("seed", 0) == 0 and steps in (None, full):
             lines.append(
                 f"ringfence data make {shell(section.task)}" + ("" if steps else "  # its size was not recorded")
@@ -331,13 +335,13 @@ def commands(section: Section, out: Path) -> list[str]:
 def _usual_preset(algorithm: str, task: str) -> str:
     """The preset that training takes without being told one; no name where that is not known."""
     known = algos.ALGORITHMS.get(algorithm)
-    return known.preset_for(tasks.TASKS[task].presets if task in tasks.TASKS else ()) if known else ""
+    return known.preset_for(registry.TASKS[task].presets if task in registry.TASKS else ()) if known else ""
 
 
 def _how(result: dict, run: Run) -> str:
     """The options of `ringfence eval` that gave a result."""
     planner, name = result.get("planner", "plain"), result.get("guard", "none")
-    task = tasks.TASKS.get(run.config["task"])
+    task = registry.TASKS.get(run.config["task"])
     words = [f"--planner {planner}"] if planner != "plain" else []
     team = run.config.get("team") if task is None else task.env.n_agents
     words += [f"--agents {result['agents']}"] if result.get("agents") not in (None, team) else []

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringfence import stats
 from ringfence.errors import UserError
+from ringfence.evaluation import statistics
 
 Interval = tuple[float, float]
 
@@ -52,7 +52,7 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
             "avoidable_interval": tuple(first["avoidable_interval"]),
             "unsafe_starts": first["unsafe_starts"],
             "cvar": first["cost_cvar10"],
-            "violation_upper": stats.upper_bound(_violations(first), first["episodes"]),
+            "violation_upper": statistics.upper_bound(_violations(first), first["episodes"]),
         }
     else:
         played = [r["episodes"] for r in results]
@@ -68,15 +68,15 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
         avoidable = cost * (not unsafe.all())
         told = {
             "returns": float(returns.mean()),
-            "returns_interval": stats.mean_of_runs(returns),
+            "returns_interval": statistics.mean_of_runs(returns),
             "cost": float(cost.mean()),
-            "cost_interval": stats.mean_of_runs(cost, least=0.0),
+            "cost_interval": statistics.mean_of_runs(cost, least=0.0),
             "avoidable": float(avoidable[fine].mean()),
-            "avoidable_interval": stats.mean_of_runs(avoidable, fine, least=0.0),
+            "avoidable_interval": statistics.mean_of_runs(avoidable, fine, least=0.0),
             "unsafe_starts": int(unsafe.sum()),
-            "cvar": stats.cvar(cost.ravel()),
+            "cvar": statistics.cvar(cost.ravel()),
             # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.
-            "violation_upper": stats.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
+            "violation_upper": statistics.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
         }
     episodes, c = sum(r["episodes"] for r in results), first["constants"]
     violations = sum(map(_violations, results))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ringfence import tasks
+from ringfence.datasets import registry
 
 NOTE = "Published, on the public data files; ours are on regenerated data."
 
@@ -38,7 +38,7 @@ def _robots(**raw: tuple[float, float, float]) -> dict[str, float]:
     for robot, returns in raw.items():
         for tier, value in zip(("good", "medium", "poor"), returns):
             for name in (f"{robot}-{tier}", f"{robot}-{tier}-quantile"):
-                found[name] = round(100 * tasks.get(name).normalised_return(value), 1)
+                found[name] = round(100 * registry.get(name).normalised_return(value), 1)
     return found
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ringfence import stats
+from ringfence.datasets.registry import TASKS
+from ringfence.evaluation import statistics
 from ringfence.report.board import Board, Entry, Method
 from ringfence.report.figures import COLOURS
 from ringfence.report.pooling import Interval, Numbers, mean_of, normal_cost, normal_return, pool
-from ringfence.tasks import TASKS
 from ringfence.types import Array
 
 DRAWS = 2000  # of every bootstrap
@@ -109,10 +109,10 @@ def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
     """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
     rest, by cost."""
     merits = [r.returns for r in rows], [r.cost_interval[1] for r in rows], limit
-    for row, place in zip(rows, stats.places(*merits)):
+    for row, place in zip(rows, statistics.places(*merits)):
         row.rank = int(place)
         row.best = row.safe and place == 1
-    return [rows[i] for i in stats.rank(*merits)]
+    return [rows[i] for i in statistics.rank(*merits)]
 
 
 def contests(rows: list[Standing]) -> list[Contest]:
@@ -122,8 +122,8 @@ def contests(rows: list[Standing]) -> list[Contest]:
     first, found = rows[0], []
     for other in rows[1:]:
         pair = [[_per_reset(row, what) for row in (first, other)] for what in ("return", "cost")]
-        found.append([stats.paired_test(*p) for p in pair])
-    adjusted = stats.holm(np.array([t["p"] for tests in found for t in tests])).reshape(-1, 2)
+        found.append([statistics.paired_test(*p) for p in pair])
+    adjusted = statistics.holm(np.array([t["p"] for tests in found for t in tests])).reshape(-1, 2)
     return [
         Contest(row, r["difference"], r["interval"], float(p), c["difference"], c["interval"], float(q))
         for row, (r, c), (p, q) in zip(rows[1:], found, adjusted)
@@ -243,10 +243,10 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
         improves=_pairs(returns, methods),
         cheaper=_pairs({m: -c for m, c in costs.items()}, methods),
         return_thresholds=return_thresholds,
-        return_profiles=np.array([stats.profile(returns[m], return_thresholds) for m in methods]),
+        return_profiles=np.array([statistics.profile(returns[m], return_thresholds) for m in methods]),
         return_bands=[_band(above[m]) for m in methods],
         cost_thresholds=cost_thresholds,
-        cost_profiles=np.array([stats.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
+        cost_profiles=np.array([statistics.cost_profile(episode_costs[m], cost_thresholds) for m in methods]),
         cost_bands=[_band(within[m]) for m in methods],
     )
 
@@ -258,7 +258,9 @@ def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
 def _iqm(scores: Array) -> tuple[float, Interval | None]:
     """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
     several = len(scores) > 1
-    return float(stats.iqm(scores)), stats.stratified_bootstrap(scores, stats.iqm, draws=DRAWS) if several else None
+    return float(statistics.iqm(scores)), statistics.stratified_bootstrap(
+        scores, statistics.iqm, draws=DRAWS
+    ) if several else None
 
 
 def _band(shares: Array) -> Array | None:
@@ -272,7 +274,7 @@ def _band(shares: Array) -> Array | None:
 
 def _pairs(scores: dict[Method, Array], methods: list[Method]) -> Array:
     """(M, M) probability that a run of the row scores higher than one of the column, averaged over tasks."""
-    return np.array([[stats.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])
+    return np.array([[statistics.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])
 
 
 def _range(scores: dict[Method, Array]) -> Interval:

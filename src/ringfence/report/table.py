@@ -9,13 +9,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ringfence import schemas
 from ringfence.algos import ALGORITHMS
-from ringfence.data.origin import other_data
 from ringfence.errors import UserError
-from ringfence.evaluate import of_last_step
+from ringfence.evaluation.protocol import of_last_step
+from ringfence.logs.provenance import other_data
 from ringfence.report.pooling import Numbers, mean_of, pool
-from ringfence.runs import Run
+from ringfence.training.runs import Run
+from ringfence.utils import schemas
 
 SPLITS = ("test", "validation")
 NAMES = {

@@ -17,14 +17,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ringfence import recordings
+from ringfence.datasets.task import Task
 from ringfence.envs.film import DRAWN
 from ringfence.errors import UserError
-from ringfence.evaluate import load_job
-from ringfence.files import whole
-from ringfence.runs import Run
-from ringfence.tasks import Task
+from ringfence.evaluation import recordings
+from ringfence.loading.resolve import load_job
+from ringfence.training.runs import Run
 from ringfence.types import Env
+from ringfence.utils.files import whole
 
 EVERY = 2  # steps per frame, at least
 LONGEST = 200  # frames

@@ -26,10 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.features import FeatureMap
-from ringfence.hazards import least, lowest
 from ringfence.nets.mlp import MLP
-from ringfence.optim import regress
+from ringfence.nets.optim import regress
+from ringfence.problem.constraints import least, lowest
+from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key
 
 Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]

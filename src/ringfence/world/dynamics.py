@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.features import FeatureMap, others
 from ringfence.nets.mlp import MLP
-from ringfence.normalise import varying
-from ringfence.optim import regress
+from ringfence.nets.optim import regress
+from ringfence.problem.features import FeatureMap, others
+from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
 
 STATES = 20_000  # steps that features and their changes are standardised by

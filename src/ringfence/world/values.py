@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.features import FeatureMap
 from ringfence.nets.mlp import MLP
-from ringfence.normalise import varying
-from ringfence.optim import regress
+from ringfence.nets.optim import regress
+from ringfence.problem.features import FeatureMap
+from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
 
 ROWS = 100_000  # states evaluated at once

@@ -1,0 +1,5 @@
+"""The command line."""
+
+from ringfence.cli.app import main
+
+__all__ = ["main"]

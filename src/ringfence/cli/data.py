@@ -1,0 +1,332 @@
+"""`ringfence data`: stores made, imported, inspected."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from ringfence.errors import UserError
+from ringfence.utils.escape import terminal
+from ringfence.utils.files import writable
+
+out = Console(highlight=False)
+Positional = tyro.conf.Positional
+Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
+Out = Annotated[Path, tyro.conf.arg(name="out")]
+
+
+def make(
+    task: Positional[str],
+    size: int | None = None,
+    seed: int = 0,
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    fresh: bool = False,
+) -> None:
+    """Regenerate a task's data set (cached).
+
+    Args:
+        task: its name, as `ringfence tasks` lists it.
+        size: transitions; the full data set by default.
+        seed: of the collection.
+        out_file: write here instead of the cache.
+        fresh: simulate again, whatever the cache holds.
+    """
+    from ringfence.datasets import registry
+    from ringfence.datasets.make import make
+
+    store, path = make(registry.get(task), size, seed, out_file, fresh)
+    out.print(f"{store.episodes:,} episodes, {store.steps:,} steps: {path}", soft_wrap=True, markup=False)
+
+
+def import_table(
+    file: Positional[Path],
+    out_file: Out,
+    time: str = "time",
+    agent: str = "agent",
+    state: list[str] = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    episode: str | None = None,
+    action: list[str] = [],  # noqa: B006
+    reward: str | None = None,
+    cost: list[str] = [],  # noqa: B006
+    limits: list[float] = [],  # noqa: B006
+    goal: list[str] = [],  # noqa: B006
+    layout: Literal["highd", "interaction"] | None = None,
+    separation: float | None = None,
+    dt: float | None = None,
+    gap: float | None = None,
+    team: int | None = None,
+    neighbours: int | None = None,
+    sight: float | None = None,
+    shortest: int = 5,
+    longest: int | None = None,
+    fastest: float = 100.0,
+    task: str | None = None,
+) -> None:
+    """Import a CSV or Parquet file with a row per agent and time; needs the extra `ringfence[tables]`.
+
+    Args:
+        file: fleet.csv or fleet.parquet.
+        out_file: the store to write.
+        time: column of times, s (or of dates).
+        agent: column that tells agents apart.
+        state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
+        episode: column that tells recordings apart.
+        action: columns of what it was told to do until its next row; accelerations by default.
+        reward: column of what it earned since its row before; progress to the goal by default, or nothing.
+        cost: column of danger since its row before, 0 or above; several are constraints of these names.
+        limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
+        goal: columns of where it is to go, as many as its position has.
+        layout: names of columns of a published format, instead of the options above.
+        separation: m between two agents' centres below which a step costs 1, where no column tells.
+        dt: s, of the store's steps; the table's own by default.
+        gap: s without a row, after which an agent was away; five steps by default.
+        team: agents of an episode; by default as many as most rows have.
+        neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
+        sight: m, how far such an agent sees.
+        shortest: steps of an episode, at least.
+        longest: steps of an episode, at most; longer ones are cut.
+        fastest: m/s that nothing there can do.
+        task: a name for the data; that of the store's file by default.
+    """
+    from ringfence.logs.io.table import from_layout, from_table
+    from ringfence.problem.constraints import Separation
+
+    kept = writable(out_file)
+    if limits and len(limits) != len(cost):
+        raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
+    bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
+    told = {
+        "danger": None if separation is None else Separation(separation, separation / 4),
+        **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
+        "fastest": fastest,
+        "cost": cost,
+        "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **bounds},
+    }
+    if layout is not None:
+        if state or action or reward or goal or episode:
+            raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
+        return imported(from_layout(file, layout, **told), kept)
+    columns = dict(state=state, action=action, reward=reward, goal=goal, episode=episode)
+    imported(from_table(file, time=time, agent=agent, **columns, **told), kept)
+
+
+def import_bag(
+    file: Positional[Path],
+    agents: str,
+    out_file: Out,
+    odom: str = "odom",
+    cmd: str = "cmd_vel",
+    joints: str | None = None,
+    cost: str | None = None,
+    separation: float | None = None,
+    dt: float | None = None,
+    gap: float | None = None,
+    team: int | None = None,
+    neighbours: int | None = None,
+    sight: float | None = None,
+    shortest: int = 5,
+    longest: int | None = None,
+    stamps: bool = True,
+    twist: Literal["child", "world"] = "child",
+    task: str | None = None,
+) -> None:
+    """Import a ROS 1 or ROS 2 bag or an MCAP file; needs the extra `ringfence[ros]`.
+
+    Args:
+        file: run1.bag, run1.mcap or a ROS 2 bag's folder.
+        agents: prefix of the agents' topics, {i} standing for any number or word, e.g. /robot_{i}.
+        out_file: the store to write.
+        odom: topic of poses, below the prefix.
+        cmd: topic of commands, below the prefix.
+        joints: topic of joint states, below the prefix.
+        cost: topic of danger, of each agent below the prefix, or of the team.
+        separation: m between two agents' centres below which a step costs 1, where no topic tells.
+        dt: s, of the store's steps; the odometry's own by default.
+        gap: s without odometry, after which an agent was away; five steps by default.
+        team: agents of an episode; by default as many as most rows have.
+        neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
+        sight: m, how far such an agent sees.
+        shortest: steps of an episode, at least.
+        longest: steps of an episode, at most; longer ones are cut.
+        stamps: take the times in headers; --no-stamps takes those of recording.
+        twist: frame of the odometry's velocities, child (ROS's rule) or world.
+        task: a name for the data; that of the store's file by default.
+    """
+    from ringfence.logs.io.rosbag import read_bag
+    from ringfence.logs.io.table import from_table
+    from ringfence.problem.constraints import Separation
+
+    kept = writable(out_file)
+    bag = read_bag(file, agents, odom=odom, cmd=cmd, joints=joints, cost=cost, stamps=stamps, twist=twist)
+    store = from_table(
+        bag.columns,
+        time="time",
+        agent="agent",
+        state=bag.state,
+        action=bag.action,
+        cost="cost" if "cost" in bag.columns else None,
+        danger=None if separation is None else Separation(separation, separation / 4),
+        **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
+        notes=bag.notes,
+        card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
+    )
+    imported(store, kept)
+
+
+def import_omar(
+    directory: Positional[Path],
+    out_file: Out,
+    radius: float | None = None,
+    task: str | None = None,
+) -> None:
+    """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
+
+    Args:
+        directory: e.g. simple_spread/expert/seed_0_data.
+        out_file: the store to write.
+        radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
+        task: a name for the data; that of the tier in the directory's path by default.
+    """
+    from ringfence.datasets.importers.omar import import_omar
+    from ringfence.problem.constraints import Separation
+
+    if radius is not None and task is None:
+        raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
+    hazard = None if radius is None else Separation(radius, radius / 4)
+    file = writable(out_file)
+    imported(import_omar(directory, hazard, task), file)
+
+
+def import_ogmarl(
+    vault: Positional[Path],
+    task: Robot,
+    out_file: Out,
+    speed_limit: float | None = None,
+    quantile: bool = False,
+    tier: str | None = None,
+) -> None:
+    """Import a robot's Vault of OG-MARL's; needs the extra `ringfence[vault]`.
+
+    Args:
+        vault: e.g. 2halfcheetah.vlt/Good.
+        task: whose robot it is.
+        out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
+    """
+    from ringfence.datasets.importers.ogmarl import import_vault
+
+    file = writable(out_file)
+    imported(import_vault(vault, task, _limit(speed_limit, quantile), tier), file)
+
+
+def import_madiff(
+    directory: Positional[Path],
+    task: Robot,
+    out_file: Out,
+    speed_limit: float | None = None,
+    quantile: bool = False,
+    tier: str | None = None,
+) -> None:
+    """Import a robot's arrays of MADIFF's release (obs.npy, actions.npy, rewards.npy, path_lengths.npy).
+
+    Args:
+        directory: the one that holds the arrays.
+        task: whose robot it is.
+        out_file: the store to write.
+        speed_limit: m/s above which a step costs 1; safety-gymnasium's by default.
+        quantile: take the limit of the tier's `-quantile` task.
+        tier: good, medium, poor or a word of your own; the folder's name by default, if it is a tier's.
+    """
+    from ringfence.datasets.importers.ogmarl import import_madiff
+
+    file = writable(out_file)
+    imported(import_madiff(directory, task, _limit(speed_limit, quantile), tier), file)
+
+
+def import_hdf5(
+    file: Positional[str],
+    out_file: Out,
+    task: str | None = None,
+    agents: str | None = None,
+    cost_limit: float | None = None,
+    action_low: float | None = None,
+    action_high: float | None = None,
+) -> None:
+    """Import an HDF5 file in DSRL's, D4RL's or Minari's layout, as the logs of one agent or of several.
+
+    Args:
+        file: the HDF5 file, a Minari data set's folder, or the name of one on this machine, e.g. D4RL/door/human-v2.
+        out_file: the store to write.
+        task: a name for the data; that of the file or the data set by default.
+        agents: who sees and moves which columns, as JSON or a JSON file: {"a": {"observation": [0, 1], "action": [0]}}.
+        cost_limit: the cost per episode that reports call safe.
+        action_low: bound of every action entry; Minari's action space tells it by default, else -1.
+        action_high: likewise, else 1.
+    """
+    from ringfence.logs.io.hdf5 import import_hdf5
+
+    target = writable(out_file)
+    if target.exists() and Path(file).exists() and target.samefile(file):
+        raise UserError(f"'{file}' would be overwritten by its own import; give another file with --out.")
+    bounds = {"action_low": action_low, "action_high": action_high}
+    imported(import_hdf5(file, task=task, agents=agents, cost_limit=cost_limit, **bounds), target)
+
+
+def _limit(speed_limit: float | None, quantile: bool):
+    if quantile and speed_limit is not None:
+        raise UserError("--quantile and --speed-limit both set the limit; give one of them.")
+    return "quantile" if quantile else speed_limit
+
+
+def imported(store, file: Path) -> None:
+    """Keep what was imported, and say what was noted."""
+    each = f" of {store.card['dt']:g} s" if "dt" in store.card else ""
+    told = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
+    out.print(told, soft_wrap=True, markup=False)
+    for note in store.card["warnings"]:
+        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
+
+
+def info(file: Positional[Path]) -> None:
+    """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
+    from ringfence.datasets.audit import audit
+    from ringfence.logs.store import EpisodeStore
+
+    report = audit(EpisodeStore.load(file))
+    for name, value in report.facts.items():
+        out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
+    for note in report.notes:
+        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
+    for warning in report.warnings:
+        out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
+
+
+def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
+    """Train MATD3 from scratch and write the behaviour policies and the replay that the package ships.
+
+    Args:
+        out_dir: folder for the files.
+    """
+    from ringfence.datasets.behaviour import train_tier_policies
+
+    for tier, facts in train_tier_policies(out_dir).items():
+        out.print(f"{tier:16} " + "  ".join(f"{k} {v:.4g}" for k, v in facts.items()), soft_wrap=True)
+
+
+COMMANDS = {
+    "make": make,
+    "import-table": import_table,
+    "import-bag": import_bag,
+    "import-omar": import_omar,
+    "import-ogmarl": import_ogmarl,
+    "import-madiff": import_madiff,
+    "import-hdf5": import_hdf5,
+    "info": info,
+    "train-behaviour": train_behaviour,
+}

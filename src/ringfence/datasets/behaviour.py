@@ -1,0 +1,480 @@
+"""The policies that make the data: snapshots of a MATD3 learner, its replay, and the collection of episodes.
+
+The public Simple Spread data (OMAR, Pan et al. 2022) are four tiers of one such learner; here they are
+
+* `random`: actions uniform in [-1, 1];
+* `medium-replay`: everything the learner did from scratch until it was about as good as `medium`;
+* `medium`, `expert`: two snapshots of the learner, rolled out with Gaussian exploration noise.
+
+One seeded run of `train_tier_policies` makes all of them, and its results are shipped under `policies/`:
+
+    python -m ringfence.datasets.behaviour
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from ringfence.datasets import matd3
+from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
+from ringfence.envs.simple_spread import SimpleSpread, SpreadState
+from ringfence.errors import CheckpointError, UserError, unknown
+from ringfence.types import Array, Env, Key, PyTree
+
+POLICIES = Path(__file__).parent / "policies"
+COMMAND = "python -m ringfence.datasets.behaviour"
+TIERS = ("random", "medium-replay", "medium", "expert")
+REPLAY_TRANSITIONS = 97_500  # size of the public medium-replay set
+FORMAT = 1  # version of the policy file
+
+
+class BehaviourPolicy(eqx.Module):
+    """One deterministic actor per agent, plus Gaussian exploration noise."""
+
+    actors: Mlp  # leading axis N
+    noise: float = eqx.field(converter=float)  # std, in units of action
+    info: dict[str, Any] = eqx.field(static=True, default_factory=dict)  # provenance; not used to act
+
+    def act(self, observations: Array, key: Key) -> Array:
+        """(B, N, O) -> (B, N, A) in [-1, 1]."""
+        return matd3.noisy(matd3.act(self.actors, observations), self.noise, key)
+
+
+class BehaviourRun(NamedTuple):
+    """What a learner left behind. E episodes in the order of collection, K snapshots of the actors."""
+
+    actors: Mlp  # leading axes (K, N)
+    seen: np.ndarray  # (K,) transitions collected before each snapshot
+    returns: np.ndarray  # (K,) mean return of the episodes since the previous snapshot, noise included
+    initial: PyTree  # simulator states at reset, leading axis E
+    actions: np.ndarray  # (E, L, N, A) float16, exactly as executed
+
+
+class _Memory(NamedTuple):
+    """The replay buffer, by episode: it holds the whole run, so nothing is ever overwritten."""
+
+    states: PyTree  # (E, L+1, ...)
+    actions: Array  # (E, L, N, A)
+    rewards: Array  # (E, L, N)
+    terminated: Array  # (E, L)
+
+
+def train_behaviour(
+    env: Env,
+    config: MATD3Config,
+    key: Key,
+    transitions: int,
+    progress: Callable[[int, float], None] | None = None,
+) -> BehaviourRun:
+    """Train MATD3 from scratch for at least `transitions` environment steps and keep everything it did.
+
+    `progress(transitions_seen, mean_return)` is called after every snapshot. Memory grows with the run: about 200
+    bytes per transition for three agents.
+    """
+    length, envs = env.episode_length, config.envs
+    rounds = -(-transitions // (length * envs))
+    if rounds < 1:
+        raise UserError(f"A behaviour run of {transitions} transitions is empty; ask for at least one.")
+    key, k_init = jax.random.split(key)
+    learner = _init_learner(env, config, k_init)
+    memory = _empty_memory(env, rounds * envs)
+    snapshots, seen, returns = [], [], []
+    done = 0
+    while done < rounds:
+        count = min(config.snapshot_every, rounds - done)
+        keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(done, done + count))
+        learner, memory, scores = _train_rounds(env, config, learner, memory, jnp.arange(done, done + count), keys)
+        done += count
+        snapshots.append(jax.tree.map(np.asarray, learner.actors))
+        seen.append(done * envs * length)
+        returns.append(float(scores.mean()))
+        if progress is not None:
+            progress(seen[-1], returns[-1])
+    return BehaviourRun(
+        actors=jax.tree.map(lambda *x: np.stack(x), *snapshots),
+        seen=np.array(seen),
+        returns=np.array(returns, np.float32),
+        initial=jax.tree.map(lambda x: np.asarray(x[:, 0]), memory.states),
+        actions=np.asarray(memory.actions).astype(np.float16),
+    )
+
+
+def snapshot(run: BehaviourRun, k: int, noise: float) -> BehaviourPolicy:
+    """The policy of the run's snapshot `k`, acting with exploration noise of this std."""
+    return BehaviourPolicy(jax.tree.map(lambda x: jnp.asarray(x[k]), run.actors), noise)
+
+
+def save_behaviour(policy: BehaviourPolicy, path: str | Path, dtype: type = np.float32) -> None:
+    """Write the policy as safetensors; the file appears whole or not at all."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {f"weights.{k}": np.ascontiguousarray(w, dtype) for k, w in enumerate(policy.actors.weights)}
+    tensors |= {f"biases.{k}": np.ascontiguousarray(b, dtype) for k, b in enumerate(policy.actors.biases)}
+    card = {**policy.info, "format": FORMAT, "noise": policy.noise}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(save(tensors, metadata={"ringfence": json.dumps(card)}))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_behaviour(path: str | Path) -> BehaviourPolicy:
+    """Read what `save_behaviour` wrote; `info` holds the metadata (task, level, noise, return, command)."""
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"There is no behaviour policy at {path}; pass a file written by save_behaviour.")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            card = json.loads((file.metadata() or {})["ringfence"])
+            layers = sum(name.startswith("weights.") for name in file.keys())
+            actors = Mlp(
+                tuple(jnp.asarray(file.get_tensor(f"weights.{k}"), jnp.float32) for k in range(layers)),
+                tuple(jnp.asarray(file.get_tensor(f"biases.{k}"), jnp.float32) for k in range(layers)),
+            )
+            noise = float(card["noise"])
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"{path} is not a whole behaviour policy ({error}); write it again with save_behaviour."
+        ) from error
+    if card.get("format") != FORMAT or not layers:
+        raise CheckpointError(
+            f"{path} has behaviour format {card.get('format')} with {layers} layers, this version reads format "
+            f"{FORMAT}; write it again with save_behaviour."
+        )
+    return BehaviourPolicy(actors, noise, card)
+
+
+def shipped_policy(level: Literal["medium", "expert"], task: str = "simple_spread") -> BehaviourPolicy:
+    """The behaviour policy of a tier, for three agents, from the files that ship with the package."""
+    if level not in ("medium", "expert"):
+        raise unknown("behaviour level", level, ("medium", "expert"))
+    return load_behaviour(POLICIES / f"{task}-{level}.safetensors")
+
+
+def collect(
+    env: Env, policy: BehaviourPolicy | Literal["random"], episodes: int, key: Key, batch: int = 2000
+) -> dict[str, np.ndarray]:
+    """Roll out `episodes` whole episodes, `batch` at a time; the result depends on `key` and `batch` alone.
+
+    Returns float32 arrays in rollout order: observations (E, L+1, N, O), state (E, L+1, S), actions (E, L, N, A) as
+    executed, rewards (E, L, N), costs (E, L). Row t+1 is the state after action t; costs are of that state.
+    """
+    if policy != "random" and not isinstance(policy, BehaviourPolicy):
+        raise UserError(f"Cannot collect with policy {policy!r}; pass 'random' or a BehaviourPolicy.")
+    actors, noise = (None, 0.0) if policy == "random" else (policy.actors, policy.noise)
+    _check_actors(env, actors)
+    batch = min(batch, episodes)
+
+    def chunk(k: int) -> dict[str, Array]:
+        return _rollout_policy(env, actors, jnp.float32(noise), jax.random.fold_in(key, k), batch)
+
+    return gather(chunk, episodes, batch)
+
+
+def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000) -> dict[str, np.ndarray]:
+    """Play recorded actions (E, L, N, A) from recorded states (leading axis E); same arrays as `collect`."""
+    episodes = len(actions)
+    batch = min(batch, episodes)
+
+    def chunk(k: int) -> dict[str, Array]:
+        # The last chunk repeats its final episode up to a full batch, so that one compilation serves all chunks.
+        rows = np.minimum(np.arange(k * batch, (k + 1) * batch), episodes - 1)
+        start = jax.tree.map(lambda x: jnp.asarray(x[rows]), initial)
+        return _rollout_actions(env, start, jnp.asarray(actions[rows], jnp.float32))
+
+    return gather(chunk, episodes, batch)
+
+
+def replay_episodes(
+    env: SimpleSpread,
+    episodes: int = 3900,
+    seed: int = 0,
+    progress: Callable[[int, float], None] | None = None,
+) -> dict[str, np.ndarray]:
+    """`medium-replay`: what the learner did from scratch until it was about medium; same arrays as `collect`.
+
+    Seed 0 with the shipped physics (three agents, `velocity_first`) re-simulates the shipped actions, which frees
+    the data from differences of floating-point arithmetic between machines; anything else runs the learner. Fewer
+    than all 3900 episodes are spread evenly over the run, in order, so a small set has the mix of the whole. The
+    learner always learns from the `omar` reward; `env` decides which reward and cost are recorded.
+    """
+    total = REPLAY_TRANSITIONS // env.episode_length
+    if not 1 <= episodes <= total:
+        raise UserError(f"A medium-replay set holds 1 to {total} episodes, got {episodes}; the run is not longer.")
+    shipped = SimpleSpread()
+    physics = ("n_agents", "integrator", "episode_length", "half_width")
+    if seed == 0 and all(getattr(env, f) == getattr(shipped, f) for f in physics):
+        initial, actions = _load_replay(POLICIES / "simple_spread-medium-replay.npz")
+    else:
+        teacher = replace(env, reward="omar")
+        run = train_behaviour(teacher, MATD3Config(), jax.random.key(seed), REPLAY_TRANSITIONS, progress)
+        initial, actions = run.initial, run.actions
+    rows = np.linspace(0, total - 1, episodes).round().astype(int)
+    return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
+
+
+def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
+    """Per-episode numbers of `collect`'s arrays: return (sum over time of the agents' mean reward) and cost.
+
+    `avoidable_cost` is the mean cost of the episodes that do not start in contact, the only ones that a policy
+    could have kept free of cost; `contact_starts` is the share of the others.
+    """
+    positions = data["state"][:, 0, : 2 * data["actions"].shape[2]].reshape(len(data["state"]), -1, 2)
+    gaps = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
+    apart = (gaps + 10.0 * np.eye(gaps.shape[-1]) >= 0.3).all((1, 2))
+    returns, cost = data["rewards"].mean(-1).sum(-1), data["costs"].sum(-1)
+    return {
+        "episodes": len(returns),
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "cost": float(cost.mean()),
+        "avoidable_cost": float(cost[apart].mean()) if apart.any() else 0.0,
+        "contact_starts": float(1.0 - apart.mean()),
+    }
+
+
+# ------------------------------------------------------------------------------------------------ the shipped tiers
+
+TARGETS = {"medium": 273.4, "expert": 531.0}  # mean returns of the public sets
+TIER_NOISE = 0.1  # std of the exploration noise in the medium and expert data (OMAR's default)
+LINEAGE = 375_000  # transitions of the run that the shipped tiers come from; it ends beyond the expert's level
+
+
+def train_tier_policies(
+    folder: str | Path = POLICIES, progress: Callable[[int, float], None] | None = None
+) -> dict[str, dict[str, float]]:
+    """Make the shipped files: one learner, seed 0; its first 97 500 transitions are the replay.
+
+    Of its snapshots, `medium` and `expert` are those whose return, with noise `TIER_NOISE`, is nearest to the public
+    sets' over 20 000 episodes. Returns the statistics of each tier. About four minutes on two cores.
+    """
+    env, config, folder = SimpleSpread(), MATD3Config(), Path(folder)
+    run = train_behaviour(env, config, jax.random.key(0), LINEAGE, progress)
+    policies = [snapshot(run, k, TIER_NOISE) for k in range(len(run.seen))]
+
+    def score(k: int, episodes: int) -> dict[str, float]:
+        return statistics(collect(env, policies[k], episodes, jax.random.key(1)))
+
+    rough = np.array([score(k, 2000)["return_mean"] for k in range(len(policies))])
+    tiers = {}
+    for level, target in TARGETS.items():
+        scores = {int(k): score(k, 20_000) for k in np.argsort(np.abs(rough - target))[:4]}
+        best = min(scores, key=lambda k: abs(scores[k]["return_mean"] - target))
+        tiers[level] = {"seen": int(run.seen[best]), **scores[best]}
+        card = {
+            "task": "simple_spread",
+            "level": level,
+            "return": round(scores[best]["return_mean"], 2),
+            "transitions": int(run.seen[best]),
+            "command": COMMAND,
+        }
+        save_behaviour(replace(policies[best], info=card), folder / f"simple_spread-{level}.safetensors")
+    episodes = REPLAY_TRANSITIONS // env.episode_length
+    initial, actions = jax.tree.map(lambda x: x[:episodes], run.initial), run.actions[:episodes]
+    _save_replay(initial, actions, folder / "simple_spread-medium-replay.npz")
+    tiers["medium-replay"] = statistics(resimulate(env, initial, actions))
+    return tiers
+
+
+def _save_replay(initial: SpreadState, actions: np.ndarray, path: Path) -> None:
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp.npz")
+    try:
+        np.savez_compressed(temporary, position=initial.position, landmarks=initial.landmarks, actions=actions)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
+    try:
+        with np.load(path) as file:
+            position, landmarks, actions = file["position"], file["landmarks"], file["actions"]
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        raise CheckpointError(f"{path} is not a whole replay ({error}); make it again with `{COMMAND}`.") from error
+    return SpreadState(position, np.zeros_like(position), landmarks), actions
+
+
+# ---------------------------------------------------------------------------------------------------- the learner
+
+
+@partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
+def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
+    state = jax.eval_shape(partial(env.reset, batch=1), key)
+    n_obs = jax.eval_shape(env.observe, state).shape[-1]
+    n = env.n_agents
+    return matd3.init(config, key, n, n_obs, n * n_obs, env.action_dim)
+
+
+def _empty_memory(env: Env, episodes: int) -> _Memory:
+    length, n = env.episode_length, env.n_agents
+    state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
+    return _Memory(
+        states=jax.tree.map(lambda s: jnp.zeros((episodes, length + 1, *s.shape[1:]), s.dtype), state),
+        actions=jnp.zeros((episodes, length, n, env.action_dim)),
+        rewards=jnp.zeros((episodes, length, n)),
+        terminated=jnp.zeros((episodes, length), bool),
+    )
+
+
+@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
+def _train_rounds(
+    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
+) -> tuple[Learner, _Memory, Array]:
+    """For every round: one episode in each environment, then the updates. Returns the rounds' mean returns too."""
+
+    def one_round(carry, xs):
+        learner, memory = carry
+        number, key = xs
+        k_collect, k_update = jax.random.split(key)
+        fresh = _explore(env, config, learner.actors, number < config.random_rounds, k_collect)
+        memory = jax.tree.map(
+            lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, number * config.envs, 0), memory, fresh
+        )
+        stored = (number + 1) * config.envs
+
+        def one_update(learner, xs):
+            index, key = xs
+            return _update(env, config, learner, memory, stored, index % config.delay == 0, key), None
+
+        # The random rounds only fill the buffer; the learner starts with the first round of its own.
+        steps = jnp.arange(config.updates), jax.random.split(k_update, config.updates)
+        learner = jax.lax.cond(
+            number + 1 >= config.random_rounds,
+            lambda learner: jax.lax.scan(one_update, learner, steps)[0],
+            lambda learner: learner,
+            learner,
+        )
+        return (learner, memory), fresh.rewards.mean(-1).sum(-1).mean()
+
+    (learner, memory), scores = jax.lax.scan(one_round, (learner, memory), (rounds, keys))
+    return learner, memory, scores
+
+
+def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
+    """One episode in each of the config's environments, laid out as the buffer's rows."""
+    k_reset, key = jax.random.split(key)
+    first = env.reset(k_reset, config.envs)
+
+    def step(state, key):
+        k_noise, k_uniform = jax.random.split(key)
+        action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, k_noise)
+        action = jnp.where(uniform, jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0), action)
+        # Executed at half precision, so that a replay file of half the size repeats the run exactly.
+        action = action.astype(jnp.float16).astype(jnp.float32)
+        after, transition = env.step(state, action)
+        return after, (after, action, transition.reward, transition.terminated)
+
+    _, (after, actions, rewards, terminated) = jax.lax.scan(step, first, jax.random.split(key, env.episode_length))
+    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
+    return _Memory(states, *(jnp.swapaxes(x, 0, 1) for x in (actions, rewards, terminated)))
+
+
+def _update(
+    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
+) -> Learner:
+    """One critic update and, if `act`, one update of actors and targets."""
+    k_rows, k_noise = jax.random.split(key)
+    e, t = jnp.divmod(jax.random.randint(k_rows, (config.batch,), 0, stored * env.episode_length), env.episode_length)
+    before = jax.tree.map(lambda x: x[e, t], memory.states)
+    after = jax.tree.map(lambda x: x[e, t + 1], memory.states)
+    actions, rewards, terminated = memory.actions[e, t], memory.rewards[e, t], memory.terminated[e, t]
+    observations, next_observations = env.observe(before), env.observe(after)
+    joint = (x.reshape(config.batch, -1) for x in (observations, next_observations))
+    batch = Transitions(observations, next(joint), actions, rewards, terminated, next_observations, next(joint))
+    return matd3.update(config, learner, batch, act, k_noise)
+
+
+# ------------------------------------------------------------------------------------------------------- rollouts
+
+
+@partial(jax.jit, static_argnums=(0, 4))
+def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch: int) -> dict[str, Array]:
+    k_reset, key = jax.random.split(key)
+
+    def choose(state, key):
+        if actors is None:
+            return jax.random.uniform(key, (batch, env.n_agents, env.action_dim), minval=-1.0, maxval=1.0)
+        return matd3.noisy(matd3.act(actors, env.observe(state)), noise, key)
+
+    return rollout(env, env.reset(k_reset, batch), choose, jax.random.split(key, env.episode_length))
+
+
+@partial(jax.jit, static_argnums=0)
+def _rollout_actions(env: Env, first: PyTree, actions: Array) -> dict[str, Array]:
+    return rollout(env, first, lambda _, action: action, jnp.swapaxes(actions, 0, 1))
+
+
+def rollout(env: Env, first: PyTree, choose: Callable, xs: PyTree) -> dict[str, Array]:
+    """Arrays (B, L, ...) of episodes from `first`, under actions `choose(state, x)`, x along the first axis of `xs`."""
+
+    def step(state, x):
+        action = choose(state, x)
+        after, transition = env.step(state, action)
+        return after, (after, action, transition.reward, transition.cost)
+
+    _, (after, *rest) = jax.lax.scan(step, first, xs)
+    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
+    actions, rewards, costs = (jnp.swapaxes(x, 0, 1) for x in rest)
+    return {
+        "observations": jax.vmap(env.observe, 1, 1)(states),
+        "state": jax.vmap(env.global_state, 1, 1)(states),
+        "actions": actions,
+        "rewards": rewards,
+        "costs": costs,
+    }
+
+
+def gather(chunk: Callable[[int], dict[str, Array]], episodes: int, batch: int) -> dict[str, np.ndarray]:
+    """Fill preallocated arrays chunk by chunk, so that the peak is the result plus one chunk."""
+    if episodes < 1 or batch < 1:
+        raise UserError(f"Cannot collect {episodes} episodes in batches of {batch}; both must be at least 1.")
+    out: dict[str, np.ndarray] = {}
+    for k, start in enumerate(range(0, episodes, batch)):
+        part = chunk(k)
+        stop = min(start + batch, episodes)
+        for name, x in part.items():
+            if name not in out:
+                out[name] = np.empty((episodes, *x.shape[1:]), np.float32)
+            out[name][start:stop] = np.asarray(x)[: stop - start]
+    return out
+
+
+def _check_actors(env: Env, actors: Mlp | None) -> None:
+    if actors is None:
+        return
+    state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
+    wanted = (env.n_agents, jax.eval_shape(env.observe, state).shape[-1], env.action_dim)
+    found = (*actors.weights[0].shape[:2], actors.weights[-1].shape[-1])
+    if found != wanted:
+        raise UserError(
+            f"The behaviour policy is for (agents, observation, action) = {found}, the task has {wanted}; "
+            "train one for this task with train_behaviour."
+        )
+
+
+def main() -> None:
+    """Remake the shipped files and print their statistics as JSON."""
+    tiers = train_tier_policies(progress=lambda seen, score: print(f"{seen:7d} transitions: return {score:.1f}"))
+    print(json.dumps(tiers, indent=1))
+
+
+if __name__ == "__main__":
+    main()

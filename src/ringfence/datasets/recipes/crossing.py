@@ -1,0 +1,178 @@
+"""Crossing's data sets: the safety barrier certificates of Wang, Ames and Egerstedt (2017, "Safety barrier certificates
+for collisions-free multirobot systems", IEEE T-RO 33(3)), decentralised as in their section V, around a controller that
+heads for its goal: with room to spare and slowly (`careful`), or at full speed, with none, by somebody who trusts the
+brakes too much and steers with an unsteady hand (`hasty`)."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ringfence import __version__
+from ringfence.datasets.behaviour import gather, rollout
+from ringfence.datasets.recipes import COLLECTION
+from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, TURN, Crossing, CrossingState, length
+from ringfence.errors import UserError
+from ringfence.logs.store import EpisodeStore
+from ringfence.types import Array, Key, PolicyStep, PyTree
+
+if TYPE_CHECKING:
+    from ringfence.datasets.task import Task
+
+BATCH = 500  # episodes that are played at once
+ROUNDS = 15  # of Hildreth's method on the programme of a step
+SLOW = 0.25  # m/s: a unicycle that is slower turns as if it were that fast
+STUBBORN = 0.1  # of full push: what a head-on encounter is broken by
+
+
+@dataclass(frozen=True)
+class Driver:
+    """How somebody drives."""
+
+    speed: float  # m/s, towards the goal
+    brake: float  # m/s² that it believes everybody has
+    room: float  # m between rims that it keeps
+    haste: float  # γ of the certificate: how fast it may be used up
+    unsteady: float  # deviation of its hand
+
+
+DRIVERS = {
+    "careful": Driver(0.6, 1.0, 0.05, 1.0, 0.0),
+    "hasty": Driver(1.0, 1.1, 0.0, 2.0, 0.1),
+}
+STEADY = Driver(1.0, 0.9, 0.1, 2.0, 0.0)
+TIERS = ("careful", "hasty", "mixed", "random")
+
+
+def about(task: Task) -> dict:
+    """The simulator, for the card."""
+    env = task.env
+    room = f"{env.body}, goals {env.goals}, {env.spacing:g} m apart"
+    return {
+        "simulator": f"ringfence {__version__} crossing, {room}, {env.neighbours} seen who come nearest in {SOON:g} s"
+    }
+
+
+def whole(task: Task, transitions: int) -> int:
+    """Whole episodes, all of one length."""
+    return -(-transitions // task.env.episode_length) * task.env.episode_length
+
+
+class Driven(eqx.Module):
+    """A driver as a policy: it reads the state, which tells where everybody is."""
+
+    env: Crossing = eqx.field(static=True)
+    driver: Driver = eqx.field(static=True)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        now = self.env.from_global_state(state)
+        driver = jnp.broadcast_to(jnp.array(astuple(self.driver)), (*observations.shape[:2], 5))
+        return memory, PolicyStep(drive(self.env, now, driver, key), {})
+
+
+def references(task: Task) -> dict[str, Driven]:
+    """The tier's driver, and the certificates at their best: full speed, with the brakes that there are."""
+    known = {"behaviour policy": DRIVERS[task.tier]} if task.tier in DRIVERS else {}
+    return {name: Driven(task.env, driver) for name, driver in (known | {"certificates": STEADY}).items()}
+
+
+def relabelled(task: Task, store: EpisodeStore) -> None:
+    """There is one definition of danger."""
+
+
+def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+    """The data set of a tier."""
+    env, tier = task.env, task.tier
+    if env.obstacles or env.walls:
+        raise UserError(f"'{task.name}' has obstacles or walls that the drivers do not know; log it otherwise.")
+    episodes = transitions // env.episode_length
+    key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
+    made = gather(lambda k: _played(env, tier, jax.random.fold_in(key, k * BATCH), BATCH), episodes, BATCH)
+    how = {
+        "random": "pushes that change ten times an episode",
+        "mixed": "a driver for each agent and episode, between careful and hasty",
+    }.get(tier, f"safety barrier certificates, {DRIVERS.get(tier)}")
+    names = list(env.observation_names)
+    card = card | {"transitions": transitions, "collected": how, "observation_names": names}
+    arrays = (made[x] for x in ("observations", "actions", "rewards", "costs"))
+    return EpisodeStore.from_episodes(*arrays, state=made["state"], card=card)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 3))
+def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
+    kr, kd, ka = jax.random.split(key, 3)
+    some, other = (jnp.array(astuple(DRIVERS[x])) for x in ("careful", "hasty"))
+    share = jax.random.uniform(kd, (batch, env.n_agents, 1))
+    fixed = jnp.array(astuple(DRIVERS.get(tier, DRIVERS["hasty"])))
+    driver = some + share * (other - some) if tier == "mixed" else jnp.broadcast_to(fixed, (batch, env.n_agents, 5))
+    steps = env.episode_length
+    held = jax.random.uniform(kd, (steps // 10 + 1, batch, env.n_agents, 2), minval=-1.0, maxval=1.0)
+
+    def choose(state: CrossingState, t: Array) -> Array:
+        return held[t // 10] if tier == "random" else drive(env, state, driver, jax.random.fold_in(ka, t))
+
+    return rollout(env, env.reset(kr, batch), choose, jnp.arange(steps))
+
+
+def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
+    """Actions (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
+    speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
+    kw, kn = jax.random.split(key)
+    ahead = state.goal - state.position
+    far = length(ahead)
+    wanted = ahead / far[..., None] * jnp.minimum(speed, jnp.sqrt(1.6 * far))[..., None]
+    push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
+    push = push + STUBBORN * jax.random.normal(kw, push.shape)
+    push = certified(env, state, push, brake[..., None], room[..., None], haste[..., None])
+    if env.body == "unicycle":
+        push = steered(state, push)
+    return jnp.clip(push + unsteady[..., None] * jax.random.normal(kn, push.shape), -1.0, 1.0)
+
+
+def steered(state: CrossingState, push: Array) -> Array:
+    """A unicycle's push along its heading and turn (B, N, 2) that move it as `push` would move a disc, as far as they
+    can: across its heading it is moved by turning, and the faster it is, the less of that it needs."""
+    x, y = jnp.cos(state.heading), jnp.sin(state.heading)
+    along, across = push[..., 0] * x + push[..., 1] * y, push[..., 1] * x - push[..., 0] * y
+    turn = PUSH * across / jnp.maximum(length(state.velocity), SLOW) / TURN
+    return jnp.clip(jnp.stack([along, turn], -1), -1.0, 1.0)
+
+
+def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, room: Array, haste: Array) -> Array:
+    """The pushes nearest to `push` (B, N, 2) of which each agent's half of every pair's certificate holds,
+
+        −Δpᵀu ≤ ½ (γ h³ ‖Δp‖ − (Δvᵀ Δp)² / ‖Δp‖² + ‖Δv‖² + 2a Δvᵀ Δp / √(4a (‖Δp‖ − D)))
+        h = √(4a (‖Δp‖ − D)) + Δpᵀ Δv / ‖Δp‖
+
+    with the `neighbours` that one sees: a quadratic programme in the plane, by Hildreth's method."""
+    if env.n_agents == 1:
+        return push
+    offset, theirs = env.nearest(state)
+    gap, speed = -offset, -theirs
+    far = length(gap)
+    left = jnp.maximum(far - 2 * RADIUS - room, 1e-3)
+    root, closing = jnp.sqrt(4 * brake * left), (gap * speed).sum(-1)
+    h = root + closing / far
+    bound = haste * h**3 * far - (closing / far) ** 2 + (speed**2).sum(-1) + 2 * brake * closing / root
+    normal, bound = -gap / far[..., None], 0.5 * bound / far
+
+    def of_one(price: Array, j: Array) -> tuple[Array, None]:
+        u = push - (price[..., None] * normal).sum(-2)
+        new = price[..., j] + (normal[..., j, :] * u).sum(-1) - bound[..., j]
+        return price.at[..., j].set(jnp.maximum(new, 0.0)), None
+
+    price = jnp.zeros_like(bound)
+    price, _ = jax.lax.scan(of_one, price, jnp.tile(jnp.arange(bound.shape[-1]), ROUNDS))
+    return _bounded(push - (price[..., None] * normal).sum(-2))
+
+
+def _bounded(push: Array) -> Array:
+    return push / jnp.maximum(length(push), 1.0)[..., None]

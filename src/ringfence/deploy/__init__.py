@@ -1,0 +1,1 @@
+"""Policies that leave: exported files, and those that come with the package."""

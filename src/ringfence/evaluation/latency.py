@@ -1,0 +1,36 @@
+"""How long one joint action takes."""
+
+from __future__ import annotations
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.datasets.task import Task
+from ringfence.types import Array, Policy
+
+
+def _first(env) -> tuple[Array, Array]:
+    """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
+    if hasattr(env, "simulate"):
+        sim = env.simulate(1)
+        sim.reset([0])
+        return jnp.asarray(sim.observe(), jnp.float32), jnp.asarray(sim.state(), jnp.float32)
+    state = env.reset(jax.random.key(0), 1)
+    return env.observe(state), env.global_state(state)
+
+
+def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
+    """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
+    seen = _first(task.env)
+    act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, *seen, key)[1].action)
+    memory, keys = policy.start(1), jax.random.split(jax.random.key(1), calls + 10)
+    took = []
+    for key in keys:
+        begun = time.perf_counter()
+        act(policy, memory, seen, key).block_until_ready()
+        took.append((time.perf_counter() - begun) * 1e3)
+    p50, p99 = np.percentile(took[10:], [50, 99])
+    return {"plan_ms_p50": float(p50), "plan_ms_p99": float(p99)}

@@ -1,0 +1,117 @@
+"""The evaluation protocol: fixed resets shared by all methods, raw numbers first, unsafe starts apart.
+
+Test resets and validation resets come from disjoint keys; settings are chosen on validation, tables are made on test.
+Every episode is counted; *avoidable* cost is that of the episodes that do not start unsafe.
+"""
+
+from __future__ import annotations
+
+import time
+
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.datasets.task import Task
+from ringfence.errors import UserError, whole_number
+from ringfence.evaluation import statistics
+from ringfence.evaluation.rollout import COUNTED, rollout
+from ringfence.problem import constraints
+from ringfence.problem.homogeneous import look
+from ringfence.types import Policy
+
+PROTOCOL = 1  # results of different protocols are never mixed in one table
+
+
+def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.ndarray) -> dict:
+    """The protocol's numbers from per-step rewards and costs (E, L), the episodes' steps and terminations (E,), and
+    who started unsafe (E,). An episode that ends early costs little: `steps_mean`, `termination_rate` and `cost_rate`
+    (cost per step played) tell."""
+    returns, costs = played["rewards"].sum(1, dtype=np.float64), played["costs"].sum(1, dtype=np.float64)
+    steps, terminated = played["steps"], played["terminated"]
+    n, fine = len(returns), ~hazard_at_start
+    violated = costs > 0
+    avoidable = costs[fine] if fine.any() else np.zeros(1)
+    return {
+        "episodes": n,
+        "return_mean": float(returns.mean()),
+        "return_std": float(returns.std()),
+        "return_interval": statistics.bootstrap_mean(returns),
+        "return_norm": float(task.normalised_return(returns.mean())),
+        "cost_mean": float(costs.mean()),
+        "cost_interval": statistics.bootstrap_mean(costs),
+        "cost_norm": float(task.normalised_cost(costs.mean())),
+        "cost_cvar10": statistics.cvar(costs),
+        "cost_rate": float(costs.sum() / steps.sum()),
+        "steps_mean": float(steps.mean()),
+        "termination_rate": float(terminated.mean()),
+        "violation_rate": float(violated.mean()),
+        "violation_interval": statistics.clopper_pearson(int(violated.sum()), n),
+        "violation_upper": statistics.upper_bound(int(violated.sum()), n),
+        **{k: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
+        # Share of (agent, episode) with a cost of the agent's own.
+        **({"agent_violation_rate": float(played["touched"].any(1).mean())} if "touched" in played else {}),
+        "unsafe_starts": int(hazard_at_start.sum()),
+        "avoidable_cost": float(avoidable.mean()),
+        "avoidable_interval": statistics.bootstrap_mean(avoidable),
+        "avoidable_violation_upper": statistics.upper_bound(int((avoidable > 0).sum()), len(avoidable)),
+        "constants": {
+            "return_min": task.return_min,
+            "return_max": task.return_max,
+            "cost_limit": task.cost_limit,
+            "cost_offset": task.cost_offset,
+        },
+        "per_episode": {
+            "return": [round(float(x), 3) for x in returns],
+            "cost": [float(x) for x in costs],
+            "unsafe_start": [bool(x) for x in hazard_at_start],
+            "steps": [int(x) for x in steps],
+            "terminated": [bool(x) for x in terminated],
+        },
+    }
+
+
+def complete(result: dict, task: Task) -> bool:
+    """Whether a stored result says all that the protocol asks for: how many episodes ended early is younger than
+    results there are, which matters only where they can."""
+    return "termination_rate" in result or task.env is None or not task.env.terminates
+
+
+def of_last_step(result: dict, config: dict) -> bool:
+    """Whether a stored result is of a run's last step, by its config; a foreign one may tell none."""
+    steps = config.get("steps")
+    return steps is None or result.get("step", steps) == steps
+
+
+def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
+    """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
+    view = task.feature_map("pruned")
+    bound = constraints.bind(task.hazard, view.names, view.plus.shape[0])
+    seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(jnp.asarray(states)))
+    unsafe, _ = bound.labels(jnp.asarray(look(view, task.alike, seen, states)))
+    return np.asarray(unsafe.reshape(len(states), -1).any(-1))
+
+
+def evaluate_policy(
+    policy: Policy,
+    task: Task,
+    episodes: int = 200,
+    split: str = "test",
+    seed: int = 0,
+    record: int = 0,
+    label: str = "",
+    quiet: bool = True,
+) -> tuple[dict, dict[str, np.ndarray]]:
+    """(summary, what was recorded) of a policy on a task's simulator. Robots are played by any object with `start` and
+    `act` (types.Policy); Simple Spread, which runs inside JAX, by pytrees."""
+    if task.env is None:
+        raise UserError(
+            f"Task '{task.name}' exists only as data, so `ringfence eval` has nothing to play in; play in a simulator "
+            "of your own: `ringfence play RUN --env FILE.py:NAME`."
+        )
+    episodes, record = whole_number("episodes", episodes, 1, 10**7), whole_number("record", record)
+    record = min(record, episodes)
+    begun = time.perf_counter()
+    played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
+    result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
+    result |= {"protocol": PROTOCOL, "task": task.name, "split": split, "seed": seed}
+    return result | {"eval_seconds": time.perf_counter() - begun}, played

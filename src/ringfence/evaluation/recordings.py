@@ -1,0 +1,53 @@
+"""What an evaluation keeps of its first episodes, `rollout-<variant>.npz` in the run's folder.
+
+R episodes of L steps: states (R, L+1, S), costs and rewards (R, L); of planners also plans (R, L, P, H, N, D), the
+features of P drawn plans of H steps, and chosen (R, L) or (R, L, N), which of them was followed.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.utils.files import read_npz, whole
+
+Recording = dict[str, np.ndarray]
+
+
+def write(folder: Path, variant: str, played: Recording, episodes: int) -> None:
+    """Keep the first episodes, if any; what was recorded before, and its film, would show another evaluation."""
+    for kind in ("npz", "gif"):
+        (folder / f"rollout-{variant}.{kind}").unlink(missing_ok=True)
+    if episodes:
+        with whole(folder / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
+            np.savez_compressed(file, **{k: v[:episodes] for k, v in played.items()})
+
+
+def read(folder: Path, variant: str) -> Recording | None:
+    """What was kept, or None if nothing was."""
+    file = folder / f"rollout-{variant}.npz"
+    if not file.exists():
+        return None
+    try:
+        arrays = read_npz(file)
+        _check(arrays)
+    except ValueError as error:
+        raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error
+    return arrays
+
+
+def _check(arrays: Recording) -> None:
+    """Whoever shows a recording relies on its shapes."""
+    axes = {"states": 3, "costs": 2, "rewards": 2} | ({"plans": 6} if "plans" in arrays else {})
+    for name, wanted in axes.items():
+        if name not in arrays or arrays[name].ndim != wanted:
+            raise ValueError(f"it holds no '{name}' of {wanted} axes")
+    episodes, steps = arrays["costs"].shape
+    if not episodes or not steps:
+        raise ValueError("it holds no episode")
+    for name in (*axes, *(["chosen"] if "chosen" in arrays else [])):
+        told = (episodes, steps + (name == "states"))
+        if arrays[name].shape[:2] != told:
+            raise ValueError(f"'{name}' begins with {arrays[name].shape[:2]}, not with {told}")

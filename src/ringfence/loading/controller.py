@@ -1,0 +1,75 @@
+"""A trained policy at run time: NumPy in, NumPy out."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from ringfence.envs.episode import given_as
+from ringfence.errors import UserError, whole_number
+from ringfence.guards.policy import Paid, costs_of_one
+from ringfence.loading.resolve import load
+from ringfence.proposals.base import act_with, heard
+from ringfence.training.runs import Run
+
+
+class Controller:
+    """A trained policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
+
+    controller = Controller("runs/…/seed-0", guard="shield", danger="learned")
+    controller.reset()                             # at the start of every episode
+    action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
+
+    `info` says of the last action what the policy knows of it, e.g. `strange`: the World knows nothing there. Not for
+    several threads at once.
+    """
+
+    def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
+        self.job, self.policy = load(run, planner=planner, **options)
+        self._key = jax.random.key(whole_number("seed", seed, 0, 2**31 - 1))
+        self._act = jax.jit(act_with)
+        self.info: dict[str, np.ndarray] = {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: plans in progress and histories are forgotten."""
+        self._memory = self.policy.start(1)
+
+    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
+        """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
+        constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so
+        is what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow
+        NaN."""
+        width, state_width = self.job.widths
+        seen = given_as("observations", observations, (self.job.team, width))
+        if state is not None and state_width == 0:
+            raise UserError(
+                "This run's data has no global state, but act() was given one; pass the observations alone."
+            )
+        view = self.job.feature_map
+        if state is None and view.source == "state":
+            raise UserError(
+                f"act() got no state, but this run's view '{view.view}' reads it; pass the global state"
+                + (f" ({state_width} entries)." if state_width else ".")
+            )
+        whole = None if state is None else given_as("state", state, (state_width,))
+        if None in self.job.widths:
+            self._reaches(seen, whole)
+        self._key, key = jax.random.split(self._key)
+        whole = None if whole is None else whole[None]
+        if cost is not None:
+            self._memory = heard(self.policy, self._memory, costs_of_one(cost))
+        self._memory, step = self._act(self.policy, self._memory, seen[None], whole, key)
+        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
+        return np.asarray(step.action[0])
+
+    def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
+        """Refuse arrays too short for the entries that the run reads; runs of own data once told no widths."""
+        view, last = self.job.feature_map, int(self.job.feature_map.plus.max())
+        name, there = "observations", seen.shape[-1]
+        if view.source == "state":
+            name, there = "state", last + 1 if state is None else len(state)
+        elif state is not None:
+            name, there = "observations and state", there + len(state)
+        if last >= there:
+            raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")

@@ -1,0 +1,85 @@
+"""The Worlds of runs: kept beside them, given, or made again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ringfence.datasets import registry
+from ringfence.errors import UserError
+from ringfence.logs.provenance import regenerated
+from ringfence.training.runs import Run
+from ringfence.training.worlds import GUARD, WORLD, fit, load, usual
+from ringfence.world import Settings, World
+
+
+def of_run(run: Run, quiet: bool = True) -> World:
+    """The World that a run's training read, in its folder; of runs that read none, that of their data (`for_guard`)."""
+    kept = run.path / WORLD
+    return load(kept) if kept.exists() else _of_data(run, None, quiet)
+
+
+def for_guard(
+    run: Run,
+    sight: str | None = None,
+    world: World | str | Path | None = None,
+    read: World | None = None,
+    quiet: bool = True,
+) -> World:
+    """The World that guards a run: the one that is given; else that of its task and seed, whatever the run's own
+    training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
+    is the one in the run's folder, or has to be given. `read`: what training read, if it is loaded already."""
+    alike = run.config["spec"].get("alike", False)
+    sight = sight or ("own" if alike else "all")
+    if world is not None:
+        world = world if isinstance(world, World) else load(world)
+        _of_same(run, world, sight)
+        return world
+    if (run.path / GUARD).exists() and (kept := load(run.path / GUARD)).alone == (sight == "own"):
+        return kept
+    if read is not None or (run.path / WORLD).exists():
+        found = read or of_run(run, quiet)
+        # Training may ask for another view, or for values that look less far.
+        wanted = Settings(**usual(registry.TASKS[run.config["task"]], sight)) if _made_here(run) else None
+        told = found.card["settings"]
+        same = wanted is None or (wanted.view, wanted.discount) == (told["view"], told["discount"])
+        if same and found.alone == (sight == "own"):
+            return found
+    return _of_data(run, sight, quiet)
+
+
+def _made_here(run: Run) -> bool:
+    """Whether this package regenerates the data of a run."""
+    return regenerated(run.config["data"]) and run.config["task"] in registry.TASKS
+
+
+def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
+    """The World of a run's data and seed, where that is regenerated."""
+    told = run.config
+    if not _made_here(run):
+        raise UserError(
+            f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
+            f"STORE --out FILE{' --sight own' if sight == 'own' else ''}` and name it with world=FILE."
+        )
+    from ringfence.datasets.make import make
+
+    card = told["data"]
+    size = card.get("size", card.get("transitions"))
+    store, _ = make(registry.get(told["task"]), size, card.get("seed", 0), must_keep=False)
+    return fit(store, seed=told["seed"], sight=sight, quiet=quiet)
+
+
+def _of_same(run: Run, world: World, sight: str) -> None:
+    """Refuse a World of other data, or of another sight."""
+    told = run.config
+    here, there = told["data"].get("content"), world.card["data"]
+    apart = told["task"] != there["task"] or (here is not None and here != there["content"])
+    if apart:
+        raise UserError(
+            f"The World is of '{there['task']}', the run '{run.path}' of other data ('{told['task']}'); fit one to the "
+            "data that the run was trained on."
+        )
+    if world.alone != (sight == "own"):
+        raise UserError(
+            f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; "
+            f"fit one with `ringfence fit STORE --sight {sight}`."
+        )

@@ -1,0 +1,1 @@
+"""Logged episodes: what they hold, where they come from."""

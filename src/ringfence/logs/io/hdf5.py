@@ -1,0 +1,308 @@
+"""Import the HDF5 files of single-agent offline reinforcement learning: DSRL's, D4RL's and Minari's. M rows or T steps:
+
+    DSRL    observations, next_observations (M, ...), actions (M, ...), rewards, costs, terminals, timeouts (M,)
+    D4RL    observations, actions, rewards, terminals, timeouts; next_observations in some, and infos/, metadata/
+    Minari  episode_0, episode_1, ..., each with observations (T+1, ...), or a group of them, actions, rewards,
+            terminations, truncations (T,), infos/ (T+1 rows, the first of the reset); metadata.json beside the file
+
+The names and shapes are those of the repositories liuzuxin/DSRL (`dsrl/offline_env.py`, Liu et al. 2023),
+Farama-Foundation/D4RL (`d4rl/offline_env.py`, `d4rl/__init__.py`, Fu et al. 2020) and Farama-Foundation/Minari
+(read in `minari.py`). What the files do not say, and is done here:
+
+* the state that an episode's last step led to is in `next_observations` or, with Minari, in the last row. D4RL's files
+  without it give up the last step of every episode, whose own observation becomes the last state; since nothing is
+  known of where that step led, no such episode counts as terminated;
+* a step that is marked both as a terminal and as a timeout is a terminal; rows after the last mark are an unfinished
+  episode and are dropped. Minari's episodes end with their group: one without a mark is truncated;
+* costs are DSRL's `costs` and Minari's `infos/cost`, both of the state that a step leads to. Elsewhere they are 0, and
+  the card says that nothing was recorded;
+* the log is one agent's, unless a map of columns shares it out among several (`columns.py`).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ringfence.datasets import registry
+from ringfence.errors import StoreError, UserError
+from ringfence.logs.io import columns, common, minari
+from ringfence.logs.schema import complete_card
+from ringfence.logs.store import EpisodeStore
+from ringfence.utils import arrays, schemas
+
+D4RL = ("observations", "actions", "rewards", "terminals", "timeouts")
+DSRL = ("observations", "next_observations", "actions", "rewards", "costs", "terminals", "timeouts")
+MINARI = ("terminations", "truncations")  # names that stand in its episodes alone
+EPISODE = re.compile(r"episode_(\d{1,9})")
+DATASET = re.compile(r"\w[\w\-/]*-v\d+")  # a Minari data set's name
+APART = 1e-3  # of an entry's deviation: two records of one state differ by rounding alone
+STRAYS = 0.05  # of the steps: more of them that do not lead to the next row are no episodes
+CHUNK = 50_000  # rows at a time
+
+
+def import_hdf5(
+    path: str | os.PathLike,
+    *,
+    task: str | None = None,
+    agents: dict | str | os.PathLike | None = None,
+    cost_limit: float | None = None,
+    action_low: float | None = None,
+    action_high: float | None = None,
+) -> EpisodeStore:
+    """The store of a DSRL, D4RL or Minari file, of a folder with Minari's main_data.hdf5, or of a Minari data set that
+    is on this machine, by its name (needs the extra `minari`). The layout is recognised by the names in the file.
+
+    `agents` shares the columns out (see `columns.py`): a dictionary, JSON text or a JSON file's path; one agent by
+    default. `task` defaults to the name of the file or the data set. `cost_limit` is the cost per episode that reports
+    call safe. Actions are bounded by `action_low` and `action_high`, by default by Minari's action space, else by −1
+    and 1. `StoreError` names what does not fit, with the row of the file.
+    """
+    told = {"task": task, "cost_limit": cost_limit}
+    told = {key: value for key, value in told.items() if value is not None}
+    complete_card(told)  # a name that cannot be one is refused before the file is read
+    asked = common.Asked(None if agents is None else columns.read(agents), action_low, action_high)
+    path = _located(path)
+    try:
+        with h5py.File(path, "r") as f:
+            episodes = _recognised(path, f)
+            log = minari.read(path, f, episodes, asked) if episodes else _flat(path, f, asked)
+    except UserError:
+        raise
+    except OSError as error:
+        said = str(error).splitlines()[0]
+        raise StoreError(f"'{path}' is truncated or not HDF5 ({said}); copy it again.") from error
+    except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise StoreError(f"'{path}' is damaged ({said}); copy it again.") from error
+    return _store(path, log, asked.agents, told)
+
+
+def _store(path: Path, log: common.Logs, agents: columns.Columns | None, told: dict) -> EpisodeStore:
+    """The steps, shared out."""
+    (low, high), notes = log.bounds, list(log.notes)
+    seen, done = log.observations[:, None], log.actions[:, None]
+    card: dict[str, Any] = {"agents": ["agent0"]}
+    if agents is not None:
+        widest = {kind: max(len(a[kind]) for a in agents.values()) for kind in ("observation", "action")}
+        rows = len(log.observations) * widest["observation"] + len(log.actions) * widest["action"]
+        arrays.fits(path, 4 * rows * len(agents))
+        seen = columns.take(log.observations, [a["observation"] for a in agents.values()])
+        done = columns.take(log.actions, [a["action"] for a in agents.values()], 0.5 * (low + high))
+        card = {"agents": list(agents), "columns": agents}
+        sizes = [len(a["action"]) for a in agents.values()]
+        card |= {"action_sizes": sizes} if len({*sizes}) > 1 else {}
+        notes += [note] if (note := columns.note(agents)) else []
+    if log.costs is None:
+        notes.append("no costs are recorded, so every step has 0: what is learned from this knows no danger")
+    names = log.names
+    if names and agents is not None:  # several agents see different columns, so none has one name
+        names = [names[k] for k in next(iter(agents.values()))["observation"]] if len(agents) == 1 else None
+    flags = np.zeros((2, len(log.actions)), bool)
+    flags[np.where(log.terminated, 0, 1), log.ends - 1] = True
+    card |= {
+        "task": _task_name(log.name),
+        "simulator": log.simulator,
+        "provenance": f"imported from {log.layout}'s layout in '{path}'",
+        "action_low": low,
+        "action_high": high,
+        "observation_names": names,
+        "warnings": notes,
+        **told,
+    }
+    try:
+        return EpisodeStore(
+            np.ascontiguousarray(seen),
+            np.ascontiguousarray(done),
+            np.repeat(log.rewards[:, None], seen.shape[1], 1),
+            np.zeros(len(log.actions), np.float32) if log.costs is None else log.costs,
+            flags[0],
+            flags[1],
+            log.ends,
+            card=card,
+        )
+    except UserError as error:
+        raise StoreError(f"'{path}': {error}") from None
+
+
+def _task_name(name: str) -> str:
+    """A data set's name as a task's; that of a task of ours would tie the data to its simulator."""
+    name = name.replace("/", "-").strip()
+    try:
+        schemas.check(name, schemas.Name)
+    except ValueError:
+        return "imported"
+    return f"{name}-imported" if name in registry.TASKS else name
+
+
+# --- finding and recognising ---
+def _located(given: str | os.PathLike) -> Path:
+    """The HDF5 file of a path, of a Minari data set's folder, or of its name."""
+    path = Path(given)
+    if path.is_file():
+        return path
+    if path.is_dir():
+        inside = [f for f in (path / "main_data.hdf5", path / "data" / "main_data.hdf5") if f.is_file()]
+        if not inside:
+            raise StoreError(f"'{path}' holds no main_data.hdf5; give an HDF5 file or the folder of a Minari data set.")
+        return inside[0]
+    if path.exists():
+        raise StoreError(f"'{path}' is no regular file; give an HDF5 file.")
+    if not DATASET.fullmatch(str(given)):
+        raise StoreError(
+            f"There is no file '{path}'; give an HDF5 file, or the name of a Minari data set (door/human-v2)."
+        )
+    try:
+        from minari.storage import get_dataset_path
+    except ImportError:
+        raise StoreError(
+            f"There is no file '{path}'; to find a Minari data set by its name, run pip install 'ringfence[minari]'."
+        ) from None
+    folder = get_dataset_path(str(given))
+    if not folder.is_dir():
+        raise StoreError(
+            f"There is no file '{path}', and no such Minari data set in '{folder}'; download it with Minari."
+        )
+    return _located(folder)
+
+
+def _recognised(path: Path, f: h5py.File) -> list[str]:
+    """The names of Minari's episodes in order, none where the file is flat; refused where it is neither or both."""
+    if "ringfence_store" in f.attrs:
+        raise StoreError(f"'{path}' is an episode store already; use it as it is.")
+    names = list(f)
+    episodes = sorted((n for n in names if EPISODE.fullmatch(n)), key=lambda n: int(n.removeprefix("episode_")))
+    flat = [n for n in names if n in DSRL]
+    strays = [n for n in names if n in MINARI]
+    if episodes and (flat or strays):
+        raise StoreError(
+            f"'{path}' mixes layouts: '{(flat or strays)[0]}' lies beside Minari's '{episodes[0]}'; keep one of them."
+        )
+    if episodes:
+        return episodes
+    if not flat:
+        what = f"holds '{names[0]}'" if names else "holds nothing"
+        raise StoreError(
+            f"'{path}' {what}, which fits neither DSRL, D4RL nor Minari; see docs/data.md for their names."
+        )
+    if strays:
+        raise StoreError(f"'{path}' mixes layouts: Minari's '{strays[0]}' lies beside '{flat[0]}'; keep one of them.")
+    layout, needed = ("DSRL", DSRL) if "costs" in names else ("D4RL", D4RL)
+    missing = [n for n in needed if n not in names]
+    if missing:
+        raise StoreError(
+            f"'{path}' lacks '{missing[0]}', which {layout}'s layout has; add it, or use EpisodeStore.from_steps."
+        )
+    return []
+
+
+# --- D4RL and DSRL ---
+def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
+    layout = "DSRL" if "costs" in f else "D4RL"
+    found = {name: arrays.array(path, f, name) for name in DSRL if name in f}
+    rows = len(found["actions"])
+    for name, array in found.items():
+        if len(array) != rows:
+            raise StoreError(f"'{path}' has {len(array)} rows of '{name}' and {rows} of 'actions'; copy it again.")
+        if name in ("rewards", "costs", "terminals", "timeouts"):
+            common.vector(path, name, array.shape)
+    seen, acted = (common.entries(path, name, found[name].shape) for name in ("observations", "actions"))
+    following = found.get("next_observations")
+    if following is not None and following.shape != found["observations"].shape:
+        raise StoreError(
+            f"'{path}' has next_observations {following.shape} and observations {found['observations'].shape}; they "
+            "must be of one shape."
+        )
+    common.continuous(path, "actions", found["actions"])
+    if asked.agents is not None:
+        columns.check(path, asked.agents, seen, acted)
+    bounds = common.bounds_of(None, asked)
+    arrays.affordable(path, sum(array.nbytes for array in found.values()), common.PACKED)
+
+    terminals, timeouts = (common.flags(path, name, found[name], rows) for name in ("terminals", "timeouts"))
+    ends = np.flatnonzero(terminals | timeouts) + 1
+    if not len(ends):
+        raise StoreError(
+            f"'{path}' marks no end of an episode in its {rows} rows; set terminals or timeouts at their last steps."
+        )
+    kept = int(ends[-1])
+    notes = common.flattened(found["observations"].shape, found["actions"].shape)
+    if kept < rows:
+        notes.append(f"the last {rows - kept} rows are an unfinished episode and were dropped")
+    if both := int((terminals & timeouts).sum()):
+        notes.append(f"{both} steps are marked as terminals and as timeouts, too, and count as terminals")
+    others = sorted(set(f) - set(DSRL) - {"infos", "metadata"})
+    if others:
+        notes.append(f"not read: {', '.join(others[:10])}" + f" and {len(others) - 10} more" * (len(others) > 10))
+    infos = f["infos"] if isinstance(f.get("infos", getlink=True), h5py.HardLink) else None
+    if layout == "D4RL" and isinstance(infos, h5py.Group) and "cost" in infos:
+        notes.append(
+            "infos/cost is not read, since D4RL does not say which state it belongs to; as 'costs' it would be"
+        )
+
+    observations = common.numbers(path, "observations", found["observations"], kept)
+    actions = common.numbers(path, "actions", found["actions"], kept)
+    common.within(path, "actions", actions, bounds)
+    rewards = common.numbers(path, "rewards", found["rewards"], kept)[:, 0]
+    costs = common.numbers(path, "costs", found["costs"], kept)[:, 0] if "costs" in found else None
+    terminated = terminals[ends - 1]
+    if following is not None:
+        reached = common.numbers(path, "next_observations", following, kept)
+        notes += _broken(path, observations, reached, ends)
+        observations = np.insert(observations, ends, reached[ends - 1], axis=0)
+    else:
+        lengths = np.diff(ends, prepend=0)
+        notes.append(_given_up(lengths, terminated))
+        long = lengths > 1
+        if not long.any():
+            raise StoreError(
+                f"'{path}' has no next_observations and no episode of two steps, so nothing says where a step led; "
+                "add next_observations."
+            )
+        inside = np.ones(kept, bool)
+        inside[ends - 1] = False
+        observations = observations[np.repeat(long, lengths)]
+        actions, rewards = actions[inside], rewards[inside]
+        ends = np.cumsum(lengths[long] - 1)
+        terminated = np.zeros(len(ends), bool)
+    return common.Logs(layout, observations, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
+
+
+def _given_up(lengths: np.ndarray, terminated: np.ndarray) -> str:
+    note = "next_observations is missing, so the last step of every episode was given up, its observation being the end"
+    if terminated.any():
+        note += f"; where {int(terminated.sum())} terminations led is not known, so those episodes count as truncated"
+    short = int((lengths == 1).sum())
+    return note + (f"; {short} episodes of one step are gone" if short else "")
+
+
+def _broken(path: Path, observations: np.ndarray, reached: np.ndarray, ends: np.ndarray) -> list[str]:
+    """Whether inside episodes a step leads to the next row: refused where many do not, else noted."""
+    inside = np.ones(len(observations), bool)
+    inside[ends - 1] = False
+    before = np.flatnonzero(inside)
+    some = observations[:: max(1, len(observations) // 100_000)].astype(np.float64)
+    slack = APART * some.std(0) + 1e-5 * np.abs(some).max(0)  # and single precision's rounding
+    wrong = [k[(np.abs(reached[k] - observations[k + 1]) > slack).any(1)] for k in _chunks(before)]
+    wrong = np.concatenate([*wrong, np.zeros(0, int)])
+    if len(wrong) > STRAYS * len(before):
+        raise StoreError(
+            f"'{path}': row {wrong[0]} of next_observations differs from the next row of observations, and so do "
+            f"{len(wrong)} of {len(before)} inside episodes; give rows in the order of time, and their ends."
+        )
+    if not len(wrong):
+        return []
+    return [
+        f"{len(wrong)} steps inside episodes, row {wrong[0]} first, do not lead to the next row; its observation was "
+        "taken for where they led"
+    ]
+
+
+def _chunks(rows: np.ndarray) -> Iterator[np.ndarray]:
+    return (rows[k : k + CHUNK] for k in range(0, len(rows), CHUNK))

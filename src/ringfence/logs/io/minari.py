@@ -1,0 +1,251 @@
+"""Read Minari's HDF5 layout: a group of every episode, metadata.json beside the file. T steps of an episode:
+
+    episode_0, episode_1, ...   observations (T+1, ...) or a group of them, actions (T, ...) or a group,
+                                rewards, terminations, truncations (T,), infos/ (T+1 rows, the first of the reset)
+
+The layout is that of Farama-Foundation/Minari (`minari/dataset/_storages/hdf5_storage.py`; older versions keep the
+metadata in the file's attributes). Groups are joined in the order of their names. The end of a group is the end of an
+episode: one without a mark is truncated.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ringfence.errors import StoreError
+from ringfence.logs.io import columns, common
+from ringfence.utils import arrays, schemas
+
+NAMES = ("observations", "actions", "rewards", "terminations", "truncations")
+FOREIGN = {"terminals": "D4RL", "timeouts": "D4RL", "next_observations": "D4RL", "costs": "DSRL"}
+DEEP, MANY = 8, 4096  # levels of groups within observations or actions, and arrays in them
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """What an episode's group holds."""
+
+    steps: int
+    observations: dict[str, tuple[int, ...]]  # arrays and the shapes of their rows
+    actions: dict[str, tuple[int, ...]]
+    cost: bool
+    size: int  # bytes
+
+
+def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> common.Logs:
+    """The steps of those episodes, in that order."""
+    told, notes = _metadata(path, f), []
+    if isinstance(count := told.get("total_episodes"), int | np.integer) and count != len(episodes):
+        raise StoreError(f"'{path}' holds {len(episodes)} episodes, its metadata tells of {count}; copy it again.")
+    bounds = common.bounds_of(_action_space(path, told, asked, notes), asked)
+    found = {name: _shapes(path, f, name) for name in episodes}
+    first = found[episodes[0]]
+    for name, shapes in found.items():
+        if replace(shapes, steps=0, size=0) != replace(first, steps=0, size=0):
+            kinds = ("observations", "actions", "cost")
+            kind = next(k for k in kinds if getattr(shapes, k) != getattr(first, k))
+            raise StoreError(
+                f"'{path}' has '{name}' with other {'infos/cost' if kind == 'cost' else kind} than '{episodes[0]}'; "
+                "all episodes must hold the same arrays."
+            )
+    seen, acted = (sum(math.prod(s) for s in x.values()) for x in (first.observations, first.actions))
+    if not seen or not acted:
+        raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
+    if asked.agents is not None:
+        columns.check(path, asked.agents, seen, acted)
+    arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
+
+    if empty := [name for name, shapes in found.items() if not shapes.steps]:
+        notes.append(f"{len(empty)} episodes without a step were dropped")
+        found = {name: shapes for name, shapes in found.items() if shapes.steps}
+    ends = np.cumsum([shapes.steps for shapes in found.values()], dtype=np.int64)
+    if not len(ends):
+        raise StoreError(f"'{path}' holds no episode with a step; record some.")
+    steps = int(ends[-1])
+    observations = np.empty((steps + len(ends), seen), np.float32)
+    actions, rewards, costs = (np.empty(s, np.float32) for s in ((steps, acted), (steps,), (steps,)))
+    terminated, truncated = np.zeros((2, len(ends)), bool)
+    for k, (name, shapes) in enumerate(found.items()):
+        here, stop = f[name], int(ends[k])
+        now = slice(stop - shapes.steps, stop)
+        observations[now.start + k : stop + k + 1] = _joined(path, here, name, shapes.observations)
+        actions[now] = _joined(path, here, name, shapes.actions)
+        common.within(path, f"{name}/actions", actions[now], bounds)
+        rewards[now] = common.numbers(path, f"{name}/rewards", here["rewards"])[:, 0]
+        terminated[k], truncated[k] = _ended(path, here, name, shapes.steps)
+        if first.cost:
+            costs[now] = common.numbers(path, f"{name}/infos/cost", here["infos/cost"])[-shapes.steps :, 0]
+    if both := int((terminated & truncated).sum()):
+        notes.append(f"{both} episodes are marked as terminated and as truncated, too, and count as terminated")
+    if neither := int((~terminated & ~truncated).sum()):
+        notes.append(f"{neither} episodes end without a mark and count as truncated")
+    names = [
+        f"{key.partition('/')[2]}" + f".{j}" * (math.prod(shape) > 1)
+        for key, shape in first.observations.items()
+        for j in range(math.prod(shape))
+    ]
+    flat = tuple(first.observations) == ("observations",)
+    if flat:
+        notes += common.flattened((0, *first.observations["observations"]), (0,))
+    return common.Logs(
+        "Minari",
+        observations,
+        actions,
+        rewards,
+        costs if first.cost else None,
+        ends,
+        terminated,
+        bounds,
+        notes,
+        told["dataset_id"] if isinstance(told.get("dataset_id"), str) else path.stem,
+        None if flat else names,
+        _simulator(told),
+    )
+
+
+def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
+    """What an episode holds, looked at before anything is read."""
+    group = arrays.member(path, f, name)
+    if not isinstance(group, h5py.Group):
+        raise StoreError(f"'{path}' holds an array where the group '{name}' belongs; write the file again.")
+    strays = [n for n in group if n in FOREIGN]
+    if strays:
+        raise StoreError(
+            f"'{path}' mixes layouts: '{name}' holds {FOREIGN[strays[0]]}'s '{strays[0]}'; see docs/data.md."
+        )
+    missing = [n for n in NAMES if n not in group]
+    if missing:
+        raise StoreError(f"'{path}' lacks '{name}/{missing[0]}', which every episode of Minari's has; copy it again.")
+    flat = {n: arrays.array(path, group, n, f"{name}/{n}") for n in ("rewards", "terminations", "truncations")}
+    steps, size = len(flat["rewards"]), sum(array.nbytes for array in flat.values())
+    for key, array in flat.items():
+        common.vector(path, f"{name}/{key}", array.shape)
+        common.rows_of(path, f"{name}/{key}", len(array), steps, steps)
+    parts: dict[str, dict[str, tuple[int, ...]]] = {}
+    for kind, expected in (("observations", steps + 1), ("actions", steps)):
+        parts[kind] = {}
+        for key, array in _leaves(path, group, kind, name):
+            common.rows_of(path, f"{name}/{key}", len(array), expected, steps)
+            if kind == "actions":
+                common.continuous(path, f"{name}/{key}", array)
+            parts[kind][key] = array.shape[1:]
+            size += array.nbytes
+    infos = arrays.member(path, group, "infos", f"{name}/infos") if "infos" in group else None
+    cost = isinstance(infos, h5py.Group) and "cost" in infos
+    if cost:
+        array = arrays.array(path, infos, "cost", f"{name}/infos/cost")
+        common.vector(path, f"{name}/infos/cost", array.shape)
+        if len(array) != steps:  # one of every step; the reset has told none
+            common.rows_of(path, f"{name}/infos/cost", len(array), steps + 1, steps)
+        size += array.nbytes
+    return Shapes(steps, parts["observations"], parts["actions"], cost, size)
+
+
+def _leaves(path: Path, group: h5py.Group, kind: str, name: str) -> Iterator[tuple[str, h5py.Dataset]]:
+    """The arrays of observations or actions, of groups in the order of their names."""
+    stack, count = [kind], 0
+    while stack:
+        key = stack.pop()
+        holder, _, last = key.rpartition("/")
+        inside = group[holder] if holder else group
+        found = arrays.member(path, inside, last, f"{name}/{key}")
+        if not isinstance(found, h5py.Group):
+            yield key, arrays.array(path, inside, last, f"{name}/{key}")
+        elif key.count("/") >= DEEP:
+            raise StoreError(f"'{path}' nests '{name}/{key[:200]}' too deeply; keep {DEEP} levels at most.")
+        else:
+            stack += [f"{key}/{part}" for part in sorted(found, key=_place, reverse=True)]
+        if (count := count + 1) > MANY:
+            raise StoreError(f"'{path}' has more than {MANY} arrays in '{name}/{kind}'; join them into fewer.")
+
+
+def _place(part: str) -> tuple[int, str]:
+    """Members of a tuple are called _index_0, _index_1, ..., _index_10."""
+    match = re.fullmatch(r"_index_(\d{1,9})", part)
+    return (int(match[1]) if match else -1, part)
+
+
+def _joined(path: Path, group: h5py.Group, name: str, parts: dict[str, tuple[int, ...]]) -> np.ndarray:
+    return np.concatenate([common.numbers(path, f"{name}/{key}", group[key]) for key in parts], 1)
+
+
+def _ended(path: Path, group: h5py.Group, name: str, steps: int) -> tuple[bool, bool]:
+    """(terminated, truncated) of an episode's last step; a mark before it is refused."""
+    marks = [common.flags(path, f"{name}/{key}", group[key], steps) for key in ("terminations", "truncations")]
+    early = np.flatnonzero((marks[0] | marks[1])[:-1])
+    if len(early):
+        raise StoreError(
+            f"'{path}' marks step {early[0]} of '{name}' as an end, but {steps - 1 - early[0]} more follow; split the "
+            "episode there."
+        )
+    return bool(marks[0][-1]), bool(marks[1][-1])
+
+
+def _metadata(path: Path, f: h5py.File) -> dict:
+    """Minari's word on the data: metadata.json beside the file or, of old versions, the file's own attributes."""
+    file = path.with_name("metadata.json")
+    if not file.is_file():
+        keys = ("total_episodes", "dataset_id", "env_spec", "action_space")
+        return {k: v.decode() if isinstance(v := f.attrs[k], bytes) else v for k in keys if k in f.attrs}
+    try:
+        if file.stat().st_size > schemas.LARGEST:
+            raise ValueError(f"it is larger than {schemas.LARGEST / 2**20:.0f} MiB")
+        told = json.loads(file.read_bytes())
+        if not isinstance(told, dict):
+            raise ValueError("it is no object")
+    except (OSError, ValueError, RecursionError) as error:
+        raise StoreError(
+            f"'{file}' cannot be read ({error}); copy it again, or read the HDF5 file without it."
+        ) from None
+    return told
+
+
+def _action_space(path: Path, told: dict, asked: common.Asked, notes: list[str]) -> tuple[float, float] | None:
+    """The bounds of Minari's action space, the widest of any entry; None where it has none or they are not asked."""
+    if "action_space" not in told or (asked.low is not None and asked.high is not None):
+        return None
+    try:
+        boxes = list(_boxes(path, json.loads(told["action_space"])))
+        low, high = (np.concatenate([np.asarray(box[k], np.float64).ravel() for box in boxes]) for k in ("low", "high"))
+    except StoreError:
+        raise
+    except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise StoreError(
+            f"'{path}' comes with an action space that cannot be read ({type(error).__name__}: {error}); pass "
+            "action_low and action_high (--action-low, --action-high)."
+        ) from None
+    if not len(low) or not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return None
+    if np.ptp(low) or np.ptp(high):
+        notes.append("entries of the action space have bounds of their own; the card holds the widest for all of them")
+    return float(low.min()), float(high.max())
+
+
+def _boxes(path: Path, space: dict) -> Iterator[dict]:
+    kind = space["type"]
+    if kind == "Box":
+        yield space
+    elif kind in ("Dict", "Tuple"):
+        parts = space["subspaces"]
+        for part in parts.values() if isinstance(parts, dict) else parts:
+            yield from _boxes(path, part)
+    else:
+        raise StoreError(
+            f"'{path}' has {str(kind)[:60]} actions, choices among few; only continuous ones are learned here."
+        )
+
+
+def _simulator(told: dict) -> str | None:
+    try:
+        name = json.loads(told["env_spec"])["id"]
+    except (KeyError, RecursionError, TypeError, ValueError):
+        return None
+    return name[:200] if isinstance(name, str) else None

@@ -1,0 +1,482 @@
+"""EpisodeStore: logged episodes of several agents, validated, in one HDF5 file with a JSON card.
+
+Time runs along the first axis, episodes one after another. T is the number of steps, E of episodes:
+
+    observations (T+E, N, O)   one more row than steps in every episode: the last state is kept
+    state        (T+E, S)      global state, when known
+    actions      (T, N, A)     rewards (T, N)     costs (T,) of the team, or (T, N) of each agent
+    constraints  (T, C)        or (T, N, C): the cost of each of several constraints, whose names and limits per episode
+                               the card's `constraints` tells; `costs` is then the largest of them
+    speed        (T,)          m/s, of robots whose simulator told it: what another speed limit would count
+    terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
+    episode_ends (E,)          cumulative number of steps
+
+The cost of step t belongs to the state that step t leads to.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ringfence.errors import StoreError, UserError, unknown
+from ringfence.logs.schema import ARRAYS, OPTIONAL, complete_card, validate
+from ringfence.problem import constraints
+from ringfence.utils import arrays, schemas
+from ringfence.utils.files import whole
+from ringfence.utils.pytrees import digest_of
+
+FORMAT = 1
+PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
+
+
+@dataclass(frozen=True, eq=False)
+class EpisodeStore:
+    """Logged episodes in memory; see the module's docstring for shapes. Validated when made."""
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    costs: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    episode_ends: np.ndarray
+    state: np.ndarray | None = None
+    card: dict = field(default_factory=dict)
+    speed: np.ndarray | None = None
+    constraints: np.ndarray | None = None
+
+    def __post_init__(self):
+        object.__setattr__(self, "card", complete_card(self.card))
+        validate(self)
+
+    def __repr__(self) -> str:
+        named = f" ({', '.join(self.limits)})" if self.limits else ""
+        return (
+            f"EpisodeStore('{self.card['task']}': {self.episodes:,} episodes, {self.steps:,} steps of {self.n_agents} "
+            f"agents, observations {self.observations.shape[2]}, actions {self.actions.shape[2]}, state "
+            f"{0 if self.state is None else self.state.shape[1]}, {100 * (self.costs > 0).mean():.3g} % of "
+            f"entries with cost{named})"
+        )
+
+    # --- sizes ---
+    @property
+    def steps(self) -> int:
+        return len(self.actions)
+
+    @property
+    def episodes(self) -> int:
+        return len(self.episode_ends)
+
+    @property
+    def n_agents(self) -> int:
+        return self.observations.shape[1]
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """(E,) steps per episode."""
+        return np.diff(self.episode_ends, prepend=0)
+
+    @property
+    def episode_of_step(self) -> np.ndarray:
+        """(T,) index of the episode of every step; row of step t in `observations` is t + episode_of_step[t]."""
+        return np.repeat(np.arange(self.episodes), self.lengths)
+
+    @property
+    def returns(self) -> np.ndarray:
+        """(E,) undiscounted episode return of the team: the sum over time of the mean over agents."""
+        return self._per_episode(self.rewards.mean(1))
+
+    @property
+    def episode_terminated(self) -> np.ndarray:
+        """(E,) bool: the task itself ended the episode."""
+        return self.terminated[self.episode_ends - 1]
+
+    @property
+    def episode_costs(self) -> np.ndarray:
+        """(E,) undiscounted episode cost of the team."""
+        return self._per_episode(self.team_costs)
+
+    @property
+    def team_costs(self) -> np.ndarray:
+        """(T,) cost of every step: of agents with costs of their own, the largest one."""
+        return team(self.costs)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limit per episode of each named constraint, in the order of `constraints`; empty where there are none."""
+        return self.card.get("constraints") or {}
+
+    def of_constraint(self, name: str) -> np.ndarray:
+        """(T,) or (T, N) cost of one constraint."""
+        return self.constraints[..., list(self.limits).index(name)]
+
+    def episode_costs_of(self, name: str) -> np.ndarray:
+        """(E,) undiscounted episode cost of the team, of one constraint."""
+        return self._per_episode(team(self.of_constraint(name)))
+
+    def _per_episode(self, x: np.ndarray) -> np.ndarray:
+        return np.add.reduceat(x.astype(np.float64), np.concatenate([[0], self.episode_ends[:-1]]))
+
+    @property
+    def hazard(self) -> constraints.Hazard:
+        """The definition of danger in the card; CostColumn when the card has none."""
+        return constraints.from_dict(self.card["hazard"])
+
+    @functools.cached_property
+    def content(self) -> str:
+        """Digest of all arrays: other steps have another."""
+        return self.digest(*ARRAYS, *OPTIONAL)
+
+    def digest(self, *names: str) -> str:
+        """Of some of the arrays."""
+        arrays = ((name, getattr(self, name)) for name in names)
+        return digest_of((name, array) for name, array in arrays if array is not None)
+
+    def select(self, keep: np.ndarray) -> EpisodeStore:
+        """The episodes where `keep` (E,) is true."""
+        keep = np.asarray(keep, bool)
+        if not keep.any():
+            raise StoreError("No episode is left after the selection; relax the rule that selects them.")
+        steps = np.repeat(keep, self.lengths)
+        rows = np.repeat(keep, self.lengths + 1)
+        return EpisodeStore(
+            self.observations[rows],
+            self.actions[steps],
+            self.rewards[steps],
+            self.costs[steps],
+            self.terminated[steps],
+            self.truncated[steps],
+            np.cumsum(self.lengths[keep]),
+            None if self.state is None else self.state[rows],
+            self.card,
+            None if self.speed is None else self.speed[steps],
+            None if self.constraints is None else self.constraints[steps],
+        )
+
+    def followed_by(self, other: EpisodeStore) -> EpisodeStore:
+        """These episodes and then the other's, of the same agents; the card is this one's."""
+        if (self.state is None) != (other.state is None):
+            raise StoreError("One of the stores holds a global state and the other none; leave it out of both.")
+        if list(self.limits) != list(other.limits):
+            raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
+        costs, several = ([getattr(s, name) for s in (self, other)] for name in ("costs", "constraints"))
+        if costs[0].ndim != costs[1].ndim:  # the team's are everybody's
+            costs = [c if c.ndim == 2 else np.repeat(c[:, None], self.n_agents, 1) for c in costs]
+            several = [c if c is None or c.ndim == 3 else np.repeat(c[:, None], self.n_agents, 1) for c in several]
+        told = {name: [getattr(s, name) for s in (self, other)] for name in (*ARRAYS, *OPTIONAL)}
+        told |= {
+            "costs": costs,
+            "constraints": several,
+            "episode_ends": [self.episode_ends, other.episode_ends + self.steps],
+        }
+        if len({x.shape[1:] for x in told["observations"]}) > 1 or len({x.shape[1:] for x in told["actions"]}) > 1:
+            raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
+        kept = {name: None if any(x is None for x in both) else np.concatenate(both) for name, both in told.items()}
+        return EpisodeStore(**kept, card=self.card)
+
+    def apart(self) -> EpisodeStore:
+        """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
+        `team` of the card tells how many they were. The global state is nobody's own, so it is left out."""
+        n = self.n_agents
+        if self.costs.ndim == 1 and n > 1:
+            raise StoreError(
+                f"The agents of '{self.card['task']}' are alike and learn from what each of them meets, but its costs "
+                "are the team's; give costs (T, N)."
+            )
+
+        c = len(self.limits)
+
+        def own(x: np.ndarray) -> np.ndarray:
+            return np.ascontiguousarray(np.moveaxis(x, 1, 0)).reshape(-1, 1, *x.shape[2:])
+
+        return EpisodeStore(
+            own(self.observations),
+            own(self.actions),
+            own(self.rewards),
+            self.costs if self.costs.ndim == 1 else self.costs.T.reshape(-1),
+            np.tile(self.terminated, n),
+            np.tile(self.truncated, n),
+            np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),
+            card={
+                **self.card,
+                "state_names": None,
+                "agents": None,
+                "action_sizes": None,
+                "team": n,
+                "content": self.content,
+            },
+            constraints=None if self.constraints is None else np.moveaxis(self.constraints, 1, 0).reshape(-1, c),
+        )
+
+    # --- making ---
+    @classmethod
+    def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
+        """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
+        costs (E, L), (E, L, N), a dictionary of these by the constraint's name, or None, state (E, L+1, S);
+        `terminated` (E,) bool says which ended by themselves (none, if it is not given)."""
+        observations, actions = _numbers("observations", observations), _numbers("actions", actions)
+        if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
+            raise StoreError(
+                f"from_episodes got observations {observations.shape} and actions {actions.shape}; they must be "
+                "(E, L+1, N, O) and (E, L, N, A): keep the state that the last action leads to."
+            )
+        e, length, n = actions.shape[:3]
+        rewards = _numbers("rewards", rewards)
+        costs, several, card = _several(costs, (e, length), n, card)
+        costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
+        one = {
+            "observations": (observations, (e, length + 1, n)),
+            "costs": (costs, (e, length, n)[: max(2, costs.ndim)]),
+        }
+        one["rewards"] = (rewards, (e, length, n)[: max(2, rewards.ndim)])
+        if state is not None:
+            state = _numbers("state", state)
+            one["state"] = (state, (e, length + 1))
+        if terminated is not None:
+            one["terminated"] = (np.asarray(terminated), (e,))
+        for name, (value, expected) in one.items():
+            wide = len(expected) + (name in ("observations", "state"))
+            if value.shape[: len(expected)] != expected or value.ndim != wide:
+                raise StoreError(
+                    f"from_episodes got {name} of shape {value.shape}, the actions say {e} episodes of {length} steps "
+                    f"and {n} agents; give ({', '.join(map(str, expected))}{', ...' * (wide > len(expected))})."
+                )
+        if rewards.ndim == 2:
+            rewards = np.repeat(rewards[..., None], n, -1)
+        last = np.zeros((e, length), bool)
+        last[:, -1] = True
+        ended = np.zeros(e, bool) if terminated is None else np.asarray(terminated, bool)
+        flat = lambda x, lead: np.ascontiguousarray(np.asarray(x).reshape(lead, *np.shape(x)[2:]))  # noqa: E731
+        return cls(
+            flat(observations, e * (length + 1)).astype(np.float32, copy=False),
+            flat(actions, e * length).astype(np.float32, copy=False),
+            flat(rewards, e * length).astype(np.float32, copy=False),
+            flat(costs, e * length).astype(np.float32, copy=False),
+            (last & ended[:, None]).ravel(),
+            (last & ~ended[:, None]).ravel(),
+            np.arange(1, e + 1) * length,
+            None if state is None else flat(state, e * (length + 1)).astype(np.float32, copy=False),
+            {} if card is None else card,
+            constraints=None if several is None else flat(several, e * length),
+        )
+
+    @classmethod
+    def from_steps(
+        cls,
+        observations,
+        actions,
+        rewards,
+        *,
+        episode_ends,
+        final_observations,
+        costs=None,
+        state=None,
+        final_state=None,
+        terminated=None,
+        speed=None,
+        card=None,
+    ):
+        """Flat logs: observations (T, N, O), actions (T, N, A), rewards (T,) or (T, N), costs (T,) or (T, N), or a
+        dictionary of these by the constraint's name (the card's `constraints` gives each its limit per episode, 0 by
+        default), state (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state`
+        (E, S): the state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit);
+        speed (T,)."""
+        ends = _numbers("episode_ends", episode_ends, 1)
+        if (ends % 1 != 0).any():
+            raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
+        ends = ends.astype(np.int64)
+        observations = _numbers("observations", observations, 3).astype(np.float32, copy=False)
+        actions = _numbers("actions", actions, 3).astype(np.float32, copy=False)
+        final_observations = _numbers("final_observations", final_observations, 3).astype(np.float32, copy=False)
+        rewards = _numbers("rewards", rewards).astype(np.float32, copy=False)
+        costs, several, card = _several(costs, actions.shape[:1], actions.shape[1], card)
+        state, final_state = (
+            None if x is None else _numbers(name, x, 2).astype(np.float32, copy=False)
+            for name, x in (("state", state), ("final_state", final_state))
+        )
+        if len(ends) == 0 or ends[-1] != len(actions):
+            raise StoreError(
+                f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {len(actions)} steps; "
+                "it must be cumulative and end with the number of steps (drop an unfinished last episode)."
+            )
+        if (np.diff(ends, prepend=0) <= 0).any():
+            raise StoreError("episode_ends must increase; give cumulative step counts.")
+        for name, value, rows in (
+            ("observations", observations, len(actions)),
+            ("state", state, len(actions)),
+            ("terminated", terminated, len(ends)),
+        ):
+            if value is not None and len(value) != rows:
+                raise StoreError(f"from_steps got {len(value)} rows of {name}, it takes {rows}; see its docstring.")
+        lasts = {"final_observations": (final_observations, (len(ends), *observations.shape[1:]))}
+        if state is not None and final_state is not None:
+            lasts["final_state"] = (final_state, (len(ends), *np.shape(state)[1:]))
+        for name, (value, expected) in lasts.items():
+            if np.shape(value) != expected:
+                raise StoreError(
+                    f"{name} has shape {np.shape(value)}, expected {expected}: the state that each of the {len(ends)} "
+                    "episodes ended in."
+                )
+        if rewards.ndim == 1:
+            rewards = np.repeat(rewards[:, None], actions.shape[1], 1)
+        ended = np.zeros(len(ends), bool) if terminated is None else np.asarray(terminated, bool)
+        flags = np.zeros((2, len(actions)), bool)
+        flags[0, ends[ended] - 1] = True
+        flags[1, ends[~ended] - 1] = True
+        if state is not None and final_state is None:
+            raise StoreError("state was given without final_state; pass the global state each episode ended in, too.")
+        return cls(
+            np.insert(observations, ends, final_observations, axis=0),
+            actions,
+            rewards,
+            np.zeros(len(actions), np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
+            flags[0],
+            flags[1],
+            ends,
+            None if state is None else np.insert(state, ends, final_state, axis=0),
+            {} if card is None else card,
+            None if speed is None else _numbers("speed", speed),
+            several,
+        )
+
+    @classmethod
+    def from_table(cls, table, *, time: str, agent: str, state, **options):
+        """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
+        Parquet file; options as of `ringfence.logs.io.table.from_table`."""
+        from ringfence.logs.io.table import from_table
+
+        return from_table(table, time=time, agent=agent, state=state, **options)
+
+    # --- disk ---
+    def save(self, path: str | os.PathLike) -> Path:
+        """Write one HDF5 file, whole or not at all."""
+        path = Path(path)
+        with whole(path) as temporary:
+            try:
+                with h5py.File(temporary, "w") as f:
+                    f.attrs["ringfence_store"] = FORMAT
+                    f.attrs["card"] = told = json.dumps(self.card)
+                    f.attrs["digest"], f.attrs["card_digest"] = self.content, _digest(told)
+                    for name in (*ARRAYS, *OPTIONAL):
+                        if getattr(self, name) is not None:
+                            f.create_dataset(name, data=getattr(self, name))
+            except RuntimeError as error:  # HDF5 on a full disk, when it closes the file
+                raise OSError(str(error)) from error
+        return path
+
+    @classmethod
+    def load(cls, path: str | os.PathLike) -> EpisodeStore:
+        """Read and validate; a foreign, truncated, damaged or invalid file is refused, never read in part."""
+        path = Path(path)
+        if not path.exists():
+            raise StoreError(f"No episode store at '{path}'; make one with `ringfence data make TASK`.")
+        if not path.is_file():
+            raise StoreError(f"'{path}' is no regular file; give the file of an episode store.")
+        try:
+            with h5py.File(path, "r") as f:
+                if f.attrs.get("ringfence_store") != FORMAT:
+                    raise StoreError(
+                        f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
+                    )
+                there = _checked(path, f)
+                raw, digest = f.attrs["card"], f.attrs.get("digest")
+                if not isinstance(raw, str | bytes) or len(raw) > 2**24:
+                    raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
+                if f.attrs.get("card_digest", of := _digest(raw)) != of:
+                    raise StoreError(
+                        f"'{path}' has another card than was written; make or import it again, or delete its "
+                        "attribute 'card_digest' if you wrote the card yourself."
+                    )
+                card = schemas.decode(raw, dict[str, Any])
+                content = {name: array[()] for name, array in there.items()}
+        except StoreError:
+            raise
+        except OSError as error:
+            told = str(error).splitlines()[0]
+            raise StoreError(f"'{path}' is truncated or not HDF5 ({told}); make or import the store again.") from error
+        except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
+            told = (str(error).splitlines() or [type(error).__name__])[0]
+            raise StoreError(f"'{path}' is damaged or has no card ({told}); make or import it again.") from error
+        try:
+            found = cls(**content, card=card)
+        except UserError as error:
+            raise StoreError(f"'{path}': {error}") from None
+        if digest is not None and digest != found.content:
+            raise StoreError(
+                f"'{path}' holds other numbers than were written (its digest differs); make or import it again."
+            )
+        return found
+
+
+def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
+    """The arrays of a file, looked at before any of them is read: plain ones, in the file itself, of shapes that belong
+    together and of no more bytes than the file can hold."""
+    missing = [name for name in ARRAYS if name not in f]
+    if missing:
+        raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
+    found = {name: arrays.array(path, f, name) for name in (*ARRAYS, *OPTIONAL) if name in f}
+    steps, episodes = found["actions"].shape[0], found["episode_ends"].shape[0]
+    rows = {"observations": steps + episodes, "state": steps + episodes, "episode_ends": episodes}
+    for name, array in found.items():
+        if array.shape[0] != rows.get(name, steps):
+            raise StoreError(
+                f"'{path}' holds {array.shape[0]} rows of '{name}' for {steps} steps of {episodes} episodes; make or "
+                "import the store again."
+            )
+    arrays.affordable(path, sum(array.nbytes for array in found.values()), PACKED)
+    return found
+
+
+def team(costs: np.ndarray) -> np.ndarray:
+    """(T,) the largest of agents' costs (T, N), or those of the team as they are."""
+    return costs if costs.ndim == 1 else costs.max(1)
+
+
+def _several(costs, lead: tuple[int, ...], agents: int, card: dict | None):
+    """(costs, constraints, card): of a dictionary by name the largest, all of them (*lead, C) or (*lead, N, C), and the
+    card with a limit of each."""
+    if not isinstance(costs, dict):
+        return costs, None, card
+    if not costs:
+        raise StoreError("costs is an empty dictionary; name a constraint, or give costs=None.")
+    found = {name: _numbers(f"costs['{name}']", x) for name, x in costs.items()}
+    for name, x in found.items():
+        if x.shape not in (lead, (*lead, agents)):
+            raise StoreError(f"costs['{name}'] has shape {x.shape}, expected {lead} or {(*lead, agents)}.")
+    if any(x.ndim > len(lead) for x in found.values()):  # the team's are everybody's
+        found = {k: x if x.ndim > len(lead) else np.repeat(x[..., None], agents, -1) for k, x in found.items()}
+    told = dict((card or {}).get("constraints") or {})
+    if strangers := [name for name in told if name not in found]:
+        raise unknown("constraint with a limit", strangers[0], found)
+    several = np.stack(list(found.values()), -1).astype(np.float32)
+    limits = {name: told.get(name, 0.0) for name in found}
+    return several.max(-1), several, {**(card or {}), "constraints": limits}
+
+
+def _digest(card: str | bytes) -> str:
+    return hashlib.blake2b(card.encode() if isinstance(card, str) else card, digest_size=8).hexdigest()
+
+
+def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
+    """An array of real numbers, with that many axes; ragged lists, words and None are refused by name."""
+    if np.ma.is_masked(value):
+        raise StoreError(f"{name} hides entries behind a mask; fill them in, or drop the episodes that hold them.")
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # rows of several lengths
+        raise StoreError(f"{name} is no array ({str(error).split('. ')[0]}); give every row the same length.") from None
+    if array.dtype.kind not in "biuf":
+        kind = "nothing" if value is None else "entries that are no real numbers"
+        raise StoreError(f"{name} holds {kind} (dtype {array.dtype}); give an array of numbers.")
+    if axes is not None and array.ndim != axes:
+        raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
+    return array

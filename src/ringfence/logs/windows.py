@@ -1,0 +1,90 @@
+"""Windows of H steps, drawn on the device from episodes that live there.
+
+A window starts at a step t that has an action. Rows before the episode's start repeat its first state (history),
+rows past its end repeat its last one and are marked invalid.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import normalise
+from ringfence.types import Array, Batch, Key
+
+NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
+
+
+class WindowData:
+    """Episodes on the device, with all that is needed to draw windows.
+
+    M = T + E rows of states, T steps. `arrays` is a pytree of device arrays that jitted functions take as an
+    argument, so that the data is never baked into a compiled program. `scores` (T,) is the condition of the window that
+    begins at each step (scores.py), for algorithms that read one.
+    """
+
+    def __init__(self, store: EpisodeStore, features: Callable, scores: np.ndarray | None = None):
+        episode = store.episode_of_step
+        starts = np.concatenate([[0], store.episode_ends[:-1]])
+        row, last = np.arange(store.steps) + episode, store.episode_ends[episode] + episode
+        bounds = store.card["action_low"], store.card["action_high"]
+        seen = np.asarray(features(store.observations, store.state), np.float32)
+        scores = np.zeros(store.steps) if scores is None else scores
+        self.steps = store.steps
+        self.arrays = {
+            "features": jnp.asarray(seen),  # (M, N, D)
+            "actions": normalise.to_unit(jnp.asarray(store.actions), *bounds),  # (T, N, A)
+            "rewards": jnp.asarray(store.rewards),  # (T, N)
+            "terminated": jnp.asarray(store.terminated),  # (T,)
+            "scores": jnp.asarray(scores, jnp.float32),  # (T,)
+            # (M,) the team's, charged on arriving
+            "costs": jnp.asarray(np.insert(store.team_costs, starts, NOT_ARRIVED), jnp.float32),
+            "row": jnp.asarray(row, jnp.int32),  # (T,) row of the state before the step
+            "first_row": jnp.asarray(starts[episode] + episode, jnp.int32),  # (T,)
+            "last_row": jnp.asarray(last, jnp.int32),  # (T,)
+        }
+
+
+def draw(arrays: dict[str, Array], key: Key, batch: int, horizon: int, history: int = 0) -> Batch:
+    """`batch` windows of `history + horizon` rows, uniform over all steps of the data; row `history` is the present."""
+    step = jax.random.randint(key, (batch,), 0, arrays["row"].shape[0])
+    return at(arrays, step, horizon, history)
+
+
+def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) -> Batch:
+    """The windows whose present is the state before `step` (B,)."""
+    offset = jnp.arange(-history, horizon)
+    wanted = arrays["row"][step][:, None] + offset
+    first, last = arrays["first_row"][step][:, None], arrays["last_row"][step][:, None]
+    row = jnp.clip(wanted, first, last)
+    valid = wanted <= last
+    # Step index of the action after each row but the last; a padded one is masked out.
+    after = jnp.clip(step[:, None] + offset[:-1], 0, arrays["actions"].shape[0] - 1)
+    acted = valid[:, 1:] & (wanted[:, :-1] >= first)
+    return Batch(
+        features=arrays["features"][row],
+        actions=jnp.where(acted[..., None, None], arrays["actions"][after], 0.0),
+        valid=valid,
+        score=arrays["scores"][step],
+        costs=arrays["costs"][row],
+        rewards=jnp.where(acted[..., None], arrays["rewards"][after], 0.0),
+        terminated=acted & arrays["terminated"][after],
+    )
+
+
+def returns_to_go(reward: np.ndarray, lengths: np.ndarray, discount: float) -> np.ndarray:
+    """(T, ...) discounted sum of `reward` (T, ...) from every step to the end of its episode."""
+    out = np.zeros(reward.shape, np.float64)
+    ends = np.cumsum(lengths)
+    # Episodes advance together, from their last steps backwards: as many passes as the longest has steps.
+    carry = np.zeros((len(lengths), *reward.shape[1:]))
+    for back in range(1, int(lengths.max()) + 1):
+        alive = lengths >= back
+        index = ends[alive] - back
+        carry[alive] = reward[index] + discount * carry[alive]
+        out[index] = carry[alive]
+    return out

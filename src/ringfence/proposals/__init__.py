@@ -1,0 +1,1 @@
+"""What proposes actions: networks that act, and planners that draw plans."""

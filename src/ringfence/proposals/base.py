@@ -1,0 +1,94 @@
+"""What acts without planning, and how any policy's actions are foreseen: batched, pure, normaliser inside."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ringfence.problem import normalise
+from ringfence.problem.features import FeatureMap, translation
+from ringfence.problem.normalise import Normaliser
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree, Spec
+from ringfence.world import World
+
+
+class Direct(eqx.Module):
+    """An actor network on the present features, one per agent, squashed into the action bounds."""
+
+    actor: Any
+    normaliser: Normaliser
+    spec: Spec = eqx.field(static=True)
+    feature_map: FeatureMap = eqx.field(static=True)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        return memory, PolicyStep(from_unit(self.decide(self.feature_map(observations, state)), self.spec), {})
+
+    def decide(self, x: Array) -> Array:
+        """Actions (..., N, A) in [−1, 1] at features (..., N, D)."""
+        return jnp.tanh(self.actor(self.normaliser.state(x)))
+
+    def propose(
+        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
+        """(memory, actions (B, 1, `rows`, N, A) in [−1, 1], info): what the actor does now and along foreseen rows."""
+        seen, present = self.feature_map(observations, state), world.map(observations, state)
+        return memory, rolled(self.decide, self.feature_map, world, seen, present, rows), {}
+
+
+def from_unit(action: Array, spec: Spec) -> Array:
+    """Actions in [−1, 1], as everything learns them, in the task's bounds."""
+    return normalise.from_unit(spec.own(action), spec.action_low, spec.action_high)
+
+
+class Constant(eqx.Module):
+    """Does nothing, or acts uniformly at random: the reference rows of every table."""
+
+    spec: Spec = eqx.field(static=True)
+    random: bool = eqx.field(static=True, default=False)
+
+    def start(self, batch: int) -> PyTree:
+        return {}
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        s = self.spec
+        shape = (observations.shape[0], s.n_agents, s.action_dim)
+        if self.random:
+            return memory, PolicyStep(jax.random.uniform(key, shape, minval=s.action_low, maxval=s.action_high), {})
+        return memory, PolicyStep(jnp.zeros(shape), {})
+
+
+def held(action: Array, rows: int) -> Array:
+    """(B, 1, K, N, A): one action (B, N, A), held."""
+    return jnp.broadcast_to(action[:, None, None], (action.shape[0], 1, rows, *action.shape[1:]))
+
+
+def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, present: Array, rows: int) -> Array:
+    """(B, 1, K, N, A): what a policy `act`, of features in its own view `own`, does now (`seen`) and along the rows
+    that the World foresees from `present`; the first action held where the views cannot be translated."""
+    index = translation(own, world.map)
+    first = act(seen)
+    if index is None or rows == 1:
+        return held(first, rows)
+    x, action, actions = present, first, [first]
+    for _ in range(rows - 1):
+        x, _ = world.dynamics.step(x, action)
+        action = act(jnp.take_along_axis(x, jnp.broadcast_to(index, (*x.shape[:-1], index.shape[1])), -1))
+        actions.append(action)
+    return jnp.stack(actions, 1)[:, None]
+
+
+def heard(policy: Policy, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint."""
+    return policy.hear(memory, cost) if hasattr(policy, "hear") else memory
+
+
+def act_with(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
+    """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
+    return policy.act(memory, observations, state, key)

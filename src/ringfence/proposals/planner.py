@@ -1,0 +1,176 @@
+"""Policies: batched, pure, normaliser inside.
+
+The planner draws plans and reads the action off the first step of one:
+
+    time        t          t+1   t+2   ...   t+H-1
+    plan        present    row1  row2  ...   row H-1       in-painted | generated
+    executed    f_φ(present, row 1), then plan again (or follow the plan for `replan` steps)
+
+What becomes of several plans, and of what they would do, is a guard's (guard/).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.nets.heads import infer_action
+from ringfence.problem.features import FeatureMap
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals import diffusion
+from ringfence.proposals.base import from_unit
+from ringfence.proposals.options import PlanOptions
+from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+from ringfence.world import World
+from ringfence.world.values import plan_value
+
+MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
+
+
+class Planner(eqx.Module):
+    """Receding-horizon diffusion planner."""
+
+    networks: dict[str, Any]  # denoiser, inverse
+    normaliser: Normaliser
+    critic: dict[str, Any]  # what states are worth
+    alpha_bar: tuple[float, ...] = eqx.field(static=True)
+    horizon: int = eqx.field(static=True)
+    history: int = eqx.field(static=True)
+    prediction: str = eqx.field(static=True)
+    clip: float = eqx.field(static=True)
+    discount: float = eqx.field(static=True)
+    observe: str = eqx.field(static=True)  # whose present was known in training
+    carries_own: bool = eqx.field(static=True)  # plans hold own entries only; the rest is recomputed
+    spec: Spec = eqx.field(static=True)
+    feature_map: FeatureMap = eqx.field(static=True)
+    options: PlanOptions = eqx.field(static=True)
+
+    def __check_init__(self):
+        o = self.options
+        if o.replan > self.horizon - 1:
+            raise UserError(
+                f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
+            )
+        if self.carries_own and not o.reconcile:
+            raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
+        if o.execution == "decentralized" and self.observe == "all":
+            raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
+        if o.execution == "centralized" and self.observe == "single":
+            raise UserError("execution='centralized' needs a model trained with observe='all' or 'mixed'.")
+        diffusion.timesteps(len(self.alpha_bar), o.steps)
+
+    def start(self, batch: int) -> PyTree:
+        n, d = self.spec.n_agents, self.spec.feature_dim
+        rows = self.history + self.horizon
+        return {
+            "past": jnp.zeros((batch, self.history, n, d)),
+            "plan": jnp.zeros((batch, rows, n, d)),
+            "age": jnp.zeros((), jnp.int32),
+        }
+
+    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+        """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds, of one plan."""
+        o, (past, present) = self.options, self._context(memory, observations, state)
+        if o.replan == 1:
+            plan = self.plans(past, present, key, 1)[:, 0]
+            ahead = plan[:, self.history + 1]
+        else:
+            fresh = memory["age"] % o.replan == 0
+            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1)[:, 0], lambda: memory["plan"])
+            ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
+        action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
+        info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
+        return self._kept(memory, past, present, plan), PolicyStep(from_unit(action, self.spec), info)
+
+    def propose(
+        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
+        """(memory, actions (B, `count`, `rows`, N, A) in [−1, 1], info): what inverse dynamics does to track plans,
+        along the rows that the World foresees if it reads the same view, else along the plans themselves."""
+        if self.options.replan > 1:
+            raise UserError("A guard decides at every step; use replan=1.")
+        if rows > self.horizon - 1:
+            raise UserError(
+                f"rows={rows} are judged, but plans hold {self.horizon - 1} steps; use at most as many, or a longer "
+                "horizon."
+            )
+        past, present = self._context(memory, observations, state)
+        plans = self.plans(past, present, key, count)
+        flat = plans.reshape(-1, *plans.shape[2:])
+        x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
+        for row in range(self.history + 1, self.history + 1 + rows):
+            action = infer_action(self.networks["inverse"], self.normaliser, x, flat[:, row])
+            actions.append(jnp.clip(action, -1.0, 1.0))
+            x = world.dynamics.step(x, actions[-1])[0] if tracks else flat[:, row]
+        actions = jnp.stack(actions, 1).reshape(*plans.shape[:2], rows, *actions[0].shape[1:])
+        return self._kept(memory, past, present, plans[:, 0]), actions, {}
+
+    def _context(self, memory: PyTree, observations: Array, state: Array) -> tuple[Array, Array]:
+        """Past rows (B, history, N, D) and the present (B, N, D)."""
+        present, past = self.feature_map(observations, state), memory["past"]
+        if self.history:
+            past = jnp.where(memory["age"] == 0, jnp.repeat(present[:, None], self.history, 1), past)
+        return past, present
+
+    def _kept(self, memory: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
+        if self.history:
+            past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
+        return {"past": past, "plan": plan, "age": memory["age"] + 1}
+
+    def plans(self, past: Array, present: Array, key: Key, count: int) -> Array:
+        """(B, count, rows, N, D) plans from the present (B, N, D). Decentralised, every agent imagines the whole team,
+        n times the work, and keeps its own part."""
+        (b, n, d), rows = present.shape, self.history + self.horizon
+        context = jnp.concatenate([past, present[:, None]], 1)
+        local = self.options.execution == "decentralized"
+        copies = count * (n if local else 1)
+        visible = jnp.ones((b, copies, n), bool)
+        if local:
+            visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
+        if not local:
+            return x.reshape(b, count, rows, n, d)
+        own = x.reshape(b, n, count, rows, n, d)
+        return jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)
+
+    def sample(self, context: Array, visible: Array, key: Key) -> Array:
+        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D)."""
+        o, (b, _, n, d) = self.options, context.shape
+        rows = self.history + self.horizon
+        known = self.normaliser.state(context)
+        mask = diffusion.known_entries(visible, self.history, rows)
+        known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
+        bar = np.asarray(self.alpha_bar)
+        target = jnp.full(b, o.target)
+        predict = diffusion.guided(self.networks["denoiser"], bar, target, o.guidance, self.prediction, self.clip)
+
+        def inpaint(x: Array) -> Array:
+            return jnp.where(mask, known, x)
+
+        def steered(x: Array, k: Array) -> Array:
+            clean = inpaint(predict(x, k))
+            if o.ascent > 0:
+                slope = jax.grad(lambda c: self.merit(inpaint(c)).sum())(clean)
+                size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
+                slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
+                level = (1.0 - jnp.asarray(bar, jnp.float32)[k]) ** o.persist
+                clean = jnp.clip(inpaint(clean + level[:, None, None, None] * slope), -self.clip, self.clip)
+            return self.normaliser.apply(self.agreed(self.normaliser.invert(clean))) if o.reconcile else clean
+
+        shape = (b, rows, n, d)
+        x = diffusion.sample(steered, inpaint, shape, bar, key, o.steps, o.sampler, o.temperature)
+        return self.agreed(self.normaliser.invert(x))
+
+    def agreed(self, x: Array) -> Array:
+        """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
+        return self.feature_map.agreed(x, self.history) if self.options.reconcile else x
+
+    def merit(self, clean: Array) -> Array:
+        """(B,) what gradient guidance climbs: value in deviations of the data's."""
+        ahead = self.agreed(self.normaliser.invert(clean))[:, self.history + 1 :]
+        return self.options.ascent * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]

@@ -1,0 +1,171 @@
+"""The run folder: everything downstream reads these files and nothing else.
+
+config.json     algorithm, preset, config, task, spec, hazard, seed, data card
+env.json        versions, hardware, git commit
+metrics.jsonl   one line per logged chunk of updates
+ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
+results.json    what `ringfence eval` measured, one entry per variant
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from ringfence.errors import CheckpointError, UserError
+from ringfence.types import PyTree
+from ringfence.utils import schemas
+from ringfence.utils.config import RANGES
+from ringfence.utils.files import alone, whole
+from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
+
+KEEP = 2  # checkpoints
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder on disk."""
+
+    path: Path
+
+    @classmethod
+    def of(cls, run: Run | str | Path) -> Run:
+        """A run, or the one in the folder that is named."""
+        if not isinstance(run, Run | str | Path) or not str(getattr(run, "path", run)).strip():
+            raise UserError(f"{str(run)[:60]!r} is no run; give the folder that `ringfence train` made.")
+        return run if isinstance(run, Run) else cls(Path(run))
+
+    @property
+    def config(self) -> dict:
+        """Contents of config.json."""
+        remedy = "is no run folder that can be read; give the one that `ringfence train` made, or train it again"
+        return schemas.read(self.path / "config.json", schemas.Config, remedy)
+
+    @property
+    def results(self) -> dict[str, dict]:
+        """Evaluations by variant; empty before the first `ringfence eval`."""
+        file = self.path / "results.json"
+        remedy = "holds a damaged results.json; delete that file and evaluate the run again"
+        return schemas.read(file, schemas.Results, remedy) if file.exists() else {}
+
+    @property
+    def metrics(self) -> list[dict]:
+        """Logged training metrics, oldest first; a line that an interruption cut short is dropped."""
+        file, rows = self.path / "metrics.jsonl", []
+        for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
+            with suppress(ValueError):
+                rows.append(schemas.decode(line, schemas.Row))
+        return rows
+
+    def checkpoints(self) -> list[tuple[int, Path]]:
+        """(step, file), oldest first."""
+        found = []
+        for file in (self.path / "ckpt").glob("step-*.safetensors"):
+            match = re.fullmatch(r"step-(\d+)\.safetensors", file.name)
+            if match:
+                found.append((int(match[1]), file))
+        return sorted(found)
+
+    def drop_damaged(self) -> None:
+        """Delete last checkpoints that are truncated or damaged, and say so: training goes on from the one before."""
+        for at, file in reversed(self.checkpoints()):
+            try:
+                sound_arrays(file, at)
+                return
+            except ValueError as wrong:
+                print(f"'{file}' is truncated or damaged ({wrong}); it is dropped.", file=sys.stderr)
+                file.unlink(missing_ok=True)
+
+    def save_checkpoint(self, step: int, state: PyTree) -> Path:
+        """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
+        final = self.path / "ckpt" / f"step-{step:08d}.safetensors"
+        arrays = named_arrays(state)
+        with whole(final) as temporary:
+            try:
+                # one entry: safetensors writes several in any order, and a run is the same to the byte
+                save_file(arrays, temporary, {"digest": digest_of(sorted(arrays.items()))})
+            except SafetensorError as error:  # its own wrapping of the operating system's error
+                raise OSError(str(error)) from error
+        for _, old in self.checkpoints()[:-KEEP]:
+            old.unlink(missing_ok=True)
+        return final
+
+    def load_checkpoint(self, template: PyTree, step: int | None = None) -> tuple[int, PyTree]:
+        """(step, state) of the last checkpoint, or of `step`; arrays must match the template in name and shape."""
+        found = self.checkpoints()
+        if not found:
+            raise CheckpointError(f"'{self.path}' holds no checkpoint; train it with `ringfence train` first.")
+        if step is not None:
+            there = ", ".join(str(at) for at, _ in found)
+            found = [c for c in found if c[0] == step]
+            if not found:
+                raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
+        for at, file in reversed(found):
+            try:
+                arrays = sound_arrays(file, at)
+            except ValueError as wrong:
+                told = f"'{file}' is truncated or damaged ({wrong})"
+                if file == found[0][1]:
+                    raise CheckpointError(f"{told}; delete it and train the run again.") from wrong
+                print(f"{told}; the one before is used.", file=sys.stderr)
+                continue
+            return at, as_tree(arrays, template, file)
+
+    def add_result(self, variant: str, result: dict) -> None:
+        """Keep a result beside the others, whoever else adds some at the same time."""
+        with alone(self.path / ".results.lock"):
+            write_json(self.path / "results.json", {**self.results, variant: result})
+
+
+def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:
+    """What a checkpoint of that step holds; ValueError says what is wrong with it. Those older than digests are
+    believed."""
+    try:
+        with safe_open(file, framework="np") as opened:
+            told = opened.metadata() or {}
+            arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (it is no dict)
+    except (SafetensorError, OSError, ValueError, TypeError) as error:
+        raise ValueError(str(error).splitlines()[0]) from error
+    if arrays.get("step", np.array(step)).tolist() != step:
+        raise ValueError("it is not of the step in its name")
+    if "digest" in told and told["digest"] != digest_of(sorted(arrays.items())):
+        raise ValueError("its contents have changed")
+    return arrays
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Whole or not at all."""
+    with whole(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=1))
+
+
+RANGES |= {"plans": (1, 10_000), "starts": (1, 10_000), "rows": (1, 10_000), "refine": (0, 10**6), "shield": (0, 10**6)}
+RANGES |= dict.fromkeys(("diffusion_steps", "inverse_width"), (1, 10**5))
+RANGES |= dict.fromkeys(("barrier_batch", "gradient_batch", "barrier_updates"), (1, 10**9))
+RANGES |= {"barrier_width": (1, 10**5)}
+RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates"), (1, 10**9))
+RANGES |= {"dynamics_width": (1, 10**5)}
+RANGES |= {
+    "members": (1, 20),
+    "future_discount": (0, 0.999),
+    "expectile": (0.5, 1),
+    "foreseen": (0, 1),
+    "penalty": (0, None),
+}
+RANGES |= dict.fromkeys(("search_iterations", "search_samples", "cql_samples"), (1, None))
+RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
+RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
+RANGES |= dict.fromkeys(("history", "warmup", "barrier_weight", "delta", "cql_weight", "cql_noise"), (0, None))
+RANGES |= dict.fromkeys(("alpha", "multiplier_rate", "multiplier_max", "action_penalty", "logit_penalty"), (0, None))
+RANGES |= dict.fromkeys(("search_deviation", "target_noise", "target_noise_clip", "inverse_noise"), (0, None))
+RANGES |= dict.fromkeys(("temperature_reward", "temperature_danger", "snr_floor", "snr_ceiling"), (0, None))
+RANGES |= {"grad_clip": (0, None), "cost_limit": (0, None)}

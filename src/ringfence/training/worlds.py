@@ -1,0 +1,86 @@
+"""Worlds of data sets: which settings, from where."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ringfence.datasets import registry
+from ringfence.datasets.task import Task
+from ringfence.errors import UserError
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints, features
+from ringfence.utils.config import build_config
+from ringfence.world import Settings, World
+from ringfence.world import load as load_world
+from ringfence.world.fit import fit_view
+
+WORLD = "world.safetensors"  # in a run folder: the World that training read
+GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
+
+
+def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Settings:
+    """The settings of a World of this data: the task's own where it has some, and labels from its costs if they tell
+    safe steps from unsafe ones, else from its formula; without either, no barrier."""
+    task = task or registry.from_store(store)
+    sight = sight_of(task, changes.pop("sight", None))
+    told = usual(task, sight)
+    costs = store.costs > 0
+    if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
+        formula = not isinstance(task.hazard, constraints.CostColumn)
+        told |= {"labels": "formula"} if formula else {"barrier": False}
+    return build_config(Settings, {**told, **changes}, "the World")
+
+
+def sight_of(task: Task, wanted: str | None = None) -> str:
+    """Whether guards see the team ("all") or every agent guards itself ("own"): as wanted; by default the team, but
+    agents who are alike know nothing but what each of them sees."""
+    if task.alike and wanted == "all":
+        raise UserError(
+            f"The agents of '{task.name}' are alike and see for themselves, so there is no sight='all'; leave it out."
+        )
+    return wanted or ("own" if task.alike else "all")
+
+
+def usual(task: Task, sight: str) -> dict:
+    """What a task asks of its World, unless told otherwise: the fields of `Settings` that are not as everywhere."""
+    return {"view": "decentralized" if sight == "own" else "pruned", **task.world, "sight": sight}
+
+
+def fit(
+    store: EpisodeStore,
+    *,
+    seed: int = 0,
+    task: Task | None = None,
+    cached: bool = True,
+    quiet: bool = True,
+    **changes,
+) -> World:
+    """The World of a store (T + E rows, N agents); `changes` are fields of Settings. Cached by content: the same data,
+    settings and seed are fitted once. `task`: of a simulator that is not in `tasks.TASKS`; else the store's own.
+
+    world = ringfence.fit(store); print(world.card)
+    """
+    if not isinstance(store, EpisodeStore):
+        raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise UserError(f"seed={seed!r} must be a whole number, 0 or more.")
+    task = task or registry.from_store(store)
+    settings, store = settings_for(store, task, **changes), task.logs(store)
+    map = task.feature_map(settings.view, store)
+    spec = task.spec(map, store)
+    needed = settings.labels == "formula" and settings.barrier
+    bind = constraints.bind if needed else constraints.bind_or_none
+    hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
+    return fit_view(store, map, spec, settings, hazard=hazard, seed=int(seed), cached=cached, quiet=quiet)
+
+
+def load(path: str | Path) -> World:
+    """The World in a file that `save` or `ringfence fit --out` wrote, or in a run folder."""
+
+    def map_of(task: str, view: features.View, hazard: dict) -> features.FeatureMap | None:
+        known = registry.simulated(task, constraints.from_dict(hazard))
+        return None if known is None else known.feature_map(view)
+
+    return load_world(path, map_of)

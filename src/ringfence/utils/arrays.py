@@ -1,0 +1,61 @@
+"""Arrays of a stranger's HDF5 file, looked at before any of them is read: plain ones, in the file itself, of no more
+bytes than the file can hold and this machine can take."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import h5py
+
+from ringfence.errors import StoreError
+from ringfence.utils.files import LOOSE
+
+
+def member(path: Path, group: h5py.Group, name: str, told: str | None = None) -> h5py.Group | h5py.Dataset:
+    """What lies in a group under that name; `told` is what messages call it. Links are not followed."""
+    told = told or name
+    found = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
+    if found is None or (isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)):
+        raise StoreError(f"'{path}' keeps '{told}' behind a link or in another file; copy it into the file itself.")
+    return found
+
+
+def array(path: Path, group: h5py.Group, name: str, told: str | None = None) -> h5py.Dataset:
+    """An array of numbers in a group, unread."""
+    told = told or name
+    found = member(path, group, name, told)
+    if not isinstance(found, h5py.Dataset):
+        raise StoreError(f"'{path}' holds a group where the array '{told}' belongs; write the file again.")
+    if found.dtype.kind not in "biuf":
+        raise StoreError(f"'{path}' holds '{told}' of type {found.dtype}; it must hold numbers.")
+    if found.shape is None or not found.shape:
+        raise StoreError(f"'{path}' holds no array in '{told}'; write the file again.")
+    return found
+
+
+def affordable(path: Path, size: int, ratio: int) -> None:
+    """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size cannot hold though it were
+    compressed `ratio` to one."""
+    fits(path, size)
+    there = path.stat().st_size
+    if size > ratio * there + LOOSE:
+        raise StoreError(
+            f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {there / 2**20:.1f}; store them uncompressed."
+        )
+
+
+def fits(path: Path, size: int) -> None:
+    """Refuse arrays of `size` bytes that memory cannot take."""
+    if size > (memory := _memory()):
+        raise StoreError(
+            f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB of memory; "
+            "take a larger machine, or store fewer episodes."
+        )
+
+
+def _memory() -> float:
+    """Bytes of memory, infinite where the system does not say."""
+    names = getattr(os, "sysconf_names", {})
+    known = "SC_PHYS_PAGES" in names and "SC_PAGE_SIZE" in names
+    return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")) if known else float("inf")

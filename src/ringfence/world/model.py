@@ -1,0 +1,30 @@
+"""The World as a value: parameters, the view that they read, and the card."""
+
+from __future__ import annotations
+
+import equinox as eqx
+
+from ringfence.problem.features import FeatureMap
+from ringfence.types import Array, Spec
+from ringfence.world.barrier import Barrier, Worst
+from ringfence.world.card import Card
+from ringfence.world.dynamics import Dynamics
+from ringfence.world.values import Values
+
+
+class World(eqx.Module):
+    """What the logs tell of a team. Features are s̃_i in the view of `map`; actions are in [−1, 1]."""
+
+    dynamics: Dynamics
+    values: Values
+    barrier: Barrier | Worst | None  # None: the logs told no danger, and no formula did
+    strange: Array  # () how far apart the ensemble is where the logs have not been: a conformal quantile
+    map: FeatureMap = eqx.field(static=True)
+    spec: Spec = eqx.field(static=True)
+    alone: bool = eqx.field(static=True)  # of each agent's own view, for agents that hear of nobody
+    card: Card = eqx.field(static=True)
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limit per episode of each constraint that the logs name; empty where they name none."""
+        return self.card.told.get("data", {}).get("constraints") or {}
