@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from ringfence.cli import data as data_commands
+from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import terminal
@@ -710,7 +711,7 @@ COMMANDS = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = rewritten(sys.argv[1:] if arguments is None else arguments)
     interrupts.listen()
     for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others
         if hasattr(stream, "reconfigure"):
