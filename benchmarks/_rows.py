@@ -7,15 +7,19 @@ import csv
 from pathlib import Path
 from typing import Any
 
+from ringfence.utils import stored
+
 
 def read(file: Path) -> list[dict[str, str]]:
-    """All rows, none if there is no file yet."""
-    return list(csv.DictReader(file.open())) if file.exists() else []
+    """All rows under today's names, none if there is no file yet."""
+    return stored.table(file) if file.exists() else []
 
 
 def append(file: Path, row: dict[str, Any], fields: tuple[str, ...]) -> None:
-    """Add a row; a new file begins with the names of its fields."""
+    """Add a row; a new file begins with the names of its fields, and one under older names gets today's."""
     fresh = not file.exists()
+    if not fresh and tuple(csv.DictReader(file.open()).fieldnames or ()) != fields:
+        write(file, read(file))
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a", newline="") as f:
         writer = csv.DictWriter(f, fields, lineterminator="\n")
@@ -39,5 +43,5 @@ def measured(r: dict[str, Any]) -> dict[str, float]:
         "return": round(r["return_mean"], 2),
         "return_norm": round(r["return_norm"], 4),
         "cost": round(r["cost_mean"], 4),
-        "avoidable_cost": round(r["avoidable_cost"], 4),
+        "cost_safe_start": round(r["cost_safe_start"], 4),
     }

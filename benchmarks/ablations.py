@@ -37,7 +37,7 @@ from ringfence.world import World
 from ringfence.world.barrier import Barrier
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "ablations.csv"
-FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible")
+FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible_rate")
 FIELDS += ("more_return", "more_return_low", "more_return_high", "p_return")
 FIELDS += ("more_cost", "more_cost_low", "more_cost_high", "p_cost")
 
@@ -189,7 +189,8 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
             found = played(how)
             usual = usual or found
             row = dict(zip(FIELDS, (*study, way, episodes)))
-            row |= {"return": found["return_mean"], "cost": found["cost_mean"], "infeasible": found["infeasible"]}
+            row |= {"return": found["return_mean"], "cost": found["cost_mean"]}
+            row |= {"infeasible_rate": found["infeasible_rate"]}
             for key in ("return", "cost"):
                 told = statistics.paired_test(*(r["per_episode"][key] for r in (found, usual)))
                 row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), told["interval"]))
@@ -226,7 +227,7 @@ def table(rows: list[dict]) -> str:
             if r != found[0] and all(r[k] == found[0][k] for k in FIELDS if k != "way"):
                 continue  # a way that is the default here
             part = [r["way"], f"{float(r['return']):.4g}", f"{float(r['cost']):.3g}"]
-            part += [f"{100 * float(r['infeasible'] or 0):.2g} %"]
+            part += [f"{100 * float(r['infeasible_rate'] or 0):.2g} %"]
             part += ["", ""] if r["way"] == "default" else [more(r, "return"), more(r, "cost")]
             out.append("| " + " | ".join(part) + " |")
         out.append("")

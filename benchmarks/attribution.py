@@ -59,7 +59,7 @@ class Question:
     words: str
     row: Row
     twin: Row
-    keys: tuple[str, ...] = ("return", "avoidable")
+    keys: tuple[str, ...] = ("return", "cost_safe_start")
 
 
 SHIELD, FULL = "+shield-learned", "+full-learned"
@@ -174,7 +174,7 @@ def crossed(suite: str) -> str:
         for guard, ending in GUARDS.items():
             row, cells = (algorithm, plain + ending), []
             for task in names:
-                told, seeds = cell(suite, task, row, ("return_norm", "avoidable_cost"), (2, 3))
+                told, seeds = cell(suite, task, row, ("return_norm", "cost_safe_start"), (2, 3))
                 cells.append((told, seeds if plain != "reference" else 0))
             if any(told != "–" for told, _ in cells):
                 lines.append(([words, sees, guard if plain != "reference" else ""], cells))

@@ -9,11 +9,12 @@ Behaviour cloning is guarded: by `shield` on Simple Spread and in the yard, by `
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 import tempfile
 import time
 from pathlib import Path
+
+from _rows import append, read
 
 import ringfence
 from ringfence.datasets import registry
@@ -45,7 +46,7 @@ GUARDS: dict[str, dict] = {
 SHORT = {"3 rows": {"rows": 3}, "future, 3 rows": {"future": True, "rows": 3}}  # where 7 are usual
 
 FIELDS = ("task", "way", "guard", "seed", "fit_seconds", "unsafe_share", "recall", "auroc", "margin")
-FIELDS += ("foreseen_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible")
+FIELDS += ("foreseen_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible_rate")
 
 
 class Simulated:
@@ -93,23 +94,18 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=200)
     parser.add_argument("--out", type=Path, default=OUT)
     a = parser.parse_args()
-    there = list(csv.DictReader(a.out.open())) if a.out.exists() else []
+    there = read(a.out)
     done = {(r["task"], r["way"], r["guard"], int(r["seed"])) for r in there}
-    with a.out.open("a", newline="") as file:
-        writer = csv.DictWriter(file, FIELDS)
-        if not there:
-            writer.writeheader()
-        for name in a.tasks:
-            kind = Yard if name == "yard" else Simulated
-            wanted = [(w, g) for w in a.ways for g in (kind.guards if w == "default" else ("margin",))]
-            wanted = [x for x in wanted if (name, *x, a.seed) not in done]
-            if not wanted:
-                continue
-            with tempfile.TemporaryDirectory() as folder:
-                subject = kind(name, a.seed, folder, a.episodes)
-                for way, guard in wanted:
-                    writer.writerow(measured(name, subject, way, guard, a.seed))
-                    file.flush()
+    for name in a.tasks:
+        kind = Yard if name == "yard" else Simulated
+        wanted = [(w, g) for w in a.ways for g in (kind.guards if w == "default" else ("margin",))]
+        wanted = [x for x in wanted if (name, *x, a.seed) not in done]
+        if not wanted:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            subject = kind(name, a.seed, folder, a.episodes)
+            for way, guard in wanted:
+                append(a.out, measured(name, subject, way, guard, a.seed), FIELDS)
 
 
 def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
@@ -131,7 +127,7 @@ def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
     }
     row |= {k: told[k] for k in ("unsafe_share", "recall", "auroc", "margin", "foreseen_false_safe")}
     row |= {"episodes": subject.episodes, "return": played["return_mean"], "cost": played["cost_mean"]}
-    row |= {"cost_low": low, "cost_high": high, "infeasible": played.get("infeasible", "")}
+    row |= {"cost_low": low, "cost_high": high, "infeasible_rate": played.get("infeasible_rate", "")}
     row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
     print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
     return row

@@ -6,7 +6,6 @@ its words are no longer there.
 
 from __future__ import annotations
 
-import csv
 import re
 import sys
 from collections import Counter
@@ -23,6 +22,7 @@ from scipy.stats import spearmanr
 
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.report import board, standings
+from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
@@ -98,7 +98,7 @@ def shielded_all() -> tuple[bool, str]:
     for (task, algorithm, variant), runs in evaluations("guards").items():
         alone = of("guards", task, (algorithm, variant.removesuffix(SHIELD)))
         if variant.endswith(SHIELD) and alone:
-            left.append(mean("guards", task, (algorithm, variant), "avoidable_cost"))
+            left.append(mean("guards", task, (algorithm, variant), "cost_safe_start"))
             both = set(runs) & set(alone)
             lost.append(np.mean([alone[s]["return_norm"] - runs[s]["return_norm"] for s in both]))
     told = f"{len(left)} proposals and tiers: at most {max(left):.3f} cost left, {max(lost):.3f} normalised return lost"
@@ -111,7 +111,7 @@ def same_safety() -> tuple[bool, str]:
     for task in tasks_of("guards"):
         learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in DANGERS)
         share.append(learned / formula)
-        left.append(mean("guards", task, ("bc", "default+shield-learned"), "avoidable_cost"))
+        left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
     kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in DANGERS]
     ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
     return ok, (
@@ -120,7 +120,8 @@ def same_safety() -> tuple[bool, str]:
     )
 
 
-DANGERS = ("learned", "formula")
+DANGERS = ("learned", "formula")  # in names of variants
+BARRIERS = ("learned", "analytic")
 
 
 def limits(suite: str, algorithm: str, variant: str) -> int:
@@ -162,7 +163,7 @@ def crossing_rare() -> tuple[bool, str]:
 
 def rows_of(file: str, **where: str) -> list[dict[str, str]]:
     """Rows of a table in results/ with these entries."""
-    rows = list(csv.DictReader((RESULTS / file).open()))
+    rows = stored.table(RESULTS / file)
     return [r for r in rows if all(r[k] == v for k, v in where.items())]
 
 
@@ -179,10 +180,10 @@ TWO = (("none", ""), ("shield", "one"), ("shield", "each"))
 
 def brakes_in_time() -> tuple[bool, str]:
     """Of the clone three rows leave next to nothing; of the blind controller they leave most, and V nothing."""
-    ask = dict(guard="shield", danger="learned")
+    ask = dict(guard="shield", barrier="learned")
     clone, blind, seen = (
-        float(rows_of("yard.csv", who=who, options=how, **ask)[0]["contact"])
-        for who, how in (("cloning", "future=False"), ("blind", "future=False"), ("blind", ""))
+        float(rows_of("yard.csv", method=who, options=how, **ask)[0]["contact"])
+        for who, how in (("cloning", "terminal_value=False"), ("blind", "terminal_value=False"), ("blind", ""))
     )
     told = (
         f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * blind:.3g} % of the blind; V: {100 * seen:.2g} %"
@@ -192,7 +193,7 @@ def brakes_in_time() -> tuple[bool, str]:
 
 def learned_sees_more() -> tuple[bool, str]:
     """Under the same three rows the formula's interval lies above V's bound."""
-    learned, formula = (rows_of("yard.csv", who="blind", guard="shield", danger=d, options="")[0] for d in DANGERS)
+    learned, formula = (rows_of("yard.csv", method="blind", guard="shield", barrier=b, options="")[0] for b in BARRIERS)
     shares = [float(r["contact"]) for r in (learned, formula)]
     return shares[1] > 0.6 and float(learned["bound"]) < 0.02, f"{100 * shares[0]:.2g} % and {100 * shares[1]:.3g} %"
 
@@ -200,7 +201,7 @@ def learned_sees_more() -> tuple[bool, str]:
 def own_shield_leaves(most: float) -> Callable[[], tuple[bool, str]]:
     def check():
         row = ("bc", "default+shield-learned-own")
-        left = max(mean("own-sight", task, row, "avoidable_cost") for task in tasks_of("own-sight"))
+        left = max(mean("own-sight", task, row, "cost_safe_start") for task in tasks_of("own-sight"))
         return left <= most, f"at most {left:.3f} on four tiers"
 
     return check
@@ -246,7 +247,7 @@ def full_is_safe() -> tuple[bool, str]:
 def limits_learned() -> tuple[bool, str]:
     """How many of five limits the Lagrangian learner keeps on each task."""
     kept = Counter()
-    for r in rows_of("frontiers.csv", who="MA-TD3+BC, Lagrange"):
+    for r in rows_of("frontiers.csv", method="MA-TD3+BC, Lagrange"):
         kept[r["task"]] += float(r["cost"]) <= float(r["value"])
     spread = sum(n for task, n in kept.items() if task.startswith("simple_spread"))
     del kept["crossing-hasty"]  # where a limit is of each agent's cost, and the row is of the team's
@@ -257,7 +258,7 @@ def guards_price() -> tuple[bool, str]:
     """Return of guarded cloning at the calibrated margin over that at the loosest, where there is no time to adapt."""
     shares = {}
     for task in ("simple_spread-expert", "simple_spread-medium-replay", "crossing-hasty"):
-        of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, who="cloning, guarded")}
+        of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, method="cloning, guarded")}
         shares[task] = float(of["1.0"]["return"]) / float(of["-1.0"]["return"]), float(of["1.0"]["cost"])
     told = ", ".join(f"{task} {100 * share:.1f} % at {cost:g}" for task, (share, cost) in shares.items())
     return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), told
@@ -273,8 +274,8 @@ def diffusion_on_crossing() -> tuple[bool, str]:
 
 def no_size_touches() -> tuple[bool, str]:
     """Under a shield and `full`, in teams of two, three, four and six, by every seed."""
-    rows = rows_of("spread-teams/table.csv", danger="learned")
-    left = max(float(r["avoidable_cost"]) for r in rows)
+    rows = rows_of("spread-teams/table.csv", barrier="learned")
+    left = max(float(r["cost_safe_start"]) for r in rows)
     return left == 0 and len(rows) >= 24, f"{len(rows)} rows, at most {left:g} steps"
 
 
@@ -354,7 +355,7 @@ CLAIMS = (
         "README.md",
         "losses as printed (λ = 0.1) do not lower its cost",
         SPREAD,
-        tested(("icbf", "paper"), ("madiff", "default"), "avoidable", chance),
+        tested(("icbf", "paper"), ("madiff", "default"), "cost_safe_start", chance),
     ),
     Claim(
         "README.md",
@@ -474,7 +475,7 @@ CLAIMS = (
         "docs/attribution.md",
         "The barrier in training lowers the cost of plans that are followed as they are",
         SPREAD,
-        tested(("icbf", "split"), ("icbf", "split-0"), "avoidable", lower),
+        tested(("icbf", "split"), ("icbf", "split-0"), "cost_safe_start", lower),
     ),
     Claim(
         "docs/attribution.md",

@@ -80,7 +80,7 @@ def main() -> None:
             "fast": hurried["cost_mean"],
             "fast_low": hurried["cost_interval"][0],
             "fast_high": hurried["cost_interval"][1],
-            "infeasible": r.get("infeasible", ""),
+            "infeasible_rate": r.get("infeasible_rate", ""),
         }
         rows.append({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
         print(rows[-1], flush=True)

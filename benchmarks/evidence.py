@@ -71,16 +71,16 @@ class Difference:
 
 
 def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Difference | None:
-    """Of `return`, `cost` or `avoidable` (cost of the resets that are not unsafe from the start); None where one of the
-    two is missing."""
+    """Of `return`, `cost` or `cost_safe_start` (cost of the resets that start safe); None where one of the two is
+    missing."""
     ours, theirs = of(suite, task, row), of(suite, task, twin)
     seeds = tuple(sorted(set(ours) & set(theirs)))
     if not seeds:
         return None
-    kind = "cost" if key == "avoidable" else key
+    kind = "cost" if key == "cost_safe_start" else key
     x, y = (np.array([r[s]["per_episode"][kind] for s in seeds], float) for r in (ours, theirs))
     d = x - y
-    if key == "avoidable":
+    if key == "cost_safe_start":
         fine = ~np.array(ours[seeds[0]]["per_episode"]["unsafe_start"], bool)
         d = d[:, fine]
     told = statistics.paired_test(d.mean(0), np.zeros(d.shape[1]))

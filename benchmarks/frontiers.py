@@ -30,7 +30,7 @@ from ringfence.training import loop, worlds
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT, PICTURE = ROOT / "results" / "frontiers.csv", ROOT / "docs" / "images" / "frontiers.png"
-FIELDS = ("task", "who", "knob", "value", "episodes", "return", "cost", "avoidable_cost", "train_seconds")
+FIELDS = ("task", "method", "knob", "value", "episodes", "return", "cost", "cost_safe_start", "train_seconds")
 MARGINS = (-1.0, 0.0, 0.25, 0.5, 1.0)
 # By task, the limits on an episode's cost.
 LIMITS = {
@@ -93,18 +93,18 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
             _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **told)
 
 
-def _missing(name: str, who: str, values: tuple, out: Path) -> list:
-    there = {r["value"] for r in read(out) if (r["task"], r["who"]) == (name, who)}
+def _missing(name: str, method: str, values: tuple, out: Path) -> list:
+    there = {r["value"] for r in read(out) if (r["task"], r["method"]) == (name, method)}
     return [v for v in values if str(v) not in there]
 
 
-def _play(name: str, who: str, knob: str, value, run, out: Path, **how) -> None:
+def _play(name: str, method: str, knob: str, value, run, out: Path, **how) -> None:
     task = registry.get(name)
     episodes = 20 if task.protocol else 200
     found = evaluate_policy(load(run, **how)[1], task, episodes, "test", 0)[0]
-    row = dict(zip(FIELDS, (name, who, knob, value, episodes)))
+    row = dict(zip(FIELDS, (name, method, knob, value, episodes)))
     row |= {k: f"{found[k + '_mean']:.5g}" for k in ("return", "cost")}
-    row |= {"avoidable_cost": f"{found['avoidable_cost']:.4g}"}
+    row |= {"cost_safe_start": f"{found['cost_safe_start']:.4g}"}
     row |= {"train_seconds": f"{sum(r['seconds'] for r in run.metrics):.0f}"}
     print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
     append(out, row, FIELDS)
@@ -112,10 +112,10 @@ def _play(name: str, who: str, knob: str, value, run, out: Path, **how) -> None:
 
 def table(rows: list[dict]) -> str:
     """Every point of the picture."""
-    out = ["| task | who | told | return | cost |", "|---|---|---|---|---|"]
-    for r in sorted(rows, key=lambda r: (list(LIMITS).index(r["task"]), r["who"])):
+    out = ["| task | method | told | return | cost |", "|---|---|---|---|---|"]
+    for r in sorted(rows, key=lambda r: (list(LIMITS).index(r["task"]), r["method"])):
         told = "nothing" if r["knob"] == "none" else f"{r['knob']} {float(r['value']):g}"
-        out.append(f"| `{r['task']}` | {r['who']} | {told} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
+        out.append(f"| `{r['task']}` | {r['method']} | {told} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
     return "\n".join(out)
 
 
@@ -124,13 +124,13 @@ def draw(rows: list[dict]) -> None:
     figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
     colours = dict(zip((*GUARDED.values(), *TRAINED.values()), ("#0b6e4f", "#7b2d8b", "#c8553d", "#3b6fb6")))
     for axis, (name, limits) in zip(axes.ravel(), LIMITS.items()):
-        for who, colour in colours.items():
-            found = [r for r in rows if (r["task"], r["who"]) == (name, who) and r["knob"] != "none"]
+        for method, colour in colours.items():
+            found = [r for r in rows if (r["task"], r["method"]) == (name, method) and r["knob"] != "none"]
             found.sort(key=lambda r: float(r["value"]))
             xy = [(float(r["cost"]), float(r["return"])) for r in found]
             if xy:
-                axis.plot(*zip(*xy), "o-", color=colour, label=who, ms=4, lw=1.2)
-            alone = [r for r in rows if (r["task"], r["who"], r["knob"]) == (name, who, "none")]
+                axis.plot(*zip(*xy), "o-", color=colour, label=method, ms=4, lw=1.2)
+            alone = [r for r in rows if (r["task"], r["method"], r["knob"]) == (name, method, "none")]
             for r in alone:
                 axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
         if registry.get(name).protocol:

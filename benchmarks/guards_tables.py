@@ -5,7 +5,6 @@ python benchmarks/guards_tables.py
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from evidence import Row, of, tasks_of, variant
 from readme import put
 
 from ringfence.evaluation.statistics import upper_bound
+from ringfence.utils import stored
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 # Columns: their heads, and their rows.
@@ -122,7 +122,7 @@ def mean(rows: list[dict], key: str) -> float:
 
 
 def short(rows: list[dict]) -> str:
-    return f"{mean(rows, 'return_norm'):.2f} / {mean(rows, 'avoidable_cost'):.3f}"
+    return f"{mean(rows, 'return_norm'):.2f} / {mean(rows, 'cost_safe_start'):.3f}"
 
 
 def long(rows: list[dict]) -> str:
@@ -144,7 +144,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
         "made of",
     )
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    rows = list(csv.DictReader((RESULTS / suite / "table.csv").open()))
+    rows = stored.table(RESULTS / suite / "table.csv")
     for task in dict.fromkeys(r["task"] for r in rows):
         several = len({r["task"] for r in rows}) > 1
         for key, words in named.items():
@@ -159,7 +159,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
             if key.split()[0] != "behaviour" or "policy" in key:
                 part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.3g} %)"
             part += [f"{100 * mean(own, 'agent_violation_rate'):.2g} %" if own else ""]
-            part += [f"{100 * mean(found, 'infeasible'):.2g} %" if found[0]["infeasible"] else ""]
+            part += [f"{100 * mean(found, 'infeasible_rate'):.2g} %" if found[0]["infeasible_rate"] else ""]
             part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]
             out.append("| " + " | ".join(part) + " |")
     return "\n".join(out)
@@ -167,7 +167,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
 
 def sizes() -> str:
     """A row per task and number of agents, a column per guard."""
-    rows = list(csv.DictReader((RESULTS / "spread-teams" / "table.csv").open()))
+    rows = stored.table(RESULTS / "spread-teams" / "table.csv")
     out = ["| learned from | agents | " + " | ".join(SIZES) + " |", "|---" * (2 + len(SIZES)) + "|"]
     for task in dict.fromkeys(r["task"] for r in rows):
         for n in (2, 3, 4, 6):
@@ -176,14 +176,14 @@ def sizes() -> str:
                 name = f"default{guard}" + f"+agents{n}" * (n != 3)
                 found = [r for r in rows if (r["task"], r["algorithm"], r["variant"]) == (task, "bc", name)]
                 seeds = f" ({len(found)} seeds)" if len(found) > 1 else ""
-                cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'avoidable_cost'):.3f}{seeds}")
+                cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'cost_safe_start'):.3f}{seeds}")
             out.append(f"| `{task}` | {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 
 def other_simulator() -> str:
     """Rows of benchmarks/other_simulator.py."""
-    rows = list(csv.DictReader((RESULTS / "other_simulator.csv").open()))
+    rows = stored.table(RESULTS / "other_simulator.csv")
     head = ("learned from", "agents", "guard", "return", "steps with contact", "episodes with contact", "made of")
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for r in rows:
@@ -198,7 +198,7 @@ def barrier() -> str:
     """Ways of fitting a barrier, by what the guard makes of them."""
     head = ("way", "unsafe steps found", "margin", "return", "cost", "95 % interval", "infeasible")
     out = []
-    rows = list(csv.DictReader((RESULTS / "tuning" / "barrier.csv").open()))
+    rows = stored.table(RESULTS / "tuning" / "barrier.csv")
     for task in dict.fromkeys(r["task"] for r in rows):
         out += [f"`{task}`:", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
         for r in (r for r in rows if r["task"] == task):
@@ -209,7 +209,7 @@ def barrier() -> str:
                 way = f"{r['way']}, 3 rows"
             part = [way, f"{100 * float(r['recall']):.1f} %", f"{float(r['margin']):.1f}", f"{float(r['return']):.4g}"]
             part += [f"{float(r['cost']):.3g}", f"{float(r['cost_low']):.3g} to {float(r['cost_high']):.3g}"]
-            part += [f"{100 * float(r['infeasible'] or 0):.1f} %"]
+            part += [f"{100 * float(r['infeasible_rate'] or 0):.1f} %"]
             out.append("| " + " | ".join(part) + " |")
         out.append("")
     return "\n".join(out).strip()

@@ -61,15 +61,15 @@ def main() -> None:
             key = (told["task"], told["algorithm"], variant, str(told["seed"]))
             if args.without and args.without in variant:
                 continue
-            if key in done or (result.get("sight") == "own" and not task.alike):
+            if key in done or (result.get("execution") == "decentralized" and not task.alike):
                 continue
             how = {"planner": result["planner"]}
             if result["guard"] != "none":
-                how |= {"guard": result["guard"], "danger": result["danger"], **result["guard_options"]}
+                how |= {"guard": result["guard"], "barrier": result["barrier"], **result["guard_options"]}
             found = estimate(run, store, judge_world=world, compare=False, **how)
             numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
             numbers = [found["played"][k]["mean"] for k in PLAYED.values()] + numbers
-            truth = [result["return_mean"], result["avoidable_cost"]]
+            truth = [result["return_mean"], result["cost_safe_start"]]
             rows.append(dict(zip(HEAD, map(str, (*key, *(f"{v:.5g}" for v in (*truth, *numbers)))))))
             print(*rows[-1].values(), flush=True)
             with whole(OUT) as temporary, temporary.open("w") as f:

@@ -29,7 +29,7 @@ def main() -> None:
             print(f"{folder}: no checkpoint here, left as it is")
             continue
         for variant, result in run.results.items():
-            guard = {k: result[k] for k in ("guard", "danger", "sight")} | result["guard_options"]
+            guard = {k: result[k] for k in ("guard", "barrier", "execution")} | result["guard_options"]
             guard = guard if result.get("guard", "none") != "none" else {}
             _, policy = load(run, **result["options"], **guard)
             took = latency.plan_latency(policy, registry.get(a.task))

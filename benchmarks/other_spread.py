@@ -68,9 +68,9 @@ def row(policy: str, logs: str, place: str, told: dict) -> dict:
         "low": round(told["return_interval"][0], 3),
         "high": round(told["return_interval"][1], 3),
         "cost": round(told["cost_mean"], 4),
-        "avoidable_cost": round(told["avoidable_cost"], 4),
+        "cost_safe_start": round(told["cost_safe_start"], 4),
         "violation_rate": round(told["violation_rate"], 4),
-        "infeasible": round(told.get("infeasible", 0.0), 4),
+        "infeasible_rate": round(told.get("infeasible_rate", 0.0), 4),
     }
     print(found, flush=True)
     return found

@@ -5,7 +5,6 @@ python benchmarks/readme.py
 
 from __future__ import annotations
 
-import csv
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -18,6 +17,7 @@ from ringfence import algos
 from ringfence.bench import paper, unpack
 from ringfence.datasets import registry
 from ringfence.report import board, export, standings
+from ringfence.utils import stored
 from ringfence.utils.config import build_config
 
 matplotlib.use("Agg")
@@ -182,7 +182,7 @@ def _spread_cell(rows: list[dict]) -> str:
     """The mean of the tiers' means, however many seeds each has."""
     by_tier = [[r for r in rows if r["task"] == f"simple_spread-{tier}"] for tier in TIERS]
     seeds = 0 if rows[0]["variant"] == "reference" else min(len(tier) for tier in by_tier)
-    earned, cost = (np.mean([mean(tier, key) for tier in by_tier]) for key in ("return_norm", "avoidable_cost"))
+    earned, cost = (np.mean([mean(tier, key) for tier in by_tier]) for key in ("return_norm", "cost_safe_start"))
     return f"{earned:.2f} / {cost:.3f}" + _seeds(seeds)
 
 
@@ -209,10 +209,9 @@ def _seeds(count: int) -> str:
 def grouped(suite: str) -> dict:
     """Rows of a suite's table by (task, algorithm, variant)."""
     groups = defaultdict(list)
-    with open(RESULTS / suite / "table.csv") as f:
-        for row in csv.DictReader(f):
-            if row["task"]:
-                groups[row["task"], row["algorithm"], row["variant"]].append(row)
+    for row in stored.table(RESULTS / suite / "table.csv"):
+        if row["task"]:
+            groups[row["task"], row["algorithm"], row["variant"]].append(row)
     return groups
 
 
@@ -256,8 +255,7 @@ def searched(file: Path, task: str) -> str:
     if not file.exists():
         return "No results yet."
     lines = ["| algorithm | setting | changes | return | norm. return | cost |", "|---|---|---|---|---|---|"]
-    with open(file) as f:
-        rows = [r for r in csv.DictReader(f) if r["task"] == task]
+    rows = [r for r in stored.table(file) if r["task"] == task]
     for r in sorted(rows, key=lambda r: (r["algorithm"], int(r["setting"]))):
         told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
         name, gain, cost = f"{r['algorithm']} {r['preset']}".strip(), float(r["return"]), float(r["cost"])
@@ -347,7 +345,7 @@ def draw(groups: dict, path: Path) -> None:
             if not rows or name in UNDRAWN:
                 continue
             mark, colour = MARKS[name]
-            x = np.array([float(r["avoidable_cost"]) for r in rows])
+            x = np.array([float(r["cost_safe_start"]) for r in rows])
             y = np.array([float(r["return_norm"]) for r in rows])
             panel.errorbar(
                 x.mean(),
@@ -378,7 +376,7 @@ def mean(rows: list[dict], key: str) -> float:
     return float(np.mean([float(r[key]) for r in rows]))
 
 
-def cell(rows: list[dict], cost: str = "avoidable_cost", digits: int = 3) -> str:
+def cell(rows: list[dict], cost: str = "cost_safe_start", digits: int = 3) -> str:
     """Return ± deviation between seeds (normalised) / cost."""
     returns = np.array([float(r["return_mean"]) for r in rows])
     spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""

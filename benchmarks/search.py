@@ -39,7 +39,7 @@ FIELDS = (
     "return",
     "return_norm",
     "cost",
-    "avoidable_cost",
+    "cost_safe_start",
     "train_seconds",
 )
 SAFE = ("bc-safe", "ma-td3bc-lag", "fisor", "icbf")

@@ -44,7 +44,7 @@ def rows_of(run: Run) -> list[dict]:
                     "seed": r["seed"],
                     "changes": config,
                     "planner": differing(r["options"], PlanOptions()),
-                    "guard": f"{r['guard']}-{r['danger']} " + differing(r["guard_options"], GuardOptions()),
+                    "guard": f"{r['guard']}-{r['barrier']} " + differing(r["guard_options"], GuardOptions()),
                     "episodes": r["episodes"],
                     "return": round(r["return_mean"], 1),
                     "cost": round(r["cost_mean"], 2),

@@ -21,6 +21,7 @@ import ringfence
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation, to_dict
+from ringfence.utils import stored
 from ringfence.utils.files import whole
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -44,7 +45,7 @@ ROWS = (
     ("blind", "shield", "learned", {"rows": 10}, 1),
     ("blind", "shield", "formula", {}, 1),
 )
-HEAD = ("who", "guard", "danger", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
+HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
 AT = {name: k for k, name in enumerate(yard.NAMES)}
 
 
@@ -65,7 +66,7 @@ def main() -> None:
     told = dataclasses.replace(store, card={**store.card, "hazard": to_dict(hazard)})
     world = ringfence.fit(told, quiet=False)
     run = ringfence.train("bc", told, out=ROOT / "runs")[0]
-    there = {tuple(r.values())[:4]: list(r.values()) for r in csv.DictReader(OUT.open())} if OUT.exists() else {}
+    there = {tuple(r.values())[:4]: list(r.values()) for r in stored.table(OUT)} if OUT.exists() else {}
     rows = [logs(store)]
     for who, guard, danger, options, part in ROWS:
         words = " ".join(f"{k}={v}" for k, v in options.items())
@@ -106,13 +107,14 @@ def write(rows: list[list]) -> None:
 
 def table(file: Path) -> str:
     lines = ["| who | guard | return | episodes with contact (bound) | made of |", "|---|---|---|---|---|"]
-    ways = {"": "", "future=False": ", 3 rows without V", "rows=7": ", 7 rows", "rows=10": ", 10 rows"}
-    ways |= {"rows=3 future=True": ", 3 rows"}
-    for r in csv.DictReader(file.open()):
-        guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['danger']}{ways[r['options']]}"
+    ways = {"": "", "terminal_value=False": ", 3 rows without V", "horizon=7": ", 7 rows"}
+    ways |= {"horizon=10": ", 10 rows"}
+    ways |= {"horizon=3 terminal_value=True": ", 3 rows"}
+    for r in stored.table(file):
+        guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['barrier']}{ways[r['options']]}"
         bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
         touched = f"{100 * float(r['contact']):.3g} %{bound}"
-        lines.append(f"| {r['who']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} episodes |")
+        lines.append(f"| {r['method']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} episodes |")
     return "\n".join(lines)
 
 

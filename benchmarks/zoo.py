@@ -83,9 +83,7 @@ def main() -> None:
 
 def _is(result: dict, guard: str) -> bool:
     """Whether a cell's result is of this guard, as the zoo plays it."""
-    return (
-        result["guard"] == guard and result["danger"] in ("none", "learned") and result["sight"] in (None, "all", "own")
-    )
+    return result["guard"] == guard and result["barrier"] in ("none", "learned")
 
 
 def table(rows: list[dict]) -> str:

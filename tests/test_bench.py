@@ -309,7 +309,7 @@ def test_a_failing_cell_is_recorded_and_stops_nobody(tmp_path, monkeypatch):
             raise RuntimeError("the moon is in the way")
         return real(run, **options)
 
-    monkeypatch.setattr(grid.evaluate, "evaluate", fails)
+    monkeypatch.setattr(grid, "evaluate", fails)
     heard = []
     grid.run_group(list(g.cells), g.out, g.episodes, lambda event, cell: heard.append((event, cell.seed)))
     assert heard == [("start", 0), ("failed", 0), ("start", 1), ("done", 1)]

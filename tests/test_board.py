@@ -281,7 +281,7 @@ def test_numbers_of_a_row_by_hand(folder):
     assert bc.returns_norm == pytest.approx((310 - LOW) / (HIGH - LOW))
     assert bc.returns_norm_sd == pytest.approx(200**0.5 / (HIGH - LOW))
     assert bc.cost == 2.5 and bc.cost_sd == pytest.approx(0.5**0.5)  # of 3 and 2
-    assert bc.avoidable == pytest.approx((12 + 4) / 7)  # without the unsafe start of seed 1
+    assert bc.cost_safe_start == pytest.approx((12 + 4) / 7)  # without the unsafe start of seed 1
     assert (bc.violations, bc.episodes, bc.seeds) == (6, 8, (0, 1)) and not bc.safe
     assert (bc.train_seconds, bc.parameters, bc.plan_ms) == (10.0, 1234, None)
     guarded = row(folder, "ICBF-Diffuser split+guarded")

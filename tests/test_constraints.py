@@ -153,8 +153,8 @@ def test_a_guard_keeps_all_of_them(fitted):
     for name, limit in LIMITS.items():
         before, after = loose["constraints"][name], tight["constraints"][name]
         assert after["limit"] == limit and after["cost_mean"] < 0.3 * before["cost_mean"]
-        assert after["within"] >= before["within"]
-    assert tight["constraints"]["fast"]["within"] == 1.0
+        assert after["limit_satisfied_rate"] >= before["limit_satisfied_rate"]
+    assert tight["constraints"]["fast"]["limit_satisfied_rate"] == 1.0
 
 
 def test_margins_follow_the_constraint_that_was_paid(fitted, logs):

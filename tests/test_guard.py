@@ -256,7 +256,7 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
         load(run, guard="shield", world=alone)
     same = worlds.fit(small_store, **QUICK_WORLD)
     result = evaluate(run, episodes=2, guard="shield", world=same)
-    assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible"] <= 1
+    assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible_rate"] <= 1
     assert registry.get("simple_spread-random").name == result["task"]
 
 

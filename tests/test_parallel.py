@@ -229,7 +229,7 @@ def test_anybodys_function_under_guard_is_played(small_world):
     """With what the guard could not do; there is no run to keep results in."""
     still = guard(lambda seen, state: np.zeros((3, 2)), small_world, rows=1, shield=1)
     told = play(still, SimpleSpreadParallel, episodes=2)
-    assert told["episodes"] == 2 and 0 <= told["infeasible"] <= 1 and 0 <= told["strange"] <= 1
+    assert told["episodes"] == 2 and 0 <= told["infeasible_rate"] <= 1 and 0 <= told["ood_rate"] <= 1
     with pytest.raises(UserError, match="a function under guard has none"):
         play(still, SimpleSpreadParallel, episodes=2, keep=True)
     with pytest.raises(UserError, match="rows was said to ringfence.guard"):

@@ -35,8 +35,8 @@ def result(returns, costs, unsafe=None, **more) -> dict:
         "cost_cvar10": statistics.cvar(costs),
         "violation_rate": float((costs > 0).mean()),
         "unsafe_starts": int(unsafe.sum()),
-        "avoidable_cost": fine.mean(),
-        "avoidable_interval": [fine.min(), fine.max()],
+        "cost_safe_start": fine.mean(),
+        "cost_safe_start_interval": [fine.min(), fine.max()],
         "constants": CONSTANTS,
         "per_episode": {"return": returns.tolist(), "cost": costs.tolist(), "unsafe_start": unsafe.tolist()},
         "protocol": 1,
@@ -176,7 +176,7 @@ def test_seeds_are_pooled(runs):
     assert plain.returns == pytest.approx(returns.mean())
     low, high = plain.returns_interval
     assert high - low > abs(returns[0].mean() - returns[1].mean())  # two seeds know little of a third
-    assert plain.cost == pytest.approx(costs.mean()) and plain.avoidable == 0.0
+    assert plain.cost == pytest.approx(costs.mean()) and plain.cost_safe_start == 0.0
     assert plain.violations == int(costs.sum())
     assert plain.violation_upper == statistics.upper_bound(int((costs > 0).any(0).sum()), 20)  # resets, not episodes
     assert plain.returns_norm == pytest.approx((returns.mean() - 159.8) / 357.0)
@@ -214,7 +214,9 @@ def test_one_run_and_one_path_make_a_page(runs, tmp_path):
         assert "BC" in build_report(one, tmp_path / "one.html").read_text()
 
 
-@pytest.mark.parametrize("lost", ["cost_cvar10", "avoidable_interval", "unsafe_starts", "return_interval", "split"])
+@pytest.mark.parametrize(
+    "lost", ["cost_cvar10", "cost_safe_start_interval", "unsafe_starts", "return_interval", "split"]
+)
 def test_results_of_another_version_are_named(runs, tmp_path, lost):
     told = runs[2].results
     del told["default"][lost]

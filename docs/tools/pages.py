@@ -14,6 +14,7 @@ from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
 from ringfence.problem import constraints
+from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -31,6 +32,9 @@ REFERENCE = {
     "Danger": ("ringfence.problem.constraints",),
     "Training": ("ringfence.training.loop", "ringfence.training.runs"),
     "Playing": (
+        "ringfence.loading.resolve",
+        "ringfence.loading.controller",
+        "ringfence.evaluation.evaluate",
         "ringfence.evaluation.protocol",
         "ringfence.evaluation.play",
         "ringfence.logs.collect",
@@ -46,7 +50,12 @@ REFERENCE = {
         "ringfence.world.values",
         "ringfence.world.barrier",
     ),
-    "Guards": ("ringfence.guards.policy", "ringfence.guards.filter", "ringfence.guards.danger"),
+    "Guards": (
+        "ringfence.guards.policy",
+        "ringfence.guards.filter",
+        "ringfence.guards.danger",
+        "ringfence.guards.wrap",
+    ),
     "Planners": ("ringfence.proposals.planner",),
     "Algorithms": (
         "ringfence.types",
@@ -98,7 +107,7 @@ SUITES = (
     "crossing-teams",
     "spread-teams",
 )
-NAMED = ("algorithm", "variant", "guard", "danger", "sight", "agents")  # what a row of a table is called by
+NAMED = ("algorithm", "variant", "guard", "barrier", "execution", "agents")  # what a row of a table is called by
 # Pages that stand outside docs/, and their places on the site.
 OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md", "results/README.md": "results.md"}
 
@@ -287,10 +296,9 @@ def _rows(task: Task) -> list[str]:
     lines = []
     for suite in SUITES:
         found = defaultdict(list)
-        with open(RESULTS / suite / "table.csv") as file:
-            for row in csv.DictReader(file):
-                if row["task"] == task.name:
-                    found[tuple(row[name] for name in NAMED)].append(row)
+        for row in stored.table(RESULTS / suite / "table.csv"):
+            if row["task"] == task.name:
+                found[tuple(row[name] for name in NAMED)].append(row)
         if not found:
             continue
         lines += [f"### `results/{suite}`", ""]
@@ -308,13 +316,14 @@ def _rows(task: Task) -> list[str]:
 
 
 def _row(names: tuple[str, ...], rows: list[dict], falls: bool) -> str:
-    algorithm, variant, guard, source, sight, agents = names
+    algorithm, variant, guard, barrier, execution, agents = names
     reference = variant == "reference"
     who = algorithm if reference else f"`{algorithm}` `{variant}`"
     who += f", {agents} agents" if agents else ""
-    how = "–" if guard == "none" else f"{guard}, {source}" + ", own sight" * (sight == "own")
+    alone = ", decentralized" if execution == "decentralized" else ""
+    how = "–" if guard == "none" else f"{guard}, {barrier}{alone}"
     cells = [f"{_mean(rows, key):.2f}" for key in ("return_mean", "return_norm")]
-    cells += [f"{_mean(rows, key):.3g}" for key in ("cost_mean", "avoidable_cost")]
+    cells += [f"{_mean(rows, key):.3g}" for key in ("cost_mean", "cost_safe_start")]
     rates = ["violation_rate", *["termination_rate"] * falls]
     cells += [f"{100 * _mean(rows, key):.3g} %" for key in rates]  # 1 of 5000 must not read as none
     return f"| {who} | {how} | " + " | ".join(cells) + f" | {'' if reference else len(rows)} |"

@@ -39,6 +39,7 @@ from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run, write_json
 from ringfence.utils import schemas
+from ringfence.utils import stored as names
 from ringfence.utils.config import build_config
 from ringfence.utils.files import whole
 from ringfence.world import Settings
@@ -124,18 +125,23 @@ def same_options(stored: dict, evaluation: dict, task: Task, defaults: dict) -> 
     today, given the planner's defaults, and in a World of the settings that it has there. What labels come from follows
     from the data."""
     how = asked(**evaluation)
-    plan = dataclasses.asdict(PlanOptions(**{**defaults, **PLANNERS[how.planner], **how.plan}))
-    if stored["options"] and {**dataclasses.asdict(PlanOptions()), **stored["options"]} != plan:
+    plan = PlanOptions(**{**defaults, **PLANNERS[how.planner], **how.plan})
+    usual = names.planner_options(dataclasses.asdict(PlanOptions()))
+    wanted = names.planner_options(dataclasses.asdict(plan))
+    if stored["options"] and {**usual, **stored["options"]} != wanted:
         return False
     guard = stored.get("guard_options") or {}
     if not how.guarded:
         return not guard
-    wanted = dataclasses.asdict(GuardOptions(**options_of(how.guard, how.danger, task.guard, **how.given)))
-    told = {**dataclasses.asdict(GuardOptions()), **guard}  # an option newer than the result had its default then
+    options = GuardOptions(**options_of(how.guard, how.danger, task.guard, **how.given))
+    wanted = names.guard_options(dataclasses.asdict(options))
+    usual = names.guard_options(dataclasses.asdict(GuardOptions()))
+    played = {**usual, **guard}  # an option newer than the result had its default then
     world = Settings(**worlds.usual(task, worlds.sight_of(task, how.sight)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
-    known = {k: v for k, v in dataclasses.asdict(world).items() if k not in ("labels", "barrier")}
-    return bool(guard) and told == wanted and all(fitted.get(k, v) == v for k, v in known.items())
+    known = names.world_settings(dataclasses.asdict(world))
+    known = {k: v for k, v in known.items() if k not in ("labels", "barrier")}
+    return bool(guard) and played == wanted and all(fitted.get(k, v) == v for k, v in known.items())
 
 
 @dataclass(frozen=True)

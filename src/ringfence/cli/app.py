@@ -212,7 +212,7 @@ def evaluate(
             terminal(r["variant"]),
             f"{r['return_mean']:.1f}",
             f"{r['cost_mean']:.3f}",
-            f"{r['avoidable_cost']:.3f}",
+            f"{r['cost_safe_start']:.3f}",
             f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
             f"{r['return_norm']:.3f}" if _of_usual_size(r) else "–",  # constants are those of the logs' team
             f"{r['cost_norm']:.3f}",
@@ -284,7 +284,7 @@ def play(
             f"{r['return_mean']:.4g} ({r['return_interval'][0]:.4g} to {r['return_interval'][1]:.4g})",
             "\n".join([f"{r['cost_mean']:.3f}", *each]),
             f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
-            f"{100 * r['infeasible']:.2g} %" if "infeasible" in r else "",
+            f"{100 * r['infeasible_rate']:.2g} %" if "infeasible_rate" in r else "",
         )
     _told(table, refused, len(found))
 
@@ -647,7 +647,7 @@ def bench_results(folder: Positional[Path]) -> None:
                 f"{r.returns:.1f} [{low:.1f}, {high:.1f}]",
                 f"{r.returns_norm:.3f}",
                 f"{r.cost:.3f}" + ("" if r.safe else " over"),
-                f"{r.avoidable:.4f}",
+                f"{r.cost_safe_start:.4f}",
                 f"{r.violation_rate:.3f} (≤ {r.violation_upper:.3f})",
             )
         out.print(table)

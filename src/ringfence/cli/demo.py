@@ -50,7 +50,7 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
             f"{r['return_mean']:.1f} ± {r['return_std']:.1f}",
             f"{r['return_norm']:.3f}",
             f"{r['cost_mean']:.3f}",
-            f"{r['avoidable_cost']:.3f}",
+            f"{r['cost_safe_start']:.3f}",
             f"{100 * r['violation_rate']:.1f} % (≤ {100 * r['violation_upper']:.1f} %)",
         )
     console.print(table)

@@ -249,7 +249,7 @@ def _of_constraints(played: list[Episode], limits: dict[str, float]) -> dict[str
             "violation_upper": statistics.upper_bound(int((costs > 0).sum()), len(costs)),
         }
         if name in limits:
-            found[name] |= {"limit": limits[name], "within": float((costs <= limits[name]).mean())}
+            found[name] |= {"limit": limits[name], "limit_satisfied_rate": float((costs <= limits[name]).mean())}
     return found
 
 

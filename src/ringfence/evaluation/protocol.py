@@ -1,7 +1,7 @@
 """The evaluation protocol: fixed resets shared by all methods, raw numbers first, unsafe starts apart.
 
 Test resets and validation resets come from disjoint keys; settings are chosen on validation, tables are made on test.
-Every episode is counted; *avoidable* cost is that of the episodes that do not start unsafe.
+Every episode is counted; `cost_safe_start` is the mean cost of the episodes that start safe.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ringfence.problem import constraints
 from ringfence.problem.homogeneous import look
 from ringfence.types import Policy
 
+RATES = {"infeasible": "infeasible_rate", "strange": "ood_rate"}  # columns of what is counted in steps
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 
 
@@ -30,7 +31,7 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
     steps, terminated = played["steps"], played["terminated"]
     n, fine = len(returns), ~hazard_at_start
     violated = costs > 0
-    avoidable = costs[fine] if fine.any() else np.zeros(1)
+    cost_safe_start = costs[fine] if fine.any() else np.zeros(1)
     return {
         "episodes": n,
         "return_mean": float(returns.mean()),
@@ -47,13 +48,13 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "violation_rate": float(violated.mean()),
         "violation_interval": statistics.clopper_pearson(int(violated.sum()), n),
         "violation_upper": statistics.upper_bound(int(violated.sum()), n),
-        **{k: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
+        **{RATES[k]: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
         # Share of (agent, episode) with a cost of the agent's own.
         **({"agent_violation_rate": float(played["touched"].any(1).mean())} if "touched" in played else {}),
         "unsafe_starts": int(hazard_at_start.sum()),
-        "avoidable_cost": float(avoidable.mean()),
-        "avoidable_interval": statistics.bootstrap_mean(avoidable),
-        "avoidable_violation_upper": statistics.upper_bound(int((avoidable > 0).sum()), len(avoidable)),
+        "cost_safe_start": float(cost_safe_start.mean()),
+        "cost_safe_start_interval": statistics.bootstrap_mean(cost_safe_start),
+        "violation_upper_safe_start": statistics.upper_bound(int((cost_safe_start > 0).sum()), len(cost_safe_start)),
         "constants": {
             "return_min": task.return_min,
             "return_max": task.return_max,

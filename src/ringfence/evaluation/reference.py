@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,10 +14,16 @@ from ringfence.problem import constraints
 from ringfence.problem.homogeneous import Each
 from ringfence.proposals.base import Constant
 from ringfence.training.runs import write_json
-from ringfence.utils import schemas
+from ringfence.utils import schemas, stored
 
 FILE = "reference.json"
 SAFE = "data within the limit"
+
+
+def read(file: Path) -> dict[str, dict[str, Any]]:
+    """The reference rows of a file by name, under today's names."""
+    damaged = "holds a damaged reference file; delete it and make it again"
+    return stored.results(schemas.read(file, schemas.References, damaged))
 
 
 def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict:
@@ -44,7 +51,7 @@ def there(task: Task, out: str | Path, episodes: int, transitions: int | None = 
     file = Path(out) / task.name / FILE
     if not file.exists():
         return False
-    known = schemas.read(file, schemas.References, "has damaged reference rows; delete that file")
+    known = read(file)
     if not all(complete(r, task) for r in known.values()):
         return False
     card = known.get("behaviour data", {}).get("data", {})
@@ -66,7 +73,7 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
     file = Path(out) / task.name / FILE
     safe = (store.episode_costs <= task.cost_limit) & ~store.episode_terminated
     if file.exists():
-        known = schemas.read(file, schemas.References, "has damaged reference rows; delete that file")
+        known = read(file)
         same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()
         if same and all(complete(r, task) for r in known.values()) and known["behaviour data"]["data"] == store.card:
             return known

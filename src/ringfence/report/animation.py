@@ -36,7 +36,7 @@ def players(section: Section) -> list[dict]:
     for row in section.rows:
         if row.split == "test" and (kept := of_row(row)):
             options = row.members[0][1].get("options") or {}
-            found.append(((options.get("plans", 0), options.get("ascent", 0.0)), row, *kept))
+            found.append(((options.get("plans", 0), options.get("value_guidance", 0.0)), row, *kept))
     if not found:
         return []
     most = max(found, key=lambda f: f[0])  # of equals the first; the flagship is last in the table, so look backwards

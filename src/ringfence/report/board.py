@@ -19,6 +19,7 @@ from ringfence.bench import suites
 from ringfence.bench.cells import read_about
 from ringfence.datasets import registry
 from ringfence.errors import UserError
+from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.logs.provenance import other_data
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
@@ -228,10 +229,10 @@ def _lacking(suite: str, task: str, job: str, run: Run) -> list[str]:
 
 def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
     """File -> (task, rows by name)."""
-    inside, damaged = folder / "reference", "holds a damaged reference file; delete it and make it again"
+    inside = folder / "reference"
     files = [(f, f.parent.name) for f in sorted(inside.glob("*/reference.json"))]
     files += [(f, f.stem) for f in sorted(inside.glob("*.json"))]
-    return {f: (task, schemas.read(f, schemas.References, damaged)) for f, task in files}
+    return {f: (task, reference.read(f)) for f, task in files}
 
 
 def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entry]:

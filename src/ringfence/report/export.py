@@ -76,9 +76,9 @@ def _numbers(r: Standing) -> dict:
         "cost_low": r.cost_interval[0],
         "cost_high": r.cost_interval[1],
         "cost_norm": r.cost_norm,
-        "avoidable_cost": r.avoidable,
-        "avoidable_low": r.avoidable_interval[0],
-        "avoidable_high": r.avoidable_interval[1],
+        "avoidable_cost": r.cost_safe_start,
+        "avoidable_low": r.cost_safe_start_interval[0],
+        "avoidable_high": r.cost_safe_start_interval[1],
         "unsafe_episodes": r.violation_rate,
         "unsafe_upper": r.violation_upper,
         "ended_early": r.ended,
@@ -131,7 +131,7 @@ def _latex(r: Standing | Method) -> str:
     returns = _pm(r.returns, r.returns_sd, 1, r"\pm")
     norm = _pm(r.returns_norm, r.returns_norm_sd, 2, r"\pm")
     cost = _pm(r.cost, r.cost_sd, 2, r"\pm") + ("" if r.safe else r"^{\dagger}")
-    cells = [returns, norm, cost, f"{r.avoidable:.3f}"]
+    cells = [returns, norm, cost, f"{r.cost_safe_start:.3f}"]
     cells += [rf"{100 * r.violation_rate:.1f}\;({100 * r.violation_upper:.1f})"]
     if r.best:
         name, cells = rf"\textbf{{{name}}}", [rf"\mathbf{{{c}}}" for c in cells]
@@ -192,7 +192,7 @@ def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
         f"**{returns}**" if r.best else returns,
         norm,
         _pm(r.cost, r.cost_sd, 3, "±") + ("" if r.safe else " †"),
-        f"{r.avoidable:.3f} ({r.avoidable_interval[0]:.3f} to {r.avoidable_interval[1]:.3f})",
+        f"{r.cost_safe_start:.3f} ({r.cost_safe_start_interval[0]:.3f} to {r.cost_safe_start_interval[1]:.3f})",
         f"{share(r.violation_rate)} (≤ {share(r.violation_upper)})",
         several if r.method else "–",
         "–" if r.train_seconds is None else f"{r.train_seconds:,.0f}",
@@ -206,7 +206,7 @@ def _brief(r: Standing | None, most: int) -> str:
     """`most`: seeds of a whole row; fewer are said."""
     if r is None:
         return "not measured"
-    text = f"{r.returns_norm:.2f} ({r.avoidable:.3f})" + ("" if r.safe else " †")
+    text = f"{r.returns_norm:.2f} ({r.cost_safe_start:.3f})" + ("" if r.safe else " †")
     text += f" [{len(r.seeds)}]" if r.method and len(r.seeds) < most else ""
     return f"**{text}**" if r.best else text
 

@@ -137,8 +137,8 @@ def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
         points = [*rows, *section.references]
         for row in points:
             ink = INK if row.reference else colour(row)
-            x, y = row.avoidable, row.returns
-            ax.plot(row.avoidable_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
+            x, y = row.cost_safe_start, row.returns
+            ax.plot(row.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
             ax.plot((x, x), row.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
             face = "none" if row.reference else ink
             ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
@@ -158,20 +158,20 @@ def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
         ax.set_ylabel("return per episode")
         made.canvas.draw()
         _label(ax, points)
-        said = "; ".join(f"{r.label}: return {r.returns:.1f}, avoidable cost {r.avoidable:.3f}" for r in points)
+        said = "; ".join(f"{r.label}: return {r.returns:.1f}, avoidable cost {r.cost_safe_start:.3f}" for r in points)
         return to_svg(made, f"Return against avoidable cost on {section.task}. {said}", name)
 
 
 def _label(ax, points: list[Row]) -> None:
     """Put every name beside its point where it hides nothing, else where it hides least."""
     renderer = ax.figure.canvas.get_renderer()
-    dots = [ax.transData.transform((r.avoidable, r.returns)) for r in points]
+    dots = [ax.transData.transform((r.cost_safe_start, r.returns)) for r in points]
     bars = [
         (ax.transData.transform(a), ax.transData.transform(b))
         for r in points
         for a, b in (
-            ((r.avoidable_interval[0], r.returns), (r.avoidable_interval[1], r.returns)),
-            ((r.avoidable, r.returns_interval[0]), (r.avoidable, r.returns_interval[1])),
+            ((r.cost_safe_start_interval[0], r.returns), (r.cost_safe_start_interval[1], r.returns)),
+            ((r.cost_safe_start, r.returns_interval[0]), (r.cost_safe_start, r.returns_interval[1])),
         )
     ]
     frame, taken = ax.get_window_extent(), []
@@ -187,7 +187,7 @@ def _label(ax, points: list[Row]) -> None:
         for dx, dy, side in around:
             text = ax.annotate(
                 row.label,
-                (row.avoidable, row.returns),
+                (row.cost_safe_start, row.returns),
                 (dx, dy),
                 textcoords="offset points",
                 ha=side,
@@ -209,7 +209,7 @@ def _label(ax, points: list[Row]) -> None:
         far = abs(dx) + abs(dy) > 30
         ax.annotate(
             row.label,
-            (row.avoidable, row.returns),
+            (row.cost_safe_start, row.returns),
             (dx, dy),
             textcoords="offset points",
             ha=side,

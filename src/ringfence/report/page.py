@@ -23,7 +23,7 @@ from ringfence.report import animation, figures
 from ringfence.report.pooling import mean_of
 from ringfence.report.table import NAMES, Row, Section, sections
 from ringfence.training.runs import Run
-from ringfence.utils import schemas
+from ringfence.utils import schemas, stored
 from ringfence.utils.escape import shell
 from ringfence.utils.files import whole
 
@@ -129,7 +129,7 @@ def constraint_table(rows: list[Row]) -> list[dict]:
         told = [result["constraints"] for _, result in row.members if "constraints" in result]
         for name in told[0] if len(told) == len(row.members) and told else ():
             each = [t[name] for t in told if name in t]
-            line = {k: mean_of(each, k) for k in ("cost_mean", "violation_rate", "limit", "within")}
+            line = {k: mean_of(each, k) for k in ("cost_mean", "violation_rate", "limit", "limit_satisfied_rate")}
             found.append({"row": row, "name": name, **line})
     return found
 
@@ -177,11 +177,11 @@ def headline(section: Section) -> list[str]:
             verb = "overlaps" if len(near) == 1 else "overlap"
             noun = "interval" if len(near) == 1 else "intervals"
             said.append(f"The {noun} of {_and([r.label for r in near])} {verb} with its own.")
-        calm = min(rows, key=lambda r: (r.avoidable, -r.returns))
+        calm = min(rows, key=lambda r: (r.cost_safe_start, -r.returns))
         if calm is not best:
             said.append(
-                f"Fewest avoidable {unit}: {calm.label}, {calm.avoidable:.3f} per episode against "
-                f"{best.avoidable:.3f}, at a return of {calm.returns:.1f}."
+                f"Fewest avoidable {unit}: {calm.label}, {calm.cost_safe_start:.3f} per episode against "
+                f"{best.cost_safe_start:.3f}, at a return of {calm.returns:.1f}."
             )
     data = next((r for r in section.references if r.name == "behaviour data"), None)
     if data:
@@ -340,18 +340,19 @@ def _usual_preset(algorithm: str, task: str) -> str:
 
 def _how(result: dict, run: Run) -> str:
     """The options of `ringfence eval` that gave a result."""
-    planner, name = result.get("planner", "plain"), result.get("guard", "none")
+    planner, name = result.get("planner", "default"), result.get("guard", "none")
     task = registry.TASKS.get(run.config["task"])
-    words = [f"--planner {planner}"] if planner != "plain" else []
+    words = [f"--planner {planner}"] if planner != "default" else []
     team = run.config.get("team") if task is None else task.env.n_agents
     words += [f"--agents {result['agents']}"] if result.get("agents") not in (None, team) else []
-    told, usual = dict(result.get("options") or {}), dataclasses.asdict(PlanOptions()) | PLANNERS.get(planner, {})
-    given = {k: v for k, v in told.items() if v != usual.get(k)}
+    planners = {stored.PLANNERS.get(known, known): options for known, options in PLANNERS.items()}
+    usual = stored.planner_options(dataclasses.asdict(PlanOptions()) | planners.get(planner, {}))
+    given = {k: v for k, v in (result.get("options") or {}).items() if v != usual.get(k)}
     if result.get("guard_options"):
-        words += [f"--guard {name} --danger {result['danger']}"]
-        words += [f"--sight {result['sight']}"] if result["sight"] != "all" else []
-        usual = {} if task is None else task.guard
-        usual = dataclasses.asdict(GuardOptions()) | options_of(name, result["danger"], usual)
+        words += [f"--guard {name} --barrier {result['barrier']}"]
+        words += [f"--execution {result['execution']}"] if result["execution"] != "centralized" else []
+        usual = options_of(name, result["barrier"], {} if task is None else task.guard)
+        usual = stored.guard_options(dataclasses.asdict(GuardOptions()) | usual)
         given |= {k: v for k, v in result["guard_options"].items() if v != usual.get(k)}
     if given:
         words.append("--set " + " ".join(shell(f"{k}={v}") for k, v in given.items()))

@@ -23,8 +23,8 @@ class Numbers:
     cost: float
     cost_interval: Interval
     cost_norm: float
-    avoidable: float
-    avoidable_interval: Interval
+    cost_safe_start: float
+    cost_safe_start_interval: Interval
     violations: int
     violation_upper: float  # exact, one-sided, of the resets on which any run has one
     unsafe_starts: int
@@ -48,8 +48,8 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
             "returns_interval": tuple(first["return_interval"]),
             "cost": first["cost_mean"],
             "cost_interval": tuple(first["cost_interval"]),
-            "avoidable": first["avoidable_cost"],
-            "avoidable_interval": tuple(first["avoidable_interval"]),
+            "cost_safe_start": first["cost_safe_start"],
+            "cost_safe_start_interval": tuple(first["cost_safe_start_interval"]),
             "unsafe_starts": first["unsafe_starts"],
             "cvar": first["cost_cvar10"],
             "violation_upper": statistics.upper_bound(_violations(first), first["episodes"]),
@@ -71,8 +71,8 @@ def pool(results: list[dict], who: str = "the runs of a row") -> dict:
             "returns_interval": statistics.mean_of_runs(returns),
             "cost": float(cost.mean()),
             "cost_interval": statistics.mean_of_runs(cost, least=0.0),
-            "avoidable": float(avoidable[fine].mean()),
-            "avoidable_interval": statistics.mean_of_runs(avoidable, fine, least=0.0),
+            "cost_safe_start": float(avoidable[fine].mean()),
+            "cost_safe_start_interval": statistics.mean_of_runs(avoidable, fine, least=0.0),
             "unsafe_starts": int(unsafe.sum()),
             "cvar": statistics.cvar(cost.ravel()),
             # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from ringfence.algos import ALGORITHMS
 from ringfence.errors import UserError
+from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.logs.provenance import other_data
 from ringfence.report.pooling import Numbers, mean_of, pool
 from ringfence.training.runs import Run
-from ringfence.utils import schemas
 
 SPLITS = ("test", "validation")
 NAMES = {
@@ -33,8 +33,8 @@ NAMES = {
     "mpc": "No prior",
 }
 ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
-NEEDED = ("episodes", "return_mean", "cost_mean", "avoidable_cost", "violation_rate", "constants", "protocol", "task")
-NEEDED += ("return_interval", "cost_interval", "avoidable_interval", "cost_cvar10", "unsafe_starts")
+NEEDED = ("episodes", "return_mean", "cost_mean", "cost_safe_start", "violation_rate", "constants", "protocol", "task")
+NEEDED += ("return_interval", "cost_interval", "cost_safe_start_interval", "cost_cvar10", "unsafe_starts")
 
 
 @dataclass(kw_only=True)
@@ -170,13 +170,13 @@ def _agree(who: str, result: dict, leader: dict, of: str) -> None:
 
 
 def _references(runs: list[Run], task: str, leader: dict, first: Run) -> list[Row]:
-    rows, read, damaged = {}, set(), "holds a damaged reference file; delete it and make it again"
+    rows, read = {}, set()
     for run in runs:
         file = run.path.resolve().parent.parent / "reference.json"
         if file in read or not file.exists():
             continue
         read.add(file)
-        for name, result in schemas.read(file, schemas.References, damaged).items():
+        for name, result in reference.read(file).items():
             _check(f"'{file}' row '{name}'", result, task)
             _agree(f"'{file}' row '{name}'", result, leader, f"'{first.path}'")
             rows.setdefault(name, pool([result]) | {"split": result.get("split", "test")})

@@ -23,7 +23,7 @@ from safetensors.numpy import save_file
 
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
-from ringfence.utils import schemas
+from ringfence.utils import schemas, stored
 from ringfence.utils.config import RANGES
 from ringfence.utils.files import alone, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
@@ -51,11 +51,11 @@ class Run:
         return schemas.read(self.path / "config.json", schemas.Config, remedy)
 
     @property
-    def results(self) -> dict[str, dict]:
-        """Evaluations by variant; empty before the first `ringfence eval`."""
+    def results(self) -> dict[str, dict[str, Any]]:
+        """Evaluations by variant, under today's names; empty before the first `ringfence eval`."""
         file = self.path / "results.json"
         remedy = "holds a damaged results.json; delete that file and evaluate the run again"
-        return schemas.read(file, schemas.Results, remedy) if file.exists() else {}
+        return stored.results(schemas.read(file, schemas.Results, remedy)) if file.exists() else {}
 
     @property
     def metrics(self) -> list[dict]:

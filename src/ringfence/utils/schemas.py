@@ -120,10 +120,23 @@ class Constraint(TypedDict):
     cost_interval: NotRequired[Interval]
     violation_upper: NotRequired[Share]
     limit: NotRequired[float]
-    within: NotRequired[Share]
+    limit_satisfied_rate: NotRequired[Share]
+    within: NotRequired[Share]  # of 0.1.0
 
 
-class Result(TypedDict, total=False):
+class Before(TypedDict, total=False):
+    """What 0.1.0 called columns that have another name now; `utils/stored.py` translates them."""
+
+    avoidable_cost: float
+    avoidable_interval: Interval
+    avoidable_violation_upper: Share
+    danger: str
+    sight: str
+    infeasible: float
+    strange: float
+
+
+class Result(Before, total=False):
     """A summary of episodes: an evaluation in results.json, or a reference row."""
 
     episodes: Positive
@@ -141,9 +154,9 @@ class Result(TypedDict, total=False):
     violation_upper: Share
     agent_violation_rate: Share
     unsafe_starts: Count
-    avoidable_cost: float
-    avoidable_interval: Interval
-    avoidable_violation_upper: Share
+    cost_safe_start: float
+    cost_safe_start_interval: Interval
+    violation_upper_safe_start: Share
     steps_mean: float
     termination_rate: Share
     constants: Constants
@@ -158,13 +171,13 @@ class Result(TypedDict, total=False):
     planner: str
     options: dict[str, Scalar]
     guard: str
-    danger: str
-    sight: str
+    barrier: str
+    execution: str
     agents: Few
     guard_options: dict[str, Scalar]
     world_settings: dict[str, Scalar]
-    infeasible: float
-    strange: float
+    infeasible_rate: float
+    ood_rate: float
     eval_seconds: float
     train_seconds: float
     plan_ms_p50: float | None

@@ -1,0 +1,137 @@
+"""What older versions wrote, under today's names.
+
+Files keep the names of the version that wrote them. Whoever reads a stored result goes through `result`, whoever reads
+a table through `table`, and sees one set of names. What is under today's names already stays as it is.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+COLUMNS = {
+    "avoidable_cost": "cost_safe_start",
+    "avoidable_interval": "cost_safe_start_interval",
+    "avoidable_violation_upper": "violation_upper_safe_start",
+    "infeasible": "infeasible_rate",
+    "strange": "ood_rate",
+    "danger": "barrier",
+    "sight": "execution",
+}
+CONSTRAINTS = {"within": "limit_satisfied_rate"}
+PLANNER_OPTIONS = {
+    "steps": "sampling_steps",
+    "guidance": "cfg_scale",
+    "target": "target_return",
+    "ascent": "value_guidance",
+}
+GUARD_OPTIONS = {
+    "plans": "num_samples",
+    "starts": "num_restarts",
+    "refine": "optimizer_steps",
+    "reach": "trust_radius",
+    "care": "safety_weight",
+    "shield": "correction_steps",
+    "bound": "max_correction",
+    "rows": "horizon",
+    "future": "terminal_value",
+}
+WORLD_SETTINGS = {
+    "sight": "execution",
+    "members": "num_ensemble",
+    "both_ends": "use_transition",
+    "missed": "miscoverage",
+}
+BARRIERS = {"formula": "analytic"}
+EXECUTIONS = {"all": "centralized", "own": "decentralized"}
+PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}
+VALUES = {"barrier": BARRIERS, "execution": EXECUTIONS, "planner": PLANNERS}  # by today's name of the column
+
+# Heads of tables in results/ that no result has.
+HEADS = {
+    "who": "method",
+    "unknown": "ood_rate",
+    "apart": "action_rmse",
+    "not_surely_safe": "margin_violation_rate",
+    "foreseen_unsafe": "predicted_violation_rate",
+}
+
+# What planners that checked their own actions by the formula did, before guards were apart from them.
+_BEFORE_GUARDS = {"guarded": "shield", "shielded": "shield", "adaptive": "adapt"}
+
+
+def result(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """An evaluation, or a reference row, as today's version would have written it."""
+    found = _before_guards(stored) | named(stored, COLUMNS)
+    for column, rename in (
+        ("options", planner_options),
+        ("guard_options", guard_options),
+        ("world_settings", world_settings),
+        ("constraints", _constraints),
+    ):
+        if column in found:
+            found[column] = rename(found[column])
+    return found
+
+
+def results(stored: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Results by variant, or reference rows by name."""
+    return {name: result(one) for name, one in stored.items()}
+
+
+def planner_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    return named(stored, PLANNER_OPTIONS)
+
+
+def guard_options(stored: Mapping[str, Any]) -> dict[str, Any]:
+    return named(stored, GUARD_OPTIONS)
+
+
+def world_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
+    return named(stored, WORLD_SETTINGS)
+
+
+def named(stored: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    """The same values under today's names, and what they are called today where they are names themselves."""
+    return {names.get(name, name): _value(names.get(name, name), value) for name, value in stored.items()}
+
+
+def table(file: str | Path) -> list[dict[str, str]]:
+    """The rows of a CSV file, in order."""
+    with open(file, newline="", encoding="utf-8") as opened:
+        return rows(csv.DictReader(opened))
+
+
+def rows(stored: Iterable[Mapping[str, str]]) -> list[dict[str, str]]:
+    """Rows of a table. Their `options` are written as `name=value name=value`."""
+    found = []
+    for line in stored:
+        names = dict(COLUMNS) if "barrier" not in line else {k: v for k, v in COLUMNS.items() if v != "barrier"}
+        row = named(line, names | HEADS)
+        if "options" in row:
+            row["options"] = re.sub(r"\b(\w+)=", lambda m: f"{GUARD_OPTIONS.get(m[1], m[1])}=", row["options"])
+        found.append(row)
+    return found
+
+
+def _constraints(stored: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    return {name: named(constraint, CONSTRAINTS) for name, constraint in stored.items()}
+
+
+def _value(column: str, value: Any) -> Any:
+    known = VALUES.get(column, {})
+    return known.get(value, value) if isinstance(value, str) else value
+
+
+def _before_guards(stored: Mapping[str, Any]) -> dict[str, str]:
+    """Guard, barrier and execution of an evaluation that is older than guards; nothing of any other."""
+    if "guard" in stored or "planner" not in stored:
+        return {}
+    guard = _BEFORE_GUARDS.get(stored["planner"], "none")
+    if guard == "none" and (stored.get("options") or {}).get("plans", 1) > 1:
+        guard = "select"
+    barrier = "none" if guard == "none" else "analytic"
+    return {"guard": guard, "barrier": barrier, "execution": "centralized"}
