@@ -21,7 +21,7 @@ from ringfence.evaluation import protocol
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
 from ringfence.report.board import Method, read
 from ringfence.report.board_page import published, rankings
-from ringfence.report.page import danger
+from ringfence.report.headline import danger
 from ringfence.report.published import PUBLISHED, matches
 from ringfence.report.standings import aggregate, aggregates, contests, references, standings
 from ringfence.utils.escape import latex, markdown, shell, spreadsheet, terminal
@@ -331,8 +331,8 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
     cell(root, {"mujoco": summary([400] * 4, [0] * 4, names[0])}, "icbf", preset="mujoco", task=names[0])
     board = read(root)
     first, second = rankings(board, standings(board))
-    assert [(r["name"], r["mean"]) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
-    assert second.tasks == names[2:] and [r["name"] for r in second.rows] == ["BC"]  # who has no result has no row
+    assert [(r.name, r.mean) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
+    assert second.tasks == names[2:] and [r.name for r in second.rows] == ["BC"]  # who has no result has no row
     native, quantile = aggregates(board)
     assert (native.protocol, native.tasks, quantile.tasks) == ("native", names[:2], names[2:])
     (told,) = native.iqm_returns.values()
@@ -517,16 +517,17 @@ def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
 
 def test_published_values_stand_beside_ours_and_apart(folder, tmp_path):
     board = read(folder)
-    told = published(board, standings(board))
-    bc = next(p for p in told["rows"] if p["name"] == "BC")
-    assert told["tasks"] == ["expert", "medium"] and bc["numbers"] == [35.0, 31.6]
-    assert bc["ours"][0]["label"] == "BC"
-    assert bc["ours"][0]["numbers"] == pytest.approx([100 * (x - LOW) / (HIGH - LOW) for x in (310, 250)])
-    omar = next(p for p in told["rows"] if p["name"] == "OMAR")
-    assert omar["numbers"] == [114.9, 47.9] and omar["ours"] == []
+    table = published(board, standings(board))
+    assert table is not None
+    bc = next(row for row in table.rows if row.name == "BC")
+    assert table.tasks == ["expert", "medium"] and bc.numbers == [35.0, 31.6]
+    assert bc.ours[0].label == "BC"
+    assert bc.ours[0].numbers == pytest.approx([100 * (x - LOW) / (HIGH - LOW) for x in (310, 250)])
+    omar = next(row for row in table.rows if row.name == "OMAR")
+    assert omar.numbers == [114.9, 47.9] and omar.ours == []
     assert "on the public data files; ours are on regenerated data" in build_board(folder, tmp_path).read_text()
     assert {p.name for p in PUBLISHED if matches(p, "ma-td3bc")} == {"MA-TD3+BC"}
-    names = [p["name"] for p in told["rows"]]
+    names = [row.name for row in table.rows]
     assert len(names) == len(set(names)), "robots' values stay off this board"
     robot = next(p for p in PUBLISHED if p.name == "BC" and "ant_2x4-good" in p.values)
     assert robot.values["ant_2x4-good"] == pytest.approx(100 * (2697 + 325.6) / (3362.44 + 325.6), abs=0.05)

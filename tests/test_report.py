@@ -12,8 +12,7 @@ import pytest
 from ringfence.algos import ICBF
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
-from ringfence.report import animation, build_report
-from ringfence.report import page as page_of
+from ringfence.report import animation, build_report, made
 from ringfence.report.table import sections
 from ringfence.training.runs import Run
 
@@ -155,7 +154,7 @@ def test_what_was_played_before_training_went_on_is_dated(runs):
     (section,) = sections(runs)
     seeds = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
     assert seeds["split@step10"] == (0,) and seeds["split"] == (1,)
-    assert any("--step 10" in line and str(runs[0].path) in line for line in page_of.commands(section, Path("r.html")))
+    assert any("--step 10" in line and str(runs[0].path) in line for line in made.commands(section, Path("r.html")))
 
 
 def test_a_run_that_is_older_than_a_field_had_its_default(runs):
@@ -191,7 +190,7 @@ def test_the_commands_name_another_number_of_agents(runs):
     results["split"]["agents"] = 5
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
-    told = page_of.commands(section, Path("r.html"))
+    told = made.commands(section, Path("r.html"))
     assert sum("--agents 5" in line for line in told) == 1 and not any("--agents 3" in line for line in told)
 
 

@@ -77,6 +77,30 @@ def test_stratified_bootstrap_keeps_tasks_apart():
     np.testing.assert_array_equal(band, [[1, 0], [1, 0]])
 
 
+def test_stratified_bootstrap_agrees_with_scipy():
+    """Every task is a sample of its own there."""
+    scores = np.arange(3)[None] * 10.0 + RNG.normal(size=(8, 3))
+    ours = statistics.stratified_bootstrap(scores, statistics.iqm, draws=8000)
+
+    def iqm(*tasks, axis):
+        return sp.trim_mean(np.stack(np.broadcast_arrays(*tasks), -1).reshape(*tasks[0].shape[:-1], -1), 0.25, axis)
+
+    found = sp.bootstrap(tuple(scores.T), iqm, n_resamples=8000, method="percentile", random_state=1)
+    np.testing.assert_allclose(ours, found.confidence_interval, atol=0.1)
+
+
+def test_aggregates_are_rliables():
+    """Agarwal et al.'s own code, where it is installed; it brings too much for the test extra."""
+    library = pytest.importorskip("rliable.library")
+    metrics = pytest.importorskip("rliable.metrics")
+    x = RNG.normal(size=(5, 4))
+    y = RNG.normal(size=(7, 4)) - 0.3
+    assert statistics.iqm(x) == pytest.approx(metrics.aggregate_iqm(x))
+    assert statistics.probability_of_improvement(x, y) == pytest.approx(metrics.probability_of_improvement(x, y))
+    taus = np.linspace(-2, 2, 9)
+    np.testing.assert_allclose(statistics.profile(x, taus), library.score_distributions(x, taus))
+
+
 def test_probability_of_improvement_is_mann_whitneys():
     x, y = RNG.normal(size=(6, 1)), RNG.normal(size=(9, 1)) - 0.5
     u = sp.mannwhitneyu(x[:, 0], y[:, 0]).statistic

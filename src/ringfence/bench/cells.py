@@ -74,7 +74,7 @@ class Cell:
 
     @property
     def id(self) -> str:
-        """Hash of what training is told; how the run is played does not count."""
+        """Hash of what training depends on; how the run is played does not count."""
         task = registry.get(self.task)
         content = {
             "format": FORMAT,
@@ -115,9 +115,14 @@ class Cell:
             return "done"
         return "failed" if self.status(out).get("state") == "failed" else "to do"
 
-    def status(self, out: Path) -> dict:
-        file = self.folder(out) / "status.json"
-        return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {}
+    def status(self, out: Path) -> schemas.Status:
+        """What its folder says of making it; nothing before it was begun."""
+        return _status(self.folder(out)) or schemas.Status()
+
+
+def _status(folder: Path) -> schemas.Status | None:
+    file = folder / "status.json"
+    return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else None
 
 
 def same_options(stored: dict, evaluation: dict, task: Task, defaults: dict) -> bool:
@@ -155,7 +160,7 @@ class Grid:
 
     @property
     def taken(self) -> str:
-        """What a second runner is told."""
+        """What a second runner reads."""
         return f"Another runner works on '{self.out}'; wait for it or stop it."
 
     def count(self) -> dict[str, int]:
@@ -200,7 +205,7 @@ class Grid:
             )
 
 
-def about(suite: str, episodes: int) -> dict:
+def about(suite: str, episodes: int) -> dict[str, Any]:
     """Contents of bench.json."""
     return {"format": FORMAT, "protocol": protocol.PROTOCOL, "suite": suite, "episodes": episodes, "split": "test"}
 
@@ -208,7 +213,7 @@ def about(suite: str, episodes: int) -> dict:
 RESTORE = "restore that file, e.g. from another results folder of this suite and number of episodes"
 
 
-def read_about(out: Path) -> dict:
+def read_about(out: Path) -> dict[str, Any]:
     """bench.json of a results folder of this version, whose archives are unpacked then."""
     file = out / "bench.json"
     if not file.is_file():
@@ -224,20 +229,19 @@ def read_about(out: Path) -> dict:
     if lacking := [name for name in about("", 0) if name not in there]:
         raise UserError(f"'{file}' lacks '{lacking[0]}'; {RESTORE}.")
     unpack(out)
-    return there
+    return dict(there)
 
 
-def statuses(out: str | Path) -> list[dict]:
+def statuses(out: str | Path) -> list[dict[str, Any]]:
     """status.json of every cell that was begun, with its task and folder; a begun cell without one is under way, and
     one that failed early has nothing else."""
     read_about(Path(out))
     found = []
     begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):
-        file = folder / "status.json"
-        told = schemas.read(file, schemas.Status, DAMAGED) if file.exists() else {"state": "under way"}
+        status = _status(folder) or {"state": "under way"}
         task, algorithm, seed = folder.parts[-3:]
-        found.append({**told, "task": task, "run": f"{algorithm}/{seed}"})
+        found.append({**status, "task": task, "run": f"{algorithm}/{seed}"})
     return found
 
 
@@ -320,59 +324,90 @@ def narrowed(held: Mapping[str, Iterable[str]], only: Iterable[str], of: str) ->
     return {suite: names for suite, names in kept.items() if names}
 
 
-def run_group(cells: list[Cell], out: Path, episodes: int, tell: Callable[[str, Cell], None]) -> None:
-    """Train and play cells of one group, one after the other; `tell(event, cell)` hears of start, done and failed.
+Tell = Callable[[str, Cell], None]  # hears of an event (start, done, failed) and its cell
+
+
+def run_group(cells: list[Cell], out: Path, episodes: int, tell: Tell) -> None:
+    """Train and play cells of one group, one after the other.
 
     A cell that fails is recorded and does not stop the others.
     """
-    left, adopted = list(cells), {}
-    while left:
-        begun = time.perf_counter()
-        current = left[0]
+    _Group(cells, out, episodes, tell).run()
 
-        def finish(run: Run) -> None:
-            nonlocal begun, current
-            trained = time.perf_counter() - begun
-            for variant, name in current.missing(out, episodes):
-                record = 4 if current.seed == 0 else 0
-                found = evaluate(run, episodes=episodes, record=record, **EVALUATIONS[name])
-                if found["variant"] != variant:
-                    raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
-            told = {"train_seconds": trained, "eval_seconds": time.perf_counter() - begun - trained}
-            told |= adopted.get(current, {})
-            before = current.status(out)
-            if before.get("state") == "done":  # only played again: what it took to train stays said
-                told |= {k: before[k] for k in ("train_seconds", "adopted") if k in before}
-                told["eval_seconds"] += before.get("eval_seconds", 0.0)
-            _record(current, out, "done", told)
-            tell("done", left.pop(0))
-            begun = time.perf_counter()
-            if left:
-                current = left[0]
-                tell("start", current)
 
-        tell("start", current)
-        try:
-            store = data_of(current.task, current.transitions)
-            for cell in left:
-                if twin := adopt(cell, out, store.card):
-                    adopted[cell] = {"adopted": str(twin.folder(out).relative_to(out))}
-            loop.train(
-                current.algorithm,
-                store,
-                preset=current.preset,
-                seeds=tuple(c.seed for c in left),
-                changes=dict(current.changes),
-                folder={c.seed: c.folder(out) for c in left}.__getitem__,
-                on_finish=finish,
-                quiet=True,
-            )
-        except Exception as error:
-            if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
-                current = next(c for c in left if c.folder(out) == error.folder)
-            record_failure(current, out, f"{type(error).__name__}: {error}", traceback.format_exc())
-            left.remove(current)
-            tell("failed", current)
+class _Group:
+    """Cells that are being made: the first of `left` now."""
+
+    def __init__(self, cells: list[Cell], out: Path, episodes: int, tell: Tell):
+        self.left = list(cells)
+        self.out = out
+        self.episodes = episodes
+        self.tell = tell
+        self.adopted: dict[Cell, str] = {}  # whose training was another cell's, by that cell's folder
+        self.begun = time.perf_counter()
+
+    def run(self) -> None:
+        while self.left:
+            self._start()
+            try:
+                self._train()
+            except Exception as error:
+                self._fail(error)
+
+    def _start(self) -> None:
+        self.begun = time.perf_counter()
+        self.tell("start", self.left[0])
+
+    def _train(self) -> None:
+        """All that is left, in one call: seeds share their data and compiled programs."""
+        first = self.left[0]
+        store = data_of(first.task, first.transitions)
+        for cell in self.left:
+            if twin := adopt(cell, self.out, store.card):
+                self.adopted[cell] = str(twin.folder(self.out).relative_to(self.out))
+        loop.train(
+            first.algorithm,
+            store,
+            preset=first.preset,
+            seeds=tuple(cell.seed for cell in self.left),
+            changes=dict(first.changes),
+            folder={cell.seed: cell.folder(self.out) for cell in self.left}.__getitem__,
+            on_finish=self._finish,
+            quiet=True,
+        )
+
+    def _finish(self, run: Run) -> None:
+        """Play the cell whose run is trained, and go on to the next one."""
+        cell = self.left[0]
+        trained = time.perf_counter() - self.begun
+        for variant, name in cell.missing(self.out, self.episodes):
+            record = 4 if cell.seed == 0 else 0
+            found = evaluate(run, episodes=self.episodes, record=record, **EVALUATIONS[name])
+            if found["variant"] != variant:
+                raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
+        played = time.perf_counter() - self.begun - trained
+        _record(cell, self.out, "done", self._took(cell, trained, played))
+        self.tell("done", self.left.pop(0))
+        if self.left:
+            self._start()
+
+    def _took(self, cell: Cell, trained: float, played: float) -> dict[str, Any]:
+        """What the cell's status says of its time; of one that was only played again, training took what it took."""
+        adopted = {"adopted": self.adopted[cell]} if cell in self.adopted else {}
+        took: dict[str, Any] = {"train_seconds": trained, "eval_seconds": played, **adopted}
+        before = dict(cell.status(self.out))
+        if before.get("state") == "done":
+            took |= {name: before[name] for name in ("train_seconds", "adopted") if name in before}
+            took["eval_seconds"] += before.get("eval_seconds", 0.0)
+        return took
+
+    def _fail(self, error: Exception) -> None:
+        cell = self.left[0]
+        if isinstance(error, RunConflict):  # found before any training, and perhaps not in the first cell
+            cell = next(c for c in self.left if c.folder(self.out) == error.folder)
+        record_failure(cell, self.out, f"{type(error).__name__}: {error}", traceback.format_exc())
+        self.left.remove(cell)
+        self.tell("failed", cell)
 
 
 @functools.lru_cache(maxsize=1)
@@ -382,16 +417,17 @@ def data_of(task: str, transitions: int | None) -> EpisodeStore:
     return make(registry.get(task), transitions, must_keep=False)[0]
 
 
-def adopt(cell: Cell, out: Path, card: dict) -> Cell | None:
+def adopt(cell: Cell, out: Path, card: dict[str, Any]) -> Cell | None:
     """Begin a cell on data of this card with what its twin has learned, where that is there, of the same data and by
     the same revision, and return the twin; its training is then over at once."""
     twin = cell.twin()
     if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
         return None
-    there, here = Run(twin.folder(out)), Run(cell.folder(out))
-    told = there.config
-    apart = {name for name, *_ in other_data(told["data"], card)} - {"task", "hazard"}
-    if apart or told.get("revision", 1) != algos.get(cell.algorithm).revision:
+    there = Run(twin.folder(out))
+    here = Run(cell.folder(out))
+    config = there.config
+    apart = {name for name, *_ in other_data(config["data"], card)} - {"task", "hazard"}
+    if apart or config.get("revision", 1) != algos.get(cell.algorithm).revision:
         return None
     learned = [file for _, file in there.checkpoints()[-1:]]
     if not learned:  # results without what was learned, as a copied folder has them
@@ -402,7 +438,7 @@ def adopt(cell: Cell, out: Path, card: dict) -> Cell | None:
     return twin
 
 
-def _record(cell: Cell, out: Path, state: str, more: dict) -> None:
+def _record(cell: Cell, out: Path, state: str, more: Mapping[str, Any]) -> None:
     attempts = cell.status(out).get("attempts", 0) + 1
     write_json(cell.folder(out) / "status.json", {"state": state, "attempts": attempts, "id": cell.id, **more})
 

@@ -7,11 +7,14 @@ the run folder; the driver puts it in place whole. Ray repeats a task whose work
 from __future__ import annotations
 
 import io
+import logging
 import shutil
 import socket
 import tarfile
 import tempfile
 from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 from ringfence.bench.cells import Cell, Grid, make_reference, record_failure, run_group, tell_lost
 from ringfence.errors import UserError
@@ -25,7 +28,8 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
     """Make all unfinished cells on a Ray cluster (`auto`, host:port or ray://host:port; None starts a local one)."""
     if threads < 1:
         raise UserError(f"threads={threads} must be at least 1.")
-    ray, make = connect(address), packed
+    ray = connect(address)
+    make = packed
     grid.open()
 
     @ray.remote(num_cpus=threads, max_retries=RETRIES)
@@ -41,7 +45,10 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
         cells = [c for group in grid.groups() for c in group]
         ours = set(cells)
         later = {c.twin(): c for c in cells if c.twin() in ours}  # they take what their twins will have learned
-        submit = lambda c: make_cell.remote(c, grid.episodes, begun(c, grid.out))  # noqa: E731
+
+        def submit(cell: Cell) -> Any:
+            return make_cell.remote(cell, grid.episodes, begun(cell, grid.out))
+
         waiting = {submit(c): c for c in cells if c.twin() not in ours}
         with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
             while waiting:
@@ -57,7 +64,7 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
     return grid.count()
 
 
-def connect(address: str | None):
+def connect(address: str | None) -> ModuleType:
     """The ray module, connected; in one sentence why not."""
     try:
         import ray
@@ -67,7 +74,7 @@ def connect(address: str | None):
         return ray
     try:
         knock(address)
-        ray.init(address=address, logging_level="ERROR", log_to_driver=False)
+        ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False)
     except (OSError, ValueError, RuntimeError) as error:
         raise UserError(
             f"No Ray cluster answers at address '{address}' ({str(error).splitlines()[0]}); start one with `ray start "
@@ -120,7 +127,8 @@ def packed(cell: Cell, episodes: int, begun: bytes) -> bytes:
 def unpack(packed: bytes, folder: Path) -> None:
     """Put a returned run folder in place, whole or not at all."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    part, old = _beside(folder, "part"), _beside(folder, "old")
+    part = _beside(folder, "part")
+    old = _beside(folder, "old")
     for left in (part, old):
         shutil.rmtree(left, ignore_errors=True)
     with tarfile.open(fileobj=io.BytesIO(packed)) as tar:

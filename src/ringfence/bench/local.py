@@ -13,7 +13,9 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 from ringfence.bench.cells import Cell, Grid, record_failure, tell_lost
 from ringfence.bench.worker import decode, encode
@@ -69,11 +71,16 @@ class _Pool:
     """What the threads that look after workers share."""
 
     def __init__(self, grid: Grid, jobs: queue.Queue, bar: Progress, threads: int, memory: float | None, lock: int):
-        self.grid, self.jobs, self.bar, self.threads, self.memory, self.lock = grid, jobs, bar, threads, memory, lock
+        self.grid = grid
+        self.jobs = jobs
+        self.bar = bar
+        self.threads = threads
+        self.memory = memory
+        self.lock = lock
         self.deaths: dict[tuple, int] = {}
         self.guard = threading.Lock()
         self.stopping = False
-        self.running: set[subprocess.Popen] = set()
+        self.running: set[subprocess.Popen[str]] = set()
         self.too_big: set[int] = set()  # process numbers of workers that were stopped for it
 
     def serve(self, cores: list[int]) -> None:
@@ -88,7 +95,7 @@ class _Pool:
                 worker = self._start(cores)
             self._work(worker, job)
         if worker is not None and worker.poll() is None:
-            worker.stdin.close()
+            _pipes(worker)[0].close()
             worker.wait(30)
 
     def stop(self) -> None:
@@ -101,7 +108,7 @@ class _Pool:
         for w in self.running:
             w.kill()
 
-    def _start(self, cores: list[int]) -> subprocess.Popen:
+    def _start(self, cores: list[int]) -> subprocess.Popen[str]:
         environment = dict(os.environ)
         flags = environment.get("XLA_FLAGS", "")
         if self.threads == 1 and "multi_thread_eigen" not in flags:
@@ -122,33 +129,36 @@ class _Pool:
         threading.Thread(target=self._weigh, args=(worker,), daemon=True).start()
         return worker
 
-    def _work(self, worker: subprocess.Popen, job: dict) -> None:
-        current, left = None, [decode(c) for c in job.get("cells", [])]
-        try:
-            worker.stdin.write(json.dumps(job) + "\n")
-            worker.stdin.flush()
-        except (BrokenPipeError, OSError):
-            pass
-        for line in worker.stdout:
-            told = json.loads(line)
-            if told["event"] in ("finished", "broken"):
-                if told["event"] == "broken":  # a cell's own failures are recorded; this is a reference's
-                    what = f"the reference rows of {job['reference']}" if "reference" in job else "a group of cells"
-                    tell_lost(what, told["error"])
+    def _work(self, worker: subprocess.Popen[str], job: dict) -> None:
+        """Hand a worker its job and count what it makes, until it is done with it or gone."""
+        left = [decode(c) for c in job.get("cells", [])]
+        current = left[0] if left else None
+        jobs, messages = _pipes(worker)
+        with suppress(OSError):  # of a worker that is gone, which the end of its messages tells
+            jobs.write(json.dumps(job) + "\n")
+            jobs.flush()
+        for line in messages:
+            message = json.loads(line)
+            event = message["event"]
+            if event == "broken":  # a cell's own failures are recorded; this is a reference's
+                what = f"the reference rows of {job['reference']}" if "reference" in job else "a group of cells"
+                tell_lost(what, message["error"])
+            if event in ("finished", "broken"):
                 return
-            if told["event"] == "ready":
+            if event == "ready":
                 continue
-            cell = decode(told["cell"])
-            current = cell
-            if told["event"] in ("done", "failed"):
-                left = [c for c in left if c != cell]
+            current = decode(message["cell"])
+            if event in ("done", "failed"):
+                left = [cell for cell in left if cell != current]
                 self._count()
         worker.wait()
         if self.stopping:
             return
-        self._died(worker, current if current in left else (left[0] if left else None), left, job)
+        if current not in left:
+            current = left[0] if left else None
+        self._died(worker, current, left, job)
 
-    def _died(self, worker, cell: Cell | None, left: list[Cell], job: dict) -> None:
+    def _died(self, worker: subprocess.Popen[str], cell: Cell | None, left: list[Cell], job: dict) -> None:
         """The worker is gone before its job was done: retry the cell once, hand the others back."""
         if cell is None:
             if "reference" not in job:
@@ -165,7 +175,7 @@ class _Pool:
         if left:
             self.jobs.put({**job, "cells": [encode(c) for c in left]})
 
-    def _cause(self, worker) -> str:
+    def _cause(self, worker: subprocess.Popen[str]) -> str:
         grown = f"its worker grew beyond {self.memory or 0:g} GiB"
         why = grown if worker.pid in self.too_big else f"its worker died {DEATHS} times"
         return f"{why} (exit status {worker.returncode})"
@@ -179,12 +189,18 @@ class _Pool:
         with self.guard:
             self.bar.advance(1)
 
-    def _weigh(self, worker: subprocess.Popen) -> None:
+    def _weigh(self, worker: subprocess.Popen[str]) -> None:
         while self.memory and worker.poll() is None:
             if resident(worker.pid) > self.memory:
                 self.too_big.add(worker.pid)
                 worker.kill()
             time.sleep(0.5)
+
+
+def _pipes(worker: subprocess.Popen[str]) -> tuple[IO[str], IO[str]]:
+    """(where jobs go, where messages come from)."""
+    assert worker.stdin is not None and worker.stdout is not None  # it was started with both
+    return worker.stdin, worker.stdout
 
 
 def resident(pid: int) -> float:

@@ -40,10 +40,10 @@ def unpack(out: str | Path) -> None:
     if not archives:
         return
     digests = {a.name: hashlib.sha256(a.read_bytes()).hexdigest() for a in archives}
-    if (out / MARK).exists() and schemas.read(
-        out / MARK, dict[str, str], "holds a damaged mark; delete that file"
-    ) == digests:
-        return
+    if (out / MARK).exists():
+        done = schemas.read(out / MARK, dict[str, str], "holds a damaged mark; delete that file")
+        if done == digests:
+            return
     for archive in archives:
         try:
             with tarfile.open(fileobj=io.BytesIO(_content(archive))) as tar:
@@ -69,12 +69,15 @@ def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFi
     known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
     if not (known and member.isfile()):
         raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
-    file, content = out.joinpath(*parts), tar.extractfile(member).read()
+    file = out.joinpath(*parts)
+    packed = tar.extractfile(member)
+    assert packed is not None  # it is a file
+    content = packed.read()
     if file.exists():
         if parts[-1] != "results.json":
             return
-        known = schemas.read(file, schemas.Results, "holds a damaged results.json; delete that file")
-        content = json.dumps({**json.loads(content), **known}, indent=1).encode()
+        results = schemas.read(file, schemas.Results, "holds a damaged results.json; delete that file")
+        content = json.dumps({**json.loads(content), **results}, indent=1).encode()
     with whole(file) as temporary:
         temporary.write_bytes(content)
 
@@ -85,14 +88,16 @@ def pack(out: str | Path) -> list[Path]:
     if not (out / "bench.json").exists():
         return []
     unpack(out)
-    found, written = [f for p in PLACES for f in sorted((out / p).rglob("*.json*"))], []
+    found = [f for p in PLACES for f in sorted((out / p).rglob("*.json*"))]
+    written = []
     for name, kinds in ARCHIVES.items():
         chosen = [f for f in found if f.name in kinds and not f.parent.name.startswith(".")]
         if not chosen:
             continue
         with whole(out / name) as temporary, tarfile.open(temporary, "w:xz", format=tarfile.PAX_FORMAT) as tar:
             for file in chosen:
-                member, content = tarfile.TarInfo(str(file.relative_to(out))), file.read_bytes()
+                content = file.read_bytes()
+                member = tarfile.TarInfo(str(file.relative_to(out)))
                 member.size = len(content)
                 tar.addfile(member, io.BytesIO(content))
         written.append(out / name)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ringfence.bench.cells import Grid, make_grids, narrowed
 from ringfence.bench.suites import SUITES
-from ringfence.bench.table import rows
+from ringfence.bench.table import Row, rows
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.utils.files import whole
@@ -96,7 +96,8 @@ class Line:
 
 def lines(folders: Iterable[str | Path]) -> list[Line]:
     """The table from results folders; a task or method that they lack has no measured values."""
-    folders, found = [Path(f) for f in folders], {}
+    folders = [Path(f) for f in folders]
+    found: dict[tuple[str, str, str], list[Row]] = {}
     if not any((f / "bench.json").exists() for f in folders):
         names = " nor ".join(f"'{f}'" for f in folders)
         raise UserError(
@@ -105,7 +106,7 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
     for folder in folders:
         for r in rows(folder, may_be_empty=True) if (folder / "bench.json").exists() else ():
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
-    out = []
+    table = []
     for task, (_, values) in PRINTED.items():
         presets = ("split", *registry.get(task).presets, "default")  # of rows that may stand there
         for (method, (algorithm, endings)), printed in zip(OURS.items(), values):
@@ -113,14 +114,19 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             variant = next((v for v in wanted if (task, algorithm, v) in found), "")
             runs = found.get((task, algorithm, variant), [])
             ours = _summary(runs) if runs else None
-            out.append(Line(task, method, printed, ours, variant, len(runs)))
-    return out
+            table.append(Line(task, method, printed, ours, variant, len(runs)))
+    return table
 
 
-def _summary(runs: list[dict]) -> tuple[float, float | None, float, float | None]:
-    reward, cost = (np.array([r[k] for r in runs]) for k in ("return_norm", "cost_norm"))
-    spread = lambda x: float(x.std(ddof=1)) if len(x) > 1 else None  # noqa: E731
-    return float(reward.mean()), spread(reward), float(cost.mean()), spread(cost)
+def _summary(runs: list[Row]) -> tuple[float, float | None, float, float | None]:
+    reward = np.array([r["return_norm"] for r in runs])
+    cost = np.array([r["cost_norm"] for r in runs])
+    return float(reward.mean()), _deviation(reward), float(cost.mean()), _deviation(cost)
+
+
+def _deviation(x: np.ndarray) -> float | None:
+    """Between seeds; None of one."""
+    return float(x.std(ddof=1)) if len(x) > 1 else None
 
 
 def markdown(table: list[Line]) -> str:
@@ -130,8 +136,8 @@ def markdown(table: list[Line]) -> str:
     for task in PRINTED:
         cells = []
         for line in (x for x in table if x.task == task):
-            r, _, c, _ = line.printed
-            cells.append(f"*{r:.2f} / {c:.2f}*")
+            reward, _, cost, _ = line.printed
+            cells.append(f"*{reward:.2f} / {cost:.2f}*")
             cells.append(brief(line))
         out.append(f"| {task} | " + " | ".join(cells) + " |")
     return "\n".join(out)

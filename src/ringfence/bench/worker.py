@@ -12,17 +12,21 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-
-def encode(cell) -> dict:
-    return {**cell.__dict__}
-
-
-def decode(told: dict):
+if TYPE_CHECKING:  # a worker says that it is there before it imports JAX
     from ringfence.bench.cells import Cell
 
-    pairs = lambda x: tuple(tuple(p) for p in x)  # noqa: E731
-    return Cell(**{**told, "changes": pairs(told["changes"]), "evaluations": pairs(told["evaluations"])})
+
+def encode(cell: Cell) -> dict[str, Any]:
+    return dict(vars(cell))
+
+
+def decode(message: dict[str, Any]) -> Cell:
+    from ringfence.bench.cells import Cell
+
+    pairs = {name: tuple(tuple(pair) for pair in message[name]) for name in ("changes", "evaluations")}
+    return Cell(**{**message, **pairs})
 
 
 def leave_with(parent: int) -> None:
@@ -46,9 +50,10 @@ def forget() -> None:
 
 def main() -> None:
     leave_with(os.getppid())
-    wire, sys.stdout = sys.stdout, sys.stderr  # prints of libraries must not mix with the messages
+    wire = sys.stdout
+    sys.stdout = sys.stderr  # prints of libraries must not mix with the messages
 
-    def say(**message) -> None:
+    def say(**message: Any) -> None:
         print(json.dumps(message), file=wire, flush=True)
 
     from ringfence.bench import cells as grid

@@ -22,6 +22,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.logs.provenance import other_data
+from ringfence.report.pooling import Result
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
 from ringfence.training.runs import Run
 from ringfence.utils import schemas
@@ -66,7 +67,7 @@ class Entry:
     algorithm: str
     variant: str
     seed: int
-    summary: dict  # as evaluate.summarise makes it
+    summary: Result
     path: Path  # the run folder
     method: Method
     revision: int  # of the algorithm that trained it
@@ -94,7 +95,7 @@ class Board:
     tasks: list[str]
     seeds: tuple[int, ...]  # that any cell has
     entries: list[Entry]
-    references: dict[str, dict[str, dict]]  # task -> name -> summary
+    references: dict[str, dict[str, Result]]  # task -> name -> summary
     missing: list[Missing]
     unstarted: list[str]  # entries of the suite that no cell was begun of
     untouched: list[str]  # tasks of the suite without any cell or reference
@@ -114,75 +115,111 @@ def is_board(folder: Path) -> bool:
     return (Path(folder) / FILE).is_file()
 
 
+@dataclass(frozen=True)
+class Cell:
+    """A folder of the grid, with or without results."""
+
+    path: Path
+    task: str
+    job: str  # algorithm[-preset], the folder's name
+    seed: int
+
+    @property
+    def place(self) -> tuple[str, str, int]:
+        """What the cell is of; presets made for the task are no difference."""
+        return self.task, _job(self.task, self.job), self.seed
+
+
 def read(folder: str | Path) -> Board:
     """The results folder as rows. `UserError` names the files that disagree where numbers must not be mixed."""
     folder = Path(folder)
-    told = read_about(folder)
-    cells = [(path, *_place_of(path)) for path in sorted((folder / "cells").glob("*/*/*/")) if CELL.match(path.name)]
-    finished, missing, partial = [], [], []
-    for path, task, job, seed in cells:
-        run = Run(path)
-        state, reason = _status(path)
-        if not run.results or not (path / "config.json").exists():
-            missing.append(Missing(task, job, seed, f"{state}: {reason}" if reason else state))
-            continue
-        finished.append((run, task, job, seed))
-        if state == "failed":
-            partial.append(Missing(task, job, seed, f"not every evaluation is there, one failed: {reason}"))
-        elif lacking := _lacking(told["suite"], task, job, run):
-            partial.append(Missing(task, job, seed, f"not every evaluation is there: {', '.join(lacking)}"))
+    about = read_about(folder)
+    cells = _cells(folder)
+    finished = [(cell, run) for cell, run in ((cell, Run(cell.path)) for cell in cells) if _finished(run)]
     if not finished:
         raise UserError(
             f"'{folder}' holds no finished cell, so there is nothing to rank; run `ringfence bench` into it first."
         )
     references = _references(folder)
-    entries = _entries(finished, told["split"])
+    entries = _entries(finished, about["split"])
     if not entries:
         raise UserError(
             f"'{folder}' holds results on other resets or of earlier checkpoints alone, so there is nothing to rank; "
             "run `ringfence bench` into it again."
         )
-    _check(entries, references, told, folder)
-    names = {task for _, task, _, _ in cells} | {task for task, _ in references.values()}
+    _check(entries, references, about, folder)
+    named = {cell.task for cell in cells} | {task for task, _ in references.values()}
     known = list(registry.TASKS)
-    ordered = sorted(names, key=lambda t: (known.index(t) if t in known else len(known), t))
-    seeds = tuple(sorted({seed for *_, seed in cells}))
-    done = {(task, _job(task, job), seed) for _, task, job, seed in finished}
-    missing = partial + [m for m in missing if (m.task, _job(m.task, m.job), m.seed) not in done]
-    begun = {(task, _job(task, job), seed) for _, task, job, seed in cells}
-    jobs = sorted({job for _, job, _ in begun})
-    grid = [(t, j, s) for t in ordered for j in jobs for s in seeds if _planned(told["suite"], t, j)]
-    missing += [Missing(*place, "not started") for place in grid if place not in begun]
+    tasks = sorted(named, key=lambda t: (known.index(t) if t in known else len(known), t))
+    jobs = {job for _, job, _ in (cell.place for cell in cells)}
+    missing = _missing(about["suite"], cells, finished, tasks)
     return Board(
         path=folder,
-        suite=told["suite"],
-        protocol=told["protocol"],
-        split=told["split"],
-        episodes=told["episodes"],
-        tasks=ordered,
-        seeds=seeds,
+        suite=about["suite"],
+        protocol=about["protocol"],
+        split=about["split"],
+        episodes=about["episodes"],
+        tasks=tasks,
+        seeds=tuple(sorted({cell.seed for cell in cells})),
         entries=entries,
         references={task: rows for task, rows in references.values()},
-        missing=sorted(missing, key=lambda m: (ordered.index(m.task), m.job, m.seed)),
-        unstarted=[e.name for e in _suite(told["suite"]) if _entry_job(e) not in jobs],
-        untouched=[t for t in _suite_tasks(told["suite"]) if t not in names],
+        missing=sorted(missing, key=lambda m: (tasks.index(m.task), m.job, m.seed)),
+        unstarted=[e.name for e in _suite(about["suite"]) if _entry_job(e) not in jobs],
+        untouched=[t for t in _suite_tasks(about["suite"]) if t not in named],
         constants=_constants(entries, references),
-        runs=[run for run, *_ in finished],
+        runs=[run for _, run in finished],
     )
 
 
-def _place_of(path: Path) -> tuple[str, str, int]:
-    """(task, job, seed) from a cell's folder."""
-    return path.parent.parent.name, path.parent.name, int(CELL.match(path.name)[1])
+def _cells(folder: Path) -> list[Cell]:
+    found = []
+    for path in sorted((folder / "cells").glob("*/*/*/")):
+        if match := CELL.match(path.name):
+            found.append(Cell(path, path.parent.parent.name, path.parent.name, int(match[1])))
+    return found
+
+
+def _finished(run: Run) -> bool:
+    return bool(run.results) and (run.path / "config.json").exists()
+
+
+def _missing(suite: str, cells: list[Cell], finished: list[tuple[Cell, Run]], tasks: list[str]) -> list[Missing]:
+    """What the grid lacks: evaluations of finished cells, cells without any, and cells that were not begun."""
+    partial = [m for cell, run in finished if (m := _partial(suite, cell, run))]
+    done = {cell.place for cell, _ in finished}
+    unfinished = [_unfinished(cell) for cell in cells if cell.place not in done]
+    begun = {cell.place for cell in cells}
+    jobs = sorted({job for _, job, _ in begun})
+    seeds = sorted({cell.seed for cell in cells})
+    grid = [(task, job, seed) for task in tasks for job in jobs for seed in seeds if _planned(suite, task, job)]
+    return partial + unfinished + [Missing(*place, "not started") for place in grid if place not in begun]
+
+
+def _partial(suite: str, cell: Cell, run: Run) -> Missing | None:
+    """What a cell with results lacks, if anything."""
+    state, reason = _status(cell.path)
+    if state == "failed":
+        why = f"not every evaluation is there, one failed: {reason}"
+    elif lacking := _lacking(suite, cell, run):
+        why = f"not every evaluation is there: {', '.join(lacking)}"
+    else:
+        return None
+    return Missing(cell.task, cell.job, cell.seed, why)
+
+
+def _unfinished(cell: Cell) -> Missing:
+    state, reason = _status(cell.path)
+    return Missing(cell.task, cell.job, cell.seed, f"{state}: {reason}" if reason else state)
 
 
 def _status(path: Path) -> tuple[str, str]:
     """(state, reason in a line) of a cell; one that was begun and left nothing behind yet is under way."""
     file = path / "status.json"
-    damaged = "has a damaged status.json; delete that file"
-    told = schemas.read(file, schemas.Status, damaged) if file.exists() else {}
-    reason = str(told.get("error") or "").strip().splitlines()
-    return str(told.get("state") or "under way"), reason[-1] if reason else ""
+    if not file.exists():
+        return "under way", ""
+    status = schemas.read(file, schemas.Status, "has a damaged status.json; delete that file")
+    reason = str(status.get("error") or "").strip().splitlines()
+    return str(status.get("state") or "under way"), reason[-1] if reason else ""
 
 
 def _tier(task: str) -> str:
@@ -219,15 +256,16 @@ def _planned(suite: str, task: str, job: str) -> bool:
     return not entries or any(e.plays(_tier(task)) for e in entries)
 
 
-def _lacking(suite: str, task: str, job: str, run: Run) -> list[str]:
+def _lacking(suite: str, cell: Cell, run: Run) -> list[str]:
     """Evaluations of the suite that a run does not have."""
     preset = run.config["preset"]
     known = {v.removeprefix(preset).removeprefix("+") or "plain" for v in run.results if v.startswith(preset)}
-    entries = [e for e in _suite(suite) if _entry_job(e) == _job(task, job)]
-    return [v for e in entries for v in e.evaluations if e.plays(_tier(task)) and v not in known]
+    _, job, _ = cell.place
+    entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
+    return [name for e in entries for name in e.evaluations if name not in known]
 
 
-def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
+def _references(folder: Path) -> dict[Path, tuple[str, dict[str, Result]]]:
     """File -> (task, rows by name)."""
     inside = folder / "reference"
     files = [(f, f.parent.name) for f in sorted(inside.glob("*/reference.json"))]
@@ -235,52 +273,63 @@ def _references(folder: Path) -> dict[Path, tuple[str, dict[str, dict]]]:
     return {f: (task, reference.read(f)) for f, task in files}
 
 
-def _entries(finished: list[tuple[Run, str, str, int]], split: str) -> list[Entry]:
-    configs = {run.path: run.config for run, *_ in finished}
-    apart = _differing([(task, configs[run.path]) for run, task, *_ in finished])  # by (algorithm, preset)
+def _entries(finished: list[tuple[Cell, Run]], split: str) -> list[Entry]:
+    configs = {run.path: run.config for _, run in finished}
+    apart = _differing([(cell.task, configs[run.path]) for cell, run in finished])  # by (algorithm, preset)
     entries: dict[tuple, Entry] = {}
-    data: dict[str, tuple[dict, Path]] = {}
-    for run, task, _, seed in finished:
-        told = configs[run.path]
-        for name, here in (("task", task), ("seed", seed)):
-            if told.get(name) != here:
-                raise UserError(
-                    f"'{run.path / 'config.json'}' names {name} {told.get(name)}, its folder {here}; a cell was moved: "
-                    "put it back or delete it."
-                )
-        card = told.get("data") or {}
-        first, path = data.setdefault(task, (card, run.path))
-        if unlike := other_data(card, first):
-            name, here, there = unlike[0]
-            raise UserError(
-                f"'{run.path}' was trained on other data (its {name} is {here}) than '{path}' ({there}); "
-                "keep one results folder for each data set."
-            )
-        algorithm, preset = told["algorithm"], _preset(task, told)
-        fields, config = apart.get((algorithm, preset), []), config_of(told)
-        words = "[" + ", ".join(f"{k}={config.get(k)}" for k in fields) + "]" if fields else ""
+    cards: dict[str, tuple[dict, Path]] = {}  # by task: what the first run says of its data
+    for cell, run in finished:
+        config = configs[run.path]
+        _check_place(run, config, cell)
+        card = config.get("data") or {}
+        _check_data(run, card, *cards.setdefault(cell.task, (card, run.path)))
+        algorithm = config["algorithm"]
+        preset = _preset(cell.task, config)
+        settings = config_of(config)
+        fields = apart.get((algorithm, preset), [])
+        words = "[" + ", ".join(f"{k}={settings.get(k)}" for k in fields) + "]" if fields else ""
         for variant, summary in run.results.items():
-            if ("@" in variant and summary.get("split") != split) or not of_last_step(summary, config):
+            if ("@" in variant and summary.get("split") != split) or not of_last_step(summary, settings):
                 continue  # settings were chosen there, or training went on; no table is made of it
             shown = variant
-            if told["preset"] != preset:
-                shown = re.sub(rf"^{re.escape(told['preset'])}\b", preset, variant)
+            if config["preset"] != preset:
+                shown = re.sub(rf"^{re.escape(config['preset'])}\b", preset, variant)
             method = Method(algorithm, preset, shown, words)
-            entry = Entry(task, algorithm, variant, seed, summary, run.path, method, told.get("revision", 1))
-            other = entries.setdefault((task, method, seed), entry)
+            revision = config.get("revision", 1)
+            entry = Entry(cell.task, algorithm, variant, cell.seed, summary, run.path, method, revision)
+            other = entries.setdefault((cell.task, method, cell.seed), entry)
             if other is not entry:
                 raise UserError(
-                    f"'{other.path}' and '{run.path}' are the same cell (same config, same seed {seed}); delete one."
+                    f"'{other.path}' and '{run.path}' are the same cell (same config, same seed {cell.seed}); "
+                    "delete one."
                 )
     return list(entries.values())
+
+
+def _check_place(run: Run, config: dict, cell: Cell) -> None:
+    for name, here in (("task", cell.task), ("seed", cell.seed)):
+        if config.get(name) != here:
+            raise UserError(
+                f"'{run.path / 'config.json'}' names {name} {config.get(name)}, its folder {here}; a cell was moved: "
+                "put it back or delete it."
+            )
+
+
+def _check_data(run: Run, card: dict, first: dict, path: Path) -> None:
+    if unlike := other_data(card, first):
+        name, here, there = unlike[0]
+        raise UserError(
+            f"'{run.path}' was trained on other data (its {name} is {here}) than '{path}' ({there}); "
+            "keep one results folder for each data set."
+        )
 
 
 def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[str]]:
     """Config fields that tell rows of the same algorithm and preset apart: those that differ within some task.
     A setting that is one thing on one task and another on the next is no reason for two rows."""
     groups: dict[tuple, list[dict]] = {}
-    for task, told in configs:
-        groups.setdefault((told["algorithm"], _preset(task, told), task), []).append(config_of(told))
+    for task, config in configs:
+        groups.setdefault((config["algorithm"], _preset(task, config), task), []).append(config_of(config))
     found: dict[tuple[str, str], list[str]] = {}
     for (algorithm, preset, _), several in groups.items():
         names = found.setdefault((algorithm, preset), [])
@@ -288,57 +337,60 @@ def _differing(configs: list[tuple[str, dict]]) -> dict[tuple[str, str], list[st
     return found
 
 
-def _preset(task: str, told: dict) -> str:
+def _preset(task: str, config: dict) -> str:
     """A run's preset, where one made for the task counts as the default."""
-    return "default" if told["preset"] in _presets(task) else told["preset"]
+    return "default" if config["preset"] in _presets(task) else config["preset"]
 
 
-def _check(entries: list[Entry], references: dict[Path, tuple[str, dict[str, dict]]], told: dict, folder: Path) -> None:
+def _check(
+    entries: list[Entry], references: dict[Path, tuple[str, dict[str, Result]]], about: dict, folder: Path
+) -> None:
     """Every summary must be of the protocol, split, length and normalisation that the folder declares."""
-    leaders: dict[str, tuple[Path, dict]] = {}
+    leaders: dict[str, tuple[Path, Result]] = {}  # by task: the first file, and its summary
     for e in entries:
         file = e.path / "results.json"
-        who = f"'{file}' variant '{e.variant}'"
-        _complete(who, e.summary, e.task, (*NEEDED, "per_episode", "split"))
+        name = f"'{file}' variant '{e.variant}'"
+        _complete(name, e.summary, e.task, (*NEEDED, "per_episode", "split"))
         for key in ("protocol", "split", "episodes"):
-            _same(who, key, e.summary[key], told[key], folder)
-        _normalised(who, e.summary, leaders.setdefault(e.task, (file, e.summary)))
+            _same(name, key, e.summary[key], about[key], folder)
+        _normalised(name, e.summary, *leaders.setdefault(e.task, (file, e.summary)))
     for file, (task, rows) in references.items():
-        for name, summary in rows.items():
-            who = f"'{file}' row '{name}'"
-            _complete(who, summary, task, (*NEEDED, "split"))
-            _same(who, "protocol", summary["protocol"], told["protocol"], folder)
+        for row, summary in rows.items():
+            name = f"'{file}' row '{row}'"
+            _complete(name, summary, task, (*NEEDED, "split"))
+            _same(name, "protocol", summary["protocol"], about["protocol"], folder)
             if summary["split"] != "data":  # logged episodes have resets of their own and any number of them
                 for key in ("split", "episodes"):
-                    _same(who, key, summary[key], told[key], folder)
-            _normalised(who, summary, leaders.setdefault(task, (file, summary)))
+                    _same(name, key, summary[key], about[key], folder)
+            _normalised(name, summary, *leaders.setdefault(task, (file, summary)))
 
 
-def _complete(who: str, summary: dict, task: str, needed: tuple[str, ...]) -> None:
+def _complete(name: str, summary: Result, task: str, needed: tuple[str, ...]) -> None:
     lacking = [k for k in needed if k not in summary]
     if lacking:
-        raise UserError(f"{who} lacks '{lacking[0]}', so it was made by another version; evaluate it again.")
+        raise UserError(f"{name} lacks '{lacking[0]}', so it was made by another version; evaluate it again.")
     if summary["task"] != task:
-        raise UserError(f"{who} holds a result of task '{summary['task']}', not of '{task}'; evaluate it again.")
+        raise UserError(f"{name} holds a result of task '{summary['task']}', not of '{task}'; evaluate it again.")
 
 
-def _same(who: str, key: str, here, declared, folder: Path) -> None:
+def _same(name: str, key: str, here: object, declared: object, folder: Path) -> None:
     if here != declared:
         raise UserError(
-            f"{who} has {key} {here}, '{folder / FILE}' declares {declared}; such numbers cannot stand in one table: "
+            f"{name} has {key} {here}, '{folder / FILE}' declares {declared}; such numbers cannot stand in one table: "
             "evaluate the cell again or keep it in a results folder of its own."
         )
 
 
-def _normalised(who: str, summary: dict, leader: tuple[Path, dict]) -> None:
-    first, of = leader
-    if summary["constants"] != of["constants"]:
+def _normalised(name: str, summary: Result, first: Path, leader: Result) -> None:
+    if summary["constants"] != leader["constants"]:
         raise UserError(
-            f"{who} was normalised with {summary['constants']}, '{first}' with {of['constants']}; "
+            f"{name} was normalised with {summary['constants']}, '{first}' with {leader['constants']}; "
             "evaluate both with one version."
         )
 
 
-def _constants(entries: list[Entry], references: dict[Path, tuple[str, dict]]) -> dict[str, dict[str, float]]:
+def _constants(
+    entries: list[Entry], references: dict[Path, tuple[str, dict[str, Result]]]
+) -> dict[str, dict[str, float]]:
     found = {task: row["constants"] for task, rows in references.values() for row in rows.values()}
     return found | {e.task: e.summary["constants"] for e in entries}

@@ -5,38 +5,42 @@ Every method has a name or a marker and a line style beside its colour, so that 
 
 from __future__ import annotations
 
-import matplotlib
+from collections.abc import Sequence
+
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
+from ringfence.evaluation.statistics import Interval
 from ringfence.report.board import Method
-from ringfence.report.figures import FAR, INK, MARKERS, STYLE, Ticks, figure, to_svg
+from ringfence.report.figures import FAR, INK, MARKERS, Ticks, figure, style, to_svg
 from ringfence.report.standings import Aggregate, Standing
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
 WIDTH = 9.2  # inches of a wide figure
+LIMIT = (0, (3, 3))  # line style
 LABEL = 0.075  # inches that a letter of a method's name takes
 
 Style = tuple[int, int]
 
 
-def _ink(style: Style) -> str:
-    return f"#0102{16 + style[0]:02x}"
+def _ink(of: Style) -> str:
+    return f"#0102{16 + of[0]:02x}"
 
 
-def _marker(style: Style) -> str:
-    return MARKERS[style[1] % len(MARKERS)]
+def _marker(of: Style) -> str:
+    return MARKERS[of[1] % len(MARKERS)]
 
 
-def _whiskers(ax, rows: list[tuple[float, tuple[float, float] | None]], styles: list[Style], digits: int) -> None:
+def _whiskers(ax: Axes, rows: list[tuple[float, Interval | None]], styles: list[Style], digits: int) -> None:
     """A point with its interval, if it has one, per row, the first on top, and the number at the right edge, clear of
     the points."""
-    for y, ((value, interval), style) in enumerate(zip(rows, styles)):
+    where = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
+    for y, ((value, interval), of) in enumerate(zip(rows, styles)):
         if interval:
-            ax.plot(interval, (y, y), color=_ink(style), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
-        ax.plot(value, y, _marker(style), color=_ink(style), markersize=7)
-        where = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
+            ax.plot(interval, (y, y), color=_ink(of), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
+        ax.plot(value, y, _marker(of), color=_ink(of), markersize=7)
         ax.annotate(f"{value:.{digits}f}", (0.99, y), **where, fontsize=8.5, color=INK)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.grid(axis="y", visible=False)
@@ -45,55 +49,56 @@ def _whiskers(ax, rows: list[tuple[float, tuple[float, float] | None]], styles: 
     ax.set_xlim(left, right + 0.16 * (right - left))
 
 
-def overall(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
+def overall(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> str:
     """IQM of normalised return and of normalised cost over all tasks, the best return on top."""
-    methods = sorted(told.methods, key=lambda m: -told.iqm_returns[m][0])
-    with matplotlib.rc_context(STYLE):
+    methods = sorted(aggregate.methods, key=lambda m: -aggregate.iqm_returns[m][0])
+    with style():
         made = figure(WIDTH, 1.2 + 0.32 * len(methods))
-        axes = made.subplots(1, 2, sharey=True)
+        left, right = made.subplots(1, 2, sharey=True)
         inks = [styles[m] for m in methods]
-        axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))  # first, so that it is in view
-        _whiskers(axes[0], [told.iqm_returns[m] for m in methods], inks, 2)
-        _whiskers(axes[1], [told.iqm_costs[m] for m in methods], inks, 2)
-        axes[0].set_yticks(range(len(methods)), [m.label for m in methods])
-        axes[0].set_xlabel("normalised return, IQM (more is better)")
-        axes[1].set_xlabel("normalised cost, IQM (less is better)")
-        axes[1].annotate(
-            "limit", (1.0, 1.0), (3, 2), xycoords=("data", "axes fraction"), textcoords="offset points", fontsize=8.5
-        )
-        said = "; ".join(
-            f"{m.label}: return {told.iqm_returns[m][0]:.2f}, cost {told.iqm_costs[m][0]:.2f}" for m in methods
-        )
-        return to_svg(made, f"Interquartile means over all tasks. {said}", name)
+        right.axvline(1.0, color=INK, linewidth=1.0, linestyle=LIMIT)  # first, so that it is in view
+        _whiskers(left, [aggregate.iqm_returns[m] for m in methods], inks, 2)
+        _whiskers(right, [aggregate.iqm_costs[m] for m in methods], inks, 2)
+        left.set_yticks(range(len(methods)), [m.label for m in methods])
+        left.set_xlabel("normalised return, IQM (more is better)")
+        right.set_xlabel("normalised cost, IQM (less is better)")
+        place = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points"}
+        right.annotate("limit", (1.0, 1.0), (3, 2), **place, fontsize=8.5)
+        each = [
+            f"{m.label}: return {aggregate.iqm_returns[m][0]:.2f}, cost {aggregate.iqm_costs[m][0]:.2f}"
+            for m in methods
+        ]
+        return to_svg(made, f"Interquartile means over all tasks. {'; '.join(each)}", name)
 
 
 def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> str:
     """Heat map of the probability that the row beats the column, with every probability printed."""
     n = len(methods)
     longest = max(len(m.label) for m in methods)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+    numbered = [(k + 1, m.label) for k, m in enumerate(methods)]
+    with style(axes_grid=False):
         made = figure(1.4 + LABEL * longest + 0.5 * n, 1.2 + 0.36 * n)
         ax = made.add_subplot()
-        for i in range(n):
-            for j in range(n):
-                if i == j:
-                    continue
-                p = float(matrix[i, j])
-                fill, ink = _shade(p)
-                ax.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, facecolor=fill, edgecolor="none"))
-                ax.text(j, i, f"{p:.2f}", ha="center", va="center", color=ink, fontsize=9)
+        for row in range(n):
+            for column in range(n):
+                if row != column:
+                    _duel(ax, row, column, float(matrix[row, column]))
         ax.set(xlim=(-0.5, n - 0.5), ylim=(n - 0.5, -0.5))
-        ax.set_yticks(range(n), [f"{k + 1}. {m.label}" for k, m in enumerate(methods)])
-        ax.set_xticks(range(n), [str(k + 1) for k in range(n)])
+        ax.set_yticks(range(n), [f"{k}. {label}" for k, label in numbered])
+        ax.set_xticks(range(n), [str(k) for k, _ in numbered])
         ax.xaxis.tick_top()
         ax.tick_params(length=0)
         for side in ax.spines.values():
             side.set_visible(False)
         ax.set_xlabel("compared with the method of this number")
-        label = f"Probability that the row's method {what} than the column's; rows are " + ", ".join(
-            f"{k + 1} {m.label}" for k, m in enumerate(methods)
-        )
-        return to_svg(made, label, name)
+        rows = ", ".join(f"{k} {label}" for k, label in numbered)
+        return to_svg(made, f"Probability that the row's method {what} than the column's; rows are {rows}", name)
+
+
+def _duel(ax: Axes, row: int, column: int, p: float) -> None:
+    fill, ink = _shade(p)
+    ax.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=fill, edgecolor="none"))
+    ax.text(column, row, f"{p:.2f}", ha="center", va="center", color=ink, fontsize=9)
 
 
 def _shade(p: float) -> tuple[str, str]:
@@ -105,59 +110,62 @@ def _shade(p: float) -> tuple[str, str]:
     return "#{:02x}{:02x}{:02x}".format(*rgb), "#101010" if light else "#fafafa"
 
 
-def profiles(told: Aggregate, styles: dict[Method, Style], name: str) -> str:
+def profiles(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> str:
     """Share of runs above a return and share of episodes within a cost, against the threshold."""
-    methods = told.methods
+    methods = aggregate.methods
     columns = 2 if max(len(m.label) for m in methods) > 24 else 3
     rows = -(-len(methods) // columns)
-    with matplotlib.rc_context(STYLE):
+    with style():
         made = figure(WIDTH, 4.2 + 0.24 * rows)
-        axes = made.subplots(1, 2)
-        panels = (
-            (
-                told.return_thresholds,
-                told.return_profiles,
-                told.return_bands,
-                "normalised return τ",
-                "share of runs with return > τ",
-            ),
-            (
-                told.cost_thresholds,
-                told.cost_profiles,
-                told.cost_bands,
-                "normalised cost τ (1: the limit)",
-                "episodes with cost ≤ τ",
-            ),
-        )
-        for ax, (thresholds, shares, bands, x, y) in zip(axes, panels):
-            for k, (m, share, band) in enumerate(zip(methods, shares, bands)):
-                style = styles[m]
-                if band is not None:
-                    ax.fill_between(thresholds, *band, color=_ink(style), alpha=0.12, linewidth=0, step="post")
-                ax.plot(
-                    thresholds,
-                    share,
-                    color=_ink(style),
-                    linestyle=DASHES[k % len(DASHES)],
-                    linewidth=1.6,
-                    marker=_marker(style),
-                    markersize=5,
-                    markevery=(0.02 * (k % 8), 0.16),  # apart, so that markers of lines that coincide can be seen
-                    drawstyle="steps-post",
-                    label=m.label,
-                )
-            ax.set(xlabel=x, ylabel=y, ylim=(-0.03, 1.03))
-        axes[1].axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
-        if told.cost_thresholds[-1] > FAR:
-            axes[1].set_xscale("symlog", linthresh=1.0)
-            axes[1].xaxis.set_major_formatter(Ticks())
-            axes[1].set_xlim(-0.05, told.cost_thresholds[-1])
-        handles, labels = axes[0].get_legend_handles_labels()
-        made.legend(
-            handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9, handlelength=3.2
-        )
+        left, right = made.subplots(1, 2)
+        for k, method in enumerate(methods):
+            _profile(
+                left, aggregate.return_thresholds, aggregate.return_profiles[k], aggregate.return_bands[k], method, k,
+                styles[method],
+            )  # fmt: skip
+            _profile(
+                right, aggregate.cost_thresholds, aggregate.cost_profiles[k], aggregate.cost_bands[k], method, k,
+                styles[method],
+            )  # fmt: skip
+        left.set(xlabel="normalised return τ", ylabel="share of runs with return > τ", ylim=(-0.03, 1.03))
+        right.set(xlabel="normalised cost τ (1: the limit)", ylabel="episodes with cost ≤ τ", ylim=(-0.03, 1.03))
+        right.axvline(1.0, color=INK, linewidth=1.0, linestyle=LIMIT)
+        if aggregate.cost_thresholds[-1] > FAR:
+            right.set_xscale("symlog", linthresh=1.0)
+            right.xaxis.set_major_formatter(Ticks())
+            right.set_xlim(-0.05, aggregate.cost_thresholds[-1])
+        handles, labels = left.get_legend_handles_labels()
+        where = {"loc": "outside lower center", "ncols": columns, "frameon": False}
+        made.legend(handles, labels, **where, fontsize=9, handlelength=3.2)
         label = "Profiles. Left: share of runs above a normalised return. Right: share of episodes within a cost."
         return to_svg(made, label, name)
+
+
+def _profile(
+    ax: Axes,
+    thresholds: np.ndarray,
+    shares: np.ndarray,
+    band: np.ndarray | None,
+    method: Method,
+    k: int,
+    of: Style,
+) -> None:
+    """The line of the k-th method with its band, if it has one."""
+    if band is not None:
+        low, high = band
+        ax.fill_between(thresholds, low, high, color=_ink(of), alpha=0.12, linewidth=0, step="post")
+    ax.plot(
+        thresholds,
+        shares,
+        color=_ink(of),
+        linestyle=DASHES[k % len(DASHES)],
+        linewidth=1.6,
+        marker=_marker(of),
+        markersize=5,
+        markevery=(0.02 * (k % 8), 0.16),  # apart, so that markers of lines that coincide can be seen
+        drawstyle="steps-post",
+        label=method.label,
+    )
 
 
 def _brief(x: float) -> str:
@@ -175,32 +183,33 @@ def expenses(rows: list[Standing], name: str) -> str:
         ("parameters", [r.parameters for r in rows], "{:,.0f}"),
         ("one joint action, ms", [r.plan_ms for r in rows], "{:.2g}"),
     )
-    with matplotlib.rc_context(STYLE):
+    with style():
         made = figure(WIDTH, 1.2 + 0.32 * len(rows))
         axes = made.subplots(1, len(panels), sharey=True)
         for ax, (title, values, form) in zip(axes, panels):
-            there = [v for v in values if v]
-            low, high = (min(there), max(there)) if there else (1.0, 10.0)
-            ax.set_xscale("log")
-            ax.set_xlim(low / 1.6, high * max(4.0, (high / low) ** 0.55))
-            for y, (row, value) in enumerate(zip(rows, values)):
-                if value:
-                    ax.plot((low / 1.6, value), (y, y), color=_ink(row.style), linewidth=1.2, alpha=0.5)
-                    ax.plot(value, y, _marker(row.style), color=_ink(row.style), markersize=6)
-                ax.annotate(
-                    form.format(value) if value else "not measured",
-                    (value or low / 1.6, y),
-                    (7, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=8.5,
-                    color=INK,
-                )
-            ax.set_ylim(len(rows) - 0.5, -0.5)
-            ax.grid(axis="y", visible=False)
-            ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 3.0)))
-            ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _brief(x)))
-            ax.minorticks_off()
+            _expense(ax, rows, values, form)
             ax.set_xlabel(title)
         axes[0].set_yticks(range(len(rows)), [r.label for r in rows])
         return to_svg(made, "Training time, parameters and time to act of each method", name)
+
+
+def _expense(ax: Axes, rows: list[Standing], values: Sequence[float | None], form: str) -> None:
+    """A bar and a number per row, the first on top."""
+    measured = [v for v in values if v] or [1.0, 10.0]
+    low = min(measured)
+    high = max(measured)
+    left = low / 1.6
+    ax.set_xscale("log")
+    ax.set_xlim(left, high * max(4.0, (high / low) ** 0.55))
+    for y, (row, value) in enumerate(zip(rows, values)):
+        if value:
+            ax.plot((left, value), (y, y), color=_ink(row.style), linewidth=1.2, alpha=0.5)
+            ax.plot(value, y, _marker(row.style), color=_ink(row.style), markersize=6)
+        text = form.format(value) if value else "not measured"
+        where = (value or left, y)
+        ax.annotate(text, where, (7, 0), textcoords="offset points", va="center", fontsize=8.5, color=INK)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
+    ax.grid(axis="y", visible=False)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0,) if high > 100 * low else (1.0, 3.0)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: _brief(x)))
+    ax.minorticks_off()

@@ -5,14 +5,15 @@ from __future__ import annotations
 import csv
 import io
 from pathlib import Path
+from typing import Any
 
 from ringfence.errors import plain, unknown
+from ringfence.report import html
 from ringfence.report.board import Board, Method, read
 from ringfence.report.board_page import rankings, short
-from ringfence.report.page import share
+from ringfence.report.html import share
 from ringfence.report.standings import Standing, references, standings
 from ringfence.utils.escape import latex, markdown, spreadsheet
-from ringfence.utils.files import whole
 
 # CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
 COLUMNS = (
@@ -27,15 +28,13 @@ def export_board(folder: str | Path, form: str, out: str | Path) -> Path:
     """Write the leaderboard of a results folder to the file `out`; `form` is a name in FORMS."""
     if form not in FORMS:
         raise unknown("format", form, FORMS)
-    text, out = FORMS[form](read(folder)), Path(out)
-    with whole(out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return out
+    return html.write(Path(out), FORMS[form](read(folder)))
 
 
 def _rows(board: Board) -> dict[str, list[Standing | Method]]:
     """By task: standings by rank, then the methods that were not measured on it, then the references."""
-    tables, rows_to_beat = standings(board), references(board)
+    tables = standings(board)
+    rows_to_beat = references(board)
     absent = {t: [m for m in board.methods if not board.of(t, m)] for t in board.tasks}
     return {t: [*tables[t], *absent[t], *rows_to_beat[t]] for t in board.tasks}
 
@@ -46,25 +45,26 @@ def _rows(board: Board) -> dict[str, list[Standing | Method]]:
 def board_csv(board: Board) -> str:
     """One line per task and method, references included; full precision to six digits."""
     file = io.StringIO()
-    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-    writer.writeheader()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(COLUMNS)
     for task, rows in _rows(board).items():
-        for r in rows:
-            known = {"suite": board.suite, "task": task} | (_absent(r) if isinstance(r, Method) else _numbers(r))
-            writer.writerow({k: spreadsheet(_plain(v)) for k, v in known.items()})
+        for row in rows:
+            values = {"suite": board.suite, "task": task}
+            values |= _absent(row) if isinstance(row, Method) else _numbers(row)
+            writer.writerow([spreadsheet(_plain(values.get(column, ""))) for column in COLUMNS])
     return file.getvalue()
 
 
-def _absent(m: Method) -> dict:
+def _absent(m: Method) -> dict[str, Any]:
     return {"algorithm": m.algorithm, "preset": m.preset, "variant": m.variant, "method": m.label, "seeds": 0}
 
 
-def _numbers(r: Standing) -> dict:
-    who = {"method": r.label, "variant": "reference"}
+def _numbers(r: Standing) -> dict[str, Any]:
+    method: dict[str, Any] = {"method": r.label, "variant": "reference"}
     if r.method:
-        who = {"algorithm": r.method.algorithm, "preset": r.method.preset, "variant": r.method.variant}
-        who |= {"method": r.label, "rank": r.rank, "best": int(r.best), "seeds": len(r.seeds)}
-    return who | {
+        method = {"algorithm": r.method.algorithm, "preset": r.method.preset, "variant": r.method.variant}
+        method |= {"method": r.label, "rank": r.rank, "best": int(r.best), "seeds": len(r.seeds)}
+    return method | {
         "within_limit": int(r.safe),
         "return_mean": r.returns,
         "return_sd": r.returns_sd,
@@ -90,7 +90,7 @@ def _numbers(r: Standing) -> dict:
     }
 
 
-def _plain(value):
+def _plain(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
 
 
@@ -134,7 +134,8 @@ def _latex(r: Standing | Method) -> str:
     cells = [returns, norm, cost, f"{r.cost_safe_start:.3f}"]
     cells += [rf"{100 * r.violation_rate:.1f}\;({100 * r.violation_upper:.1f})"]
     if r.best:
-        name, cells = rf"\textbf{{{name}}}", [rf"\mathbf{{{c}}}" for c in cells]
+        name = rf"\textbf{{{name}}}"
+        cells = [rf"\mathbf{{{c}}}" for c in cells]
     return " & ".join([name, *(f"${c}$" for c in cells), str(len(r.seeds)) if r.method else "--"]) + r" \\"
 
 
@@ -164,7 +165,8 @@ def board_markdown(board: Board) -> str:
 
 def board_markdown_short(board: Board) -> str:
     """One table per protocol, methods by tasks: normalised return and avoidable cost, by mean rank."""
-    tables, rows_to_beat = standings(board), references(board)
+    tables = standings(board)
+    rows_to_beat = references(board)
     blocks = []
     for ranking in rankings(board, tables):
         head = ["norm. return (avoidable cost)", *(short(t, board.suite) for t in ranking.tasks), "mean rank"]
@@ -174,9 +176,9 @@ def board_markdown_short(board: Board) -> str:
             cells = [next((r for r in rows_to_beat[t] if r.name == name), None) for t in ranking.tasks]
             rows.append([name, *(_brief(r, 0) for r in cells), "–"])
         for row in ranking.rows:
-            mean = "–" if row["mean"] is None else f"{row['mean']:.2f}"
-            cells = (_brief(r, len(board.seeds)) for r in row["cells"])
-            rows.append([f"{row['name']} {row['variant']}".strip(), *cells, mean])
+            mean = "–" if row.mean is None else f"{row.mean:.2f}"
+            cells = (_brief(cell, len(board.seeds)) for cell in row.cells)
+            rows.append([row.method.label, *cells, mean])
         blocks.append(_table(head, rows))
     return "\n\n".join([*blocks, _legend(board)]) + "\n"
 
@@ -184,7 +186,8 @@ def board_markdown_short(board: Board) -> str:
 def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
     if isinstance(r, Method):
         return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *["–"] * (3 + ends)]
-    returns, norm = _pm(r.returns, r.returns_sd, 1, "±"), _pm(r.returns_norm, r.returns_norm_sd, 3, "±")
+    returns = _pm(r.returns, r.returns_sd, 1, "±")
+    norm = _pm(r.returns_norm, r.returns_norm_sd, 3, "±")
     several = f"{len(r.seeds)}" if len(r.seeds) == len(board.seeds) else f"{len(r.seeds)} of {len(board.seeds)}"
     return [
         r.label,

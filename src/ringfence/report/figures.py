@@ -5,17 +5,27 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogFormatter, MaxNLocator
+from matplotlib.transforms import Bbox
 
 from ringfence.errors import UserError
-from ringfence.report.table import Row, Section
+from ringfence.report.pooling import Line
+from ringfence.report.table import LineT, Row, Section
 from ringfence.training.runs import Run
 
 COLOURS = 10  # series colours in style.css
@@ -90,12 +100,39 @@ PANELS = (
 )
 
 
-def colour(row: Row) -> str:
+@dataclass(frozen=True)
+class Panel:
+    """A small figure with a title."""
+
+    title: str
+    svg: Markup
+
+
+@dataclass(frozen=True)
+class BarrierField:
+    """A picture of a barrier around an agent, and what is said of it."""
+
+    svg: Markup
+    about: str  # what it shows of the other agent, in words
+    others: int  # further agents
+    radius: float  # of contact
+
+
+def colour(row: Line) -> str:
     return f"#0102{16 + row.style[0] % COLOURS:02x}"
 
 
-def marker(row: Row) -> str:
+def marker(row: Line) -> str:
     return MARKERS[row.style[1] % len(MARKERS)]
+
+
+@contextmanager
+def style(**changes: Any) -> Iterator[None]:
+    """Figures of this package's look inside; `changes` have _ for the dots of matplotlib's names."""
+    more = {name.replace("_", "."): value for name, value in changes.items()}
+    parameters: Any = STYLE | more  # matplotlib names its keys by a type of its own
+    with matplotlib.rc_context(parameters):
+        yield
 
 
 def figure(width: float, height: float) -> Figure:
@@ -129,154 +166,291 @@ def _escape(text: str) -> str:
     return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
 
 
-def scatter(section: Section, rows: list[Row], x_label: str, name: str) -> str:
-    """Return against avoidable cost with 95 % intervals, every point labelled in place."""
-    with matplotlib.rc_context(STYLE):
+def scatter(section: Section[LineT], rows: Sequence[LineT], x_label: str, name: str) -> str:
+    """Return against the cost of safe starts with 95 % intervals, every point labelled in place."""
+    points = [*rows, *section.references]
+    with style():
         made = figure(8.2, 4.8)
         ax = made.add_subplot()
-        points = [*rows, *section.references]
         for row in points:
-            ink = INK if row.reference else colour(row)
-            x, y = row.cost_safe_start, row.returns
-            ax.plot(row.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
-            ax.plot((x, x), row.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
-            face = "none" if row.reference else ink
-            ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
+            _point(ax, row)
         ax.margins(0.08, 0.1)
-        low, high = ax.get_xlim()
-        limit = section.constants["cost_limit"] if section.constants else 0.0
-        if limit > 0:  # beside the points, where it is in view
-            ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
-        if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
-            root = lambda x: np.sign(x) * np.sqrt(np.abs(x))  # noqa: E731
-            ax.set_xscale("function", functions=(root, lambda y: np.sign(y) * y**2))
-            ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
-            ax.set_xlim(-0.002 * high, 1.1 * high)
-        else:
-            ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
+        _cost_axis(ax, section.constants["cost_limit"] if section.constants else 0.0)
         ax.set_xlabel(f"avoidable {x_label}")
         ax.set_ylabel("return per episode")
         made.canvas.draw()
         _label(ax, points)
-        said = "; ".join(f"{r.label}: return {r.returns:.1f}, avoidable cost {r.cost_safe_start:.3f}" for r in points)
-        return to_svg(made, f"Return against avoidable cost on {section.task}. {said}", name)
+        each = [f"{r.label}: return {r.returns:.1f}, avoidable cost {r.cost_safe_start:.3f}" for r in points]
+        return to_svg(made, f"Return against avoidable cost on {section.task}. {'; '.join(each)}", name)
 
 
-def _label(ax, points: list[Row]) -> None:
+def _point(ax: Axes, row: Line) -> None:
+    ink = INK if row.reference else colour(row)
+    x = row.cost_safe_start
+    y = row.returns
+    ax.plot(row.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
+    ax.plot((x, x), row.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
+    face = "none" if row.reference else ink
+    ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
+
+
+def _cost_axis(ax: Axes, limit: float) -> None:
+    """The limit as a line, and costs by their square roots where they reach far beyond it."""
+    low, high = ax.get_xlim()
+    if limit > 0:  # beside the points, where it is in view
+        ax.axvline(limit, color=INK, linewidth=1.0, linestyle=(0, (3, 3)), zorder=1)
+    if limit > 0 and high > FAR * limit:  # or all that keeps the limit would lie at the edge
+        ax.set_xscale("function", functions=(_root, _square))
+        ax.set_xticks([limit * k for k in (0, 1, 4, 10, 20, 40, 100) if limit * k < high])
+        ax.set_xlim(-0.002 * high, 1.1 * high)
+    else:
+        ax.set_xlim(min(low, -0.02 * high), high + 0.05 * (high - low))
+
+
+def _root(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * np.sqrt(np.abs(x))
+
+
+def _square(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * x**2
+
+
+# --- names beside points ---
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a name may stand beside its point, and how much it would hide there."""
+
+    penalty: float
+    dx: float
+    dy: float
+    side: str
+    box: Bbox
+    lead: np.ndarray  # (20, 2) points of the line that leads from the point to the name
+
+    @property
+    def far(self) -> bool:
+        """Whether a line has to lead there."""
+        return abs(self.dx) + abs(self.dy) > 30
+
+
+def _label(ax: Axes, points: Sequence[Line]) -> None:
     """Put every name beside its point where it hides nothing, else where it hides least."""
-    renderer = ax.figure.canvas.get_renderer()
     dots = [ax.transData.transform((r.cost_safe_start, r.returns)) for r in points]
-    bars = [
-        (ax.transData.transform(a), ax.transData.transform(b))
-        for r in points
-        for a, b in (
-            ((r.cost_safe_start_interval[0], r.returns), (r.cost_safe_start_interval[1], r.returns)),
-            ((r.cost_safe_start, r.returns_interval[0]), (r.cost_safe_start, r.returns_interval[1])),
-        )
-    ]
-    frame, taken = ax.get_window_extent(), []
-    around = [
-        (sign_x * x, sign_y * y, {1: "left", -1: "right", 0: "center"}[sign_x])
-        for far in (0, 1, 2, 3, 4, 5)
+    bars = [(ax.transData.transform(a), ax.transData.transform(b)) for r in points for a, b in _bars(r)]
+    taken: list[Bbox] = []
+    leaders: list[np.ndarray] = []
+    for row, dot in zip(points, dots):
+        places = [_place(ax, row, dot, at, dots, bars, taken, leaders) for at in _around()]
+        best = min(places, key=lambda place: place.penalty)
+        leader = {"arrowstyle": "-", "color": INK, "lw": 0.6, "alpha": 0.6, "shrinkB": 5} if best.far else None
+        _write(ax, row, best.dx, best.dy, best.side, arrowprops=leader).set_in_layout(False)
+        taken.append(best.box)
+        if best.far:
+            leaders += list(best.lead)
+
+
+Segment = tuple[tuple[float, float], tuple[float, float]]
+
+
+def _bars(row: Line) -> tuple[Segment, Segment]:
+    """A point's intervals."""
+    x = row.cost_safe_start
+    y = row.returns
+    left, right = row.cost_safe_start_interval
+    low, high = row.returns_interval
+    return ((left, y), (right, y)), ((x, low), (x, high))
+
+
+def _around() -> list[tuple[float, float, str]]:
+    """(dx, dy, which side of the text is there) in points, the nearest first."""
+    sides = {1: "left", -1: "right", 0: "center"}
+    return [
+        (sign_x * x, sign_y * y, sides[sign_x])
+        for far in range(6)
         for sign_x, x in ((1, 8 + 12 * far), (-1, 8 + 12 * far), (0, 0))
         for sign_y, y in ((1, 8 + 14 * far), (-1, 8 + 14 * far))
     ]
-    leaders = []
-    for row, dot in zip(points, dots):
-        options = []
-        for dx, dy, side in around:
-            text = ax.annotate(
-                row.label,
-                (row.cost_safe_start, row.returns),
-                (dx, dy),
-                textcoords="offset points",
-                ha=side,
-                va="center",
-                fontsize=9,
-                color=INK,
-            )
-            box = text.get_window_extent(renderer).padded(3)
-            text.remove()
-            penalty = sum(2000 + _overlap(box, other) for other in taken if _overlap(box, other))
-            penalty += 400 * sum(box.contains(*d) for d in dots)
-            penalty += 120 * sum(_crosses(box, a, b) for a, b in bars)
-            lead = np.linspace(dot, ((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2), 20)
-            penalty += 1000 * sum(other.contains(*p) for other in taken for p in lead[::2])
-            penalty += 1000 * sum(box.contains(*p) for p in leaders)
-            outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y0 < frame.y0 or box.y1 > frame.y1
-            options.append((penalty + 10_000 * outside + abs(dx) + abs(dy), dx, dy, side, box, lead))
-        _, dx, dy, side, box, lead = min(options, key=lambda o: o[0])
-        far = abs(dx) + abs(dy) > 30
-        ax.annotate(
-            row.label,
-            (row.cost_safe_start, row.returns),
-            (dx, dy),
-            textcoords="offset points",
-            ha=side,
-            va="center",
-            fontsize=9,
-            color=INK,
-            arrowprops={"arrowstyle": "-", "color": INK, "lw": 0.6, "alpha": 0.6, "shrinkB": 5} if far else None,
-        ).set_in_layout(False)
-        taken.append(box)
-        leaders += [*lead] if far else []
 
 
-def _overlap(a, b) -> float:
-    width, height = min(a.x1, b.x1) - max(a.x0, b.x0), min(a.y1, b.y1) - max(a.y0, b.y0)
+def _place(
+    ax: Axes,
+    row: Line,
+    dot: np.ndarray,
+    at: tuple[float, float, str],
+    dots: list[np.ndarray],
+    bars: list[tuple[np.ndarray, np.ndarray]],
+    taken: list[Bbox],
+    leaders: list[np.ndarray],
+) -> Place:
+    """Try a place: other names weigh most, then lines that would cross, points, and intervals."""
+    dx, dy, side = at
+    text = _write(ax, row, dx, dy, side)
+    box = text.get_window_extent().padded(3)
+    text.remove()
+    lead = np.linspace(dot, ((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2), 20)
+    penalty = sum(2000 + _overlap(box, other) for other in taken if _overlap(box, other))
+    penalty += 400 * sum(box.contains(*other) for other in dots)
+    penalty += 120 * sum(_crosses(box, a, b) for a, b in bars)
+    penalty += 1000 * sum(other.contains(*p) for other in taken for p in lead[::2])
+    penalty += 1000 * sum(box.contains(*p) for p in leaders)
+    frame = ax.get_window_extent()
+    outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y0 < frame.y0 or box.y1 > frame.y1
+    return Place(penalty + 10_000 * outside + abs(dx) + abs(dy), dx, dy, side, box, lead)
+
+
+def _write(ax: Axes, row: Line, dx: float, dy: float, side: str, **more: Any) -> Annotation:
+    return ax.annotate(
+        row.label,
+        (row.cost_safe_start, row.returns),
+        (dx, dy),
+        textcoords="offset points",
+        ha=side,
+        va="center",
+        fontsize=9,
+        color=INK,
+        **more,
+    )
+
+
+def _overlap(a: Bbox, b: Bbox) -> float:
+    """The area that two boxes share."""
+    width = min(a.x1, b.x1) - max(a.x0, b.x0)
+    height = min(a.y1, b.y1) - max(a.y0, b.y0)
     return width * height if width > 0 and height > 0 else 0.0
 
 
-def _crosses(box, a, b) -> bool:
+def _crosses(box: Bbox, a: np.ndarray, b: np.ndarray) -> bool:
     """Whether a level or upright segment passes through the box."""
-    (x0, x1), (y0, y1) = sorted((a[0], b[0])), sorted((a[1], b[1]))
-    return x0 < box.x1 and x1 > box.x0 and y0 < box.y1 and y1 > box.y0
+    left, right = sorted((a[0], b[0]))
+    low, high = sorted((a[1], b[1]))
+    return left < box.x1 and right > box.x0 and low < box.y1 and high > box.y0
 
 
-def training_curves(rows: list[Row], name: str) -> list[dict]:
-    """One small panel per quantity that any run logged: {title, svg, keys}; seeds are thin lines."""
-    runs: dict = {}
+# --- training ---
+
+
+def training_curves(rows: Sequence[Row], name: str) -> list[Panel]:
+    """One small panel per quantity that any run logged; seeds are thin lines."""
+    runs: dict[Path, tuple[Row, list[dict[str, Any]]]] = {}
     for row in rows:
         for run, _ in row.members:
             runs.setdefault(run.path, (row, run.metrics))
     panels = []
-    for k, (title, y, logarithmic, lines) in enumerate(PANELS):
-        present = [
-            (row, style, [(m["step"], m[key]) for m in log if key in m])
+    for k, (title, y_label, logarithmic, lines) in enumerate(PANELS):
+        curves = [
+            (row, line_style, [(entry["step"], entry[key]) for entry in log if key in entry])
             for row, log in runs.values()
-            for key, style, _ in lines
-            if any(key in m for m in log)
+            for key, line_style, _ in lines
         ]
-        if not present:
-            continue
-        with matplotlib.rc_context(STYLE | {"font.size": 9}):
-            made = figure(3.5, 2.3)
-            ax = made.add_subplot()
-            for row, style, points in present:
-                points = points[:: -(-len(points) // 300)]  # at most 300 points a line
-                ax.plot(*zip(*points), style, color=colour(row), linewidth=1.1)
-            if logarithmic and all(v > 0 for _, _, points in present for _, v in points):
-                ax.set_yscale("log")
-                ax.yaxis.set_major_formatter(Ticks())
-                ax.yaxis.set_minor_formatter(Ticks())
-            if "share" in y:
-                ax.set_ylim(-0.03, 1.03 if "true hazard" not in title else None)
-            ax.xaxis.set_major_locator(MaxNLocator(5))
-            ax.set_ylabel(y)
-            ax.set_xlabel("update")
-            panels.append(
-                {
-                    "title": title,
-                    "svg": to_svg(made, f"{title} during training, one thin line per seed", f"{name}-{k}"),
-                    "dashed": len(lines) > 1,
-                }
-            )
+        curves = [curve for curve in curves if curve[2]]
+        if curves:
+            panels.append(Panel(title, Markup(_curves(title, y_label, logarithmic, curves, f"{name}-{k}"))))
     return panels
 
 
-def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
-    """h of one agent around it, one other agent moved over a grid: {svg, about}; None where there is no barrier or
-    the features do not say where others are. `state` (S,) is a real state; None takes a reset."""
+Curve = tuple[Row, str, list[tuple[int, float]]]  # whose, line style, (step, value)
+
+
+def _curves(title: str, y_label: str, logarithmic: bool, curves: list[Curve], name: str) -> str:
+    with style(font_size=9):
+        made = figure(3.5, 2.3)
+        ax = made.add_subplot()
+        for row, line_style, points in curves:
+            points = points[:: -(-len(points) // 300)]  # at most 300 points a line
+            steps, values = zip(*points)
+            ax.plot(steps, values, line_style, color=colour(row), linewidth=1.1)
+        if logarithmic and all(value > 0 for _, _, points in curves for _, value in points):
+            ax.set_yscale("log")
+            ax.yaxis.set_major_formatter(Ticks())
+            ax.yaxis.set_minor_formatter(Ticks())
+        if "share" in y_label:
+            ax.set_ylim(-0.03, 1.03 if "true hazard" not in title else None)
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+        ax.set_ylabel(y_label)
+        ax.set_xlabel("update")
+        return to_svg(made, f"{title} during training, one thin line per seed", name)
+
+
+# --- barriers ---
+
+AGENT = 0
+OTHER = 1  # who is moved around the agent
+SPEED = 1.0  # m/s at which it approaches
+GRID_SIDE = np.linspace(-1.0, 1.0, 81)  # m
+
+
+@dataclass(frozen=True)
+class Around:
+    """States in which one agent is moved over a grid around another."""
+
+    base: np.ndarray  # (N, D) features of the state that the others stay in
+    position: np.ndarray  # (N, 2)
+    velocity: np.ndarray  # (N, 2)
+    names: Sequence[str]  # of features
+
+    @property
+    def relative(self) -> bool:
+        """Whether features say where others are, seen from the agent; else they say where everybody is."""
+        return "other0.dx" in self.names
+
+    @property
+    def tells(self) -> bool:
+        """Whether features say where the other agent is."""
+        return self.relative or f"agent{OTHER}.x" in self.names
+
+    @property
+    def has_velocity(self) -> bool:
+        return ("other0.dvx" if self.relative else f"agent{OTHER}.vx") in self.names
+
+    @property
+    def rest(self) -> np.ndarray:
+        """(N − 2, 2) where the remaining agents are, seen from the agent."""
+        others = [j for j in range(len(self.position)) if j not in (AGENT, OTHER)]
+        return (self.position[others] - self.position[AGENT]).reshape(-1, 2)
+
+    def states(self, approach: float) -> np.ndarray:
+        """(81², N, D) features, the other agent approaching at this speed."""
+        dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
+        distance = np.maximum(np.hypot(dx, dy), 1e-6)
+        x = np.broadcast_to(self.base, (dx.size, *self.base.shape)).copy()
+        for c, (axis, away) in enumerate(zip("xy", (dx, dy))):
+            speed = approach * (-away / distance).ravel()
+            if self.relative:
+                x[:, AGENT, self.names.index(f"other0.d{axis}")] = away.ravel()
+                if self.has_velocity:
+                    x[:, AGENT, self.names.index(f"other0.dv{axis}")] = speed
+                continue
+            x[:, :, self.names.index(f"agent{OTHER}.{axis}")] = (self.position[AGENT, c] + away.ravel())[:, None]
+            if self.has_velocity:
+                x[:, :, self.names.index(f"agent{OTHER}.v{axis}")] = (self.velocity[AGENT, c] + speed)[:, None]
+        return x
+
+
+def barrier_field(run: Run, state: np.ndarray | None, name: str) -> BarrierField | None:
+    """h of one agent around it, one other agent moved over a grid; None where there is no barrier or the features do
+    not say where others are. `state` (S,) is a real state; None takes a reset."""
+    found = _barrier_around(run, state)
+    if found is None:
+        return None
+    around, barrier, radius = found
+    cases = [("at rest relative to the agent", 0.0)]
+    if around.has_velocity:
+        cases.append((f"approaching at {SPEED:g} m/s", SPEED))
+    shape = (len(GRID_SIDE), len(GRID_SIDE))
+    fields = {case: barrier(around.states(speed))[:, AGENT].reshape(shape) for case, speed in cases}
+    about = "; ".join(_agreement(case, h, radius) for case, h in fields.items())
+    label = f"Learned barrier of agent {AGENT} around it. With the other agent {about}."
+    svg = _draw_fields(fields, radius, around.rest, label, name)
+    return BarrierField(Markup(svg), about, len(around.rest), radius)
+
+
+Barrier = Callable[[np.ndarray], np.ndarray]  # of features (B, N, D), for each agent (B, N)
+
+
+def _barrier_around(run: Run, state: np.ndarray | None) -> tuple[Around, Barrier, float] | None:
+    """What a run knows danger by, where from, and the radius of contact."""
     import jax
     import jax.numpy as jnp
 
@@ -286,83 +460,64 @@ def barrier_field(run: Run, state: np.ndarray | None, name: str) -> dict | None:
 
     if not run.checkpoints():
         raise UserError(f"'{run.path}' holds no checkpoint.")
-    job, policy = load(run)
-    networks, names = getattr(policy, "networks", {}), job.spec.feature_names
-    n, radius = job.spec.n_agents, getattr(job.hazard.hazard, "radius", None)
+    job, loaded = load(run)
+    policy: Any = loaded  # whatever planner it is
+    networks = getattr(policy, "networks", {})
     learned = run_worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
+    radius = getattr(job.hazard.hazard, "radius", None)
+    n = job.spec.n_agents
     if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
         return None
-    agent, other = 0, 1
-    env = job.task.env
-    reset = env.from_global_state(jnp.asarray(state)[None]) if state is not None else env.reset(jax.random.key(1), 1)
-    base = np.array(policy.feature_map(env.observe(reset), env.global_state(reset)))[0]  # (N, D)
+    env: Any = job.task.env
+    reset = env.reset(jax.random.key(1), 1) if state is None else env.from_global_state(jnp.asarray(state)[None])
+    base = np.array(policy.feature_map(env.observe(reset), env.global_state(reset)))[0]
     flat = np.asarray(env.global_state(reset))[0]
-    position, velocity = flat[: 2 * n].reshape(n, 2), flat[2 * n : 4 * n].reshape(n, 2)
-    relative = "other0.dx" in names
-    if not relative and f"agent{other}.x" not in names:
-        return None
-    has_velocity = ("other0.dvx" if relative else f"agent{other}.vx") in names
-    side = np.linspace(-1.0, 1.0, 81)
-    dx, dy = np.meshgrid(side, side)
-    speed, distance = 1.0, np.maximum(np.hypot(dx, dy), 1e-6)
+    position = flat[: 2 * n].reshape(n, 2)
+    velocity = flat[2 * n : 4 * n].reshape(n, 2)
+    around = Around(base, position, velocity, job.spec.feature_names)
 
-    def field(approach: float) -> np.ndarray:
-        x = np.broadcast_to(base, (dx.size, *base.shape)).copy()
-        for c, (d, towards) in enumerate(((dx, -dx / distance), (dy, -dy / distance))):
-            axis = "xy"[c]
-            if relative:
-                x[:, agent, names.index(f"other0.d{axis}")] = d.ravel()
-                if has_velocity:
-                    x[:, agent, names.index(f"other0.dv{axis}")] = approach * towards.ravel()
-            else:
-                x[:, :, names.index(f"agent{other}.{axis}")] = (position[agent, c] + d.ravel())[:, None]
-                if has_velocity:
-                    v = velocity[agent, c] + approach * towards.ravel()
-                    x[:, :, names.index(f"agent{other}.v{axis}")] = v[:, None]
-        x = jnp.asarray(x)
+    def barrier(features: np.ndarray) -> np.ndarray:
+        x = jnp.asarray(features)
         h = barrier_on(networks["barrier"], policy.normaliser, x) if learned is None else learned.of_steps(x, x)
-        return np.asarray(h)[:, agent].reshape(dx.shape)
+        return np.asarray(h)
 
-    cases = [("at rest relative to the agent", 0.0)]
-    if has_velocity:
-        cases.append((f"approaching at {speed:g} m/s", speed))
-    fields = [field(v) for _, v in cases]
-    most = max(np.abs(f).max() for f in fields) or 1.0
-    rest = np.array([position[j] - position[agent] for j in range(n) if j not in (agent, other)]).reshape(-1, 2)
-    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+    return (around, barrier, radius) if around.tells else None
+
+
+def _draw_fields(fields: dict[str, np.ndarray], radius: float, rest: np.ndarray, label: str, name: str) -> str:
+    most = max(np.abs(h).max() for h in fields.values()) or 1.0
+    near = rest[np.abs(rest).max(1) < 1] if len(rest) else rest
+    scale = TwoSlopeNorm(0.0, -most, most)
+    with style(axes_grid=False):
         made = figure(4.1 * len(fields) + 0.7, 4.0)
         axes = made.subplots(1, len(fields), squeeze=False, sharey=True)[0]
-        for ax, h, (case, _) in zip(axes, fields, cases):
-            shown = ax.imshow(
-                h,
-                origin="lower",
-                extent=(-1.0125, 1.0125, -1.0125, 1.0125),
-                cmap="RdBu",
-                norm=TwoSlopeNorm(0.0, -most, most),
-                interpolation="bilinear",
-            )
-            if h.min() < 0 < h.max():
-                ax.contour(dx, dy, h, [0.0], colors="black", linewidths=1.8)
-            ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
-            ax.plot(0, 0, "+", color="black")
-            near = rest[np.abs(rest).max(1) < 1] if len(rest) else rest
-            if len(near):
-                ax.plot(*near.T, "o", mfc="none", color="black", markersize=9)
+        for ax, (case, h) in zip(axes, fields.items()):
+            _draw_field(ax, h, scale, radius, near)
             ax.set(title=f"other agent {case}", xlabel="other agent's x − own x (m)", xlim=(-1, 1), ylim=(-1, 1))
         axes[0].set_ylabel("other agent's y − own y (m)")
-        bar = made.colorbar(shown, ax=axes, shrink=0.85)
+        bar = made.colorbar(axes[-1].images[0], ax=list(axes), shrink=0.85)
         bar.set_label("h  (negative: judged unsafe)")
-        share = [_agreement(h, distance < radius) for h in fields]
-        about = "; ".join(
-            f"{case}, h < 0 on {100 * inside:.0f} % of the area in contact and on {100 * outside:.0f} % of the rest"
-            for (case, _), (inside, outside) in zip(cases, share)
-        )
-        label = f"Learned barrier of agent {agent} around it. With the other agent {about}."
-        return {"svg": to_svg(made, label, name), "about": about, "others": len(rest), "radius": radius}
+        return to_svg(made, label, name)
 
 
-def _agreement(h: np.ndarray, contact: np.ndarray) -> tuple[float, float]:
-    return float((h[contact] < 0).mean()), float((h[~contact] < 0).mean())
+def _draw_field(ax: Axes, h: np.ndarray, scale: TwoSlopeNorm, radius: float, near: np.ndarray) -> None:
+    extent = (-1.0125, 1.0125, -1.0125, 1.0125)
+    ax.imshow(h, origin="lower", extent=extent, cmap="RdBu", norm=scale, interpolation="bilinear")
+    if h.min() < 0 < h.max():
+        ax.contour(GRID_SIDE, GRID_SIDE, h, [0.0], colors="black", linewidths=1.8)
+    ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
+    ax.plot(0, 0, "+", color="black")
+    if len(near):
+        ax.plot(near[:, 0], near[:, 1], "o", mfc="none", color="black", markersize=9)
+
+
+def _agreement(case: str, h: np.ndarray, radius: float) -> str:
+    """How well the sign of h tells contact, in words."""
+    dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
+    contact = np.maximum(np.hypot(dx, dy), 1e-6) < radius
+    inside = 100 * float((h[contact] < 0).mean())
+    outside = 100 * float((h[~contact] < 0).mean())
+    return f"{case}, h < 0 on {inside:.0f} % of the area in contact and on {outside:.0f} % of the rest"
 
 
 def lonely_state(states: np.ndarray, n: int) -> np.ndarray:

@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from markupsafe import Markup
 
 from ringfence.datasets.audit import Audit
-from ringfence.report.figures import INK, STYLE, figure, to_svg
-from ringfence.report.page import render
-from ringfence.utils.files import whole
+from ringfence.report import html
+from ringfence.report.figures import INK, figure, style, to_svg
 from ringfence.world import Card
 
 # What is said of each number of a judgement, and of which kind it is.
@@ -26,7 +24,6 @@ CONDUCT = {
 
 def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str, Any] | None = None) -> Path:
     """Write the page of logs and their World, and of a policy that was judged by them (`judging.judge`)."""
-    out = Path(out)
     drawn = []
     if "barrier" in card and "calibration" in card["barrier"]:
         drawn.append(("What a margin means", _calibration(card["barrier"]), _said_of(card["barrier"])))
@@ -40,7 +37,7 @@ def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str,
             )
         )
     words = str(card).splitlines()
-    text = render(
+    text = html.render(
         "judgement.html.j2",
         {
             "title": f"{card['data']['task']}: what its logs say" + (f" of {judged['algorithm']}" if judged else ""),
@@ -52,16 +49,14 @@ def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str,
             "conduct": [(CONDUCT[k], judged[k]) for k in CONDUCT if judged.get(k) is not None] if judged else [],
         },
     )
-    with whole(out) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return out
+    return html.write(Path(out), text)
 
 
 def _calibration(barrier: dict[str, Any]) -> str:
     """Unsafe steps in 1000, and safe ones kept, by margin."""
     rows = barrier["calibration"]
     x = [r["margin"] for r in rows]
-    with matplotlib.rc_context(STYLE):
+    with style():
         made = figure(8.2, 2.8)
         left, right = made.subplots(1, 2)
         left.plot(x, [r["unsafe_in_1000"] for r in rows], marker="o", color=INK)
@@ -81,7 +76,7 @@ def _said_of(barrier: dict[str, Any]) -> str:
 
 
 def _margins(margins: dict[str, list[float]]) -> str:
-    with matplotlib.rc_context(STYLE):
+    with style():
         made = figure(8.2, 3.0)
         ax = made.add_subplot()
         for k, (name, quantiles) in enumerate(margins.items()):

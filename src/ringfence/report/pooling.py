@@ -1,15 +1,19 @@
-"""Runs of one method on one task, played on the same resets, as one row of numbers; both kinds of page rest on it."""
+"""Runs of one method on one task, played on the same resets, as one row of numbers. Both kinds of page rest on it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
+from ringfence.evaluation.statistics import Interval
 
-Interval = tuple[float, float]
+Result = dict[str, Any]  # a summary of episodes as results.json has it (schemas.Result), under today's names
+Number = TypeVar("Number", float, np.ndarray)
 
 
 @dataclass(kw_only=True)
@@ -36,74 +40,107 @@ class Numbers:
         return self.violations / self.episodes
 
 
-def pool(results: list[dict], who: str = "the runs of a row") -> dict:
-    """Fields of `Numbers` from the summaries of a row's runs. `UserError` if they played different numbers of resets.
+@dataclass(kw_only=True)
+class Line(Numbers):
+    """A row of a table: a method over its seeds, or a reference policy."""
+
+    name: str  # in plain words
+    variant: str  # what is evaluated beside the default, in short; empty for references
+    seeds: tuple[int, ...]  # none of a reference
+    reference: bool = False
+    parameters: int | None = None
+    train_seconds: float | None = None  # of one seed
+    plan_ms: float | None = None  # median of one joint action
+    style: tuple[int, int] = (0, 0)  # colour, marker
+
+    @property
+    def label(self) -> str:
+        """Name and variant in one line, e.g. `ICBF-Diffuser split+plans4`."""
+        return f"{self.name} {self.variant}".strip()
+
+
+def pool(results: list[Result], name: str = "the runs of a row") -> Numbers:
+    """The summaries of a row's runs as one. `UserError` if they played different numbers of resets.
 
     The interval of one run speaks of its episodes alone, that of several also of what another seed would have trained.
     """
-    first = results[0]
-    if len(results) == 1:  # which may be of logged data, whose episodes are not kept one by one
-        told = {
-            "returns": first["return_mean"],
-            "returns_interval": tuple(first["return_interval"]),
-            "cost": first["cost_mean"],
-            "cost_interval": tuple(first["cost_interval"]),
-            "cost_safe_start": first["cost_safe_start"],
-            "cost_safe_start_interval": tuple(first["cost_safe_start_interval"]),
-            "unsafe_starts": first["unsafe_starts"],
-            "cvar": first["cost_cvar10"],
-            "violation_upper": statistics.upper_bound(_violations(first), first["episodes"]),
-        }
-    else:
-        played = [r["episodes"] for r in results]
-        if len(set(played)) > 1:
-            raise UserError(
-                f"{who} were played for {min(played)} and for {max(played)} episodes, which are not the same resets; "
-                "evaluate all of them with the same --episodes."
-            )
-        returns, cost, unsafe = (
-            np.array([r["per_episode"][k] for r in results], float) for k in ("return", "cost", "unsafe_start")
-        )
-        fine = unsafe == 0 if not unsafe.all() else np.ones_like(unsafe, bool)
-        avoidable = cost * (not unsafe.all())
-        told = {
-            "returns": float(returns.mean()),
-            "returns_interval": statistics.mean_of_runs(returns),
-            "cost": float(cost.mean()),
-            "cost_interval": statistics.mean_of_runs(cost, least=0.0),
-            "cost_safe_start": float(avoidable[fine].mean()),
-            "cost_safe_start_interval": statistics.mean_of_runs(avoidable, fine, least=0.0),
-            "unsafe_starts": int(unsafe.sum()),
-            "cvar": statistics.cvar(cost.ravel()),
-            # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.
-            "violation_upper": statistics.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
-        }
-    episodes, c = sum(r["episodes"] for r in results), first["constants"]
-    violations = sum(map(_violations, results))
-    return told | {
-        "episodes": episodes,
-        "violations": violations,
-        "returns_norm": normal_return(told["returns"], c),
-        "cost_norm": normal_cost(told["cost"], c),
-        "safe": told["cost_interval"][1] <= c["cost_limit"],
+    measured = _of_one(results[0]) if len(results) == 1 else _of_several(results, name)
+    constants = results[0]["constants"]
+    return Numbers(
+        **measured,
+        episodes=sum(r["episodes"] for r in results),
+        violations=sum(map(_violations, results)),
+        returns_norm=normal_return(measured["returns"], constants),
+        cost_norm=normal_cost(measured["cost"], constants),
+        safe=measured["cost_interval"][1] <= constants["cost_limit"],
+    )
+
+
+def _of_one(result: Result) -> dict[str, Any]:
+    """Its own numbers: it may be of logged data, whose episodes are not kept one by one."""
+    return {
+        "returns": result["return_mean"],
+        "returns_interval": tuple(result["return_interval"]),
+        "cost": result["cost_mean"],
+        "cost_interval": tuple(result["cost_interval"]),
+        "cost_safe_start": result["cost_safe_start"],
+        "cost_safe_start_interval": tuple(result["cost_safe_start_interval"]),
+        "unsafe_starts": result["unsafe_starts"],
+        "cvar": result["cost_cvar10"],
+        "violation_upper": statistics.upper_bound(_violations(result), result["episodes"]),
     }
 
 
-def _violations(result: dict) -> int:
+def _of_several(results: list[Result], name: str) -> dict[str, Any]:
+    """From the episodes (runs, resets) of all."""
+    played = [r["episodes"] for r in results]
+    if len(set(played)) > 1:
+        raise UserError(
+            f"{name} were played for {min(played)} and for {max(played)} episodes, which are not the same resets; "
+            "evaluate all of them with the same --episodes."
+        )
+    returns = _episodes(results, "return")
+    cost = _episodes(results, "cost")
+    unsafe = _episodes(results, "unsafe_start")
+    if unsafe.all():  # nothing is known of safe starts: no cost
+        safe_start = np.ones_like(unsafe, bool)
+        cost_safe_start = np.zeros_like(cost)
+    else:
+        safe_start = unsafe == 0
+        cost_safe_start = cost
+    return {
+        "returns": float(returns.mean()),
+        "returns_interval": statistics.mean_of_runs(returns),
+        "cost": float(cost.mean()),
+        "cost_interval": statistics.mean_of_runs(cost, least=0.0),
+        "cost_safe_start": float(cost_safe_start[safe_start].mean()),
+        "cost_safe_start_interval": statistics.mean_of_runs(cost_safe_start, safe_start, least=0.0),
+        "unsafe_starts": int(unsafe.sum()),
+        "cvar": statistics.cvar(cost.ravel()),
+        # Runs share their resets, which alone are independent; a mean over runs is at most this share of them.
+        "violation_upper": statistics.upper_bound(int((cost > 0).any(0).sum()), cost.shape[1]),
+    }
+
+
+def _episodes(results: list[Result], what: str) -> np.ndarray:
+    return np.array([r["per_episode"][what] for r in results], float)
+
+
+def _violations(result: Result) -> int:
     return round(result["violation_rate"] * result["episodes"])
 
 
-def normal_return(x, c: dict[str, float]):
+def normal_return(x: Number, constants: dict[str, float]) -> Number:
     """0 at return_min, 1 at return_max."""
-    return (x - c["return_min"]) / (c["return_max"] - c["return_min"])
+    return (x - constants["return_min"]) / (constants["return_max"] - constants["return_min"])
 
 
-def normal_cost(x, c: dict[str, float]):
+def normal_cost(x: Number, constants: dict[str, float]) -> Number:
     """1 at the limit."""
-    return (x + c["cost_offset"]) / (c["cost_limit"] + c["cost_offset"])
+    return (x + constants["cost_offset"]) / (constants["cost_limit"] + constants["cost_offset"])
 
 
-def mean_of(results: list[dict], key: str) -> float | None:
+def mean_of(results: Iterable[Mapping[str, Any]], key: str) -> float | None:
     """Mean of what the summaries say under `key`; None where none says it."""
     values = [r[key] for r in results if r.get(key) is not None]
     return float(np.mean(values)) if values else None

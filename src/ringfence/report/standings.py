@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -10,41 +11,25 @@ from ringfence.datasets.registry import TASKS
 from ringfence.evaluation import statistics
 from ringfence.report.board import Board, Entry, Method
 from ringfence.report.figures import COLOURS
-from ringfence.report.pooling import Interval, Numbers, mean_of, normal_cost, normal_return, pool
-from ringfence.types import Array
+from ringfence.report.pooling import Interval, Line, Result, mean_of, normal_cost, normal_return, pool
 
 DRAWS = 2000  # of every bootstrap
 
 
 @dataclass(kw_only=True)
-class Standing(Numbers):
-    """A method on a task over its seeds, or a reference policy."""
+class Standing(Line):
+    """A row of a task's ranking: a method over its seeds, or a reference policy."""
 
     task: str
-    name: str
-    variant: str
     method: Method | None  # None: a reference
-    seeds: tuple[int, ...]
     returns_sd: float | None = None  # between seeds; None with fewer than two
     returns_norm_sd: float | None = None
     cost_sd: float | None = None
     ended: float | None = None  # share of episodes that ended before the time limit; None: not said
     steps: float | None = None  # mean of an episode
-    train_seconds: float | None = None  # of one seed
-    plan_ms: float | None = None  # median of one joint action
-    parameters: int | None = None
     rank: int = 0  # on this task, from 1; 0 for references
     best: bool = False  # the highest return among the safe
-    style: tuple[int, int] = (0, 0)  # colour, marker
     entries: list[Entry] = field(default_factory=list, repr=False)
-
-    @property
-    def reference(self) -> bool:
-        return self.method is None
-
-    @property
-    def label(self) -> str:
-        return f"{self.name} {self.variant}".strip()
 
 
 @dataclass(frozen=True)
@@ -76,18 +61,18 @@ class Aggregate:
     methods: list[Method]
     seeds: dict[Method, tuple[int, ...]]  # those that every task has
     left_out: dict[Method, list[str]]  # method -> tasks without a result; none: no seed has all tasks
-    returns: dict[Method, Array]
-    costs: dict[Method, Array]
+    returns: dict[Method, np.ndarray]
+    costs: dict[Method, np.ndarray]
     iqm_returns: dict[Method, tuple[float, Interval | None]]  # no interval of one seed
     iqm_costs: dict[Method, tuple[float, Interval | None]]
-    improves: Array  # (M, M): probability that the row's return beats the column's
-    cheaper: Array  # (M, M): probability that the row's cost is below the column's
-    return_thresholds: Array  # (K,)
-    return_profiles: Array  # (M, K)
-    return_bands: list[Array | None]  # (2, K) pointwise 95 % intervals, runs resampled within each task
-    cost_thresholds: Array  # (K,)
-    cost_profiles: Array  # (M, K)
-    cost_bands: list[Array | None]
+    improves: np.ndarray  # (M, M): probability that the row's return beats the column's
+    cheaper: np.ndarray  # (M, M): probability that the row's cost is below the column's
+    return_thresholds: np.ndarray  # (K,)
+    return_profiles: np.ndarray  # (M, K)
+    return_bands: list[np.ndarray | None]  # (2, K) pointwise 95 % intervals, runs resampled within each task
+    cost_thresholds: np.ndarray  # (K,)
+    cost_profiles: np.ndarray  # (M, K)
+    cost_bands: list[np.ndarray | None]
 
 
 def standings(board: Board) -> dict[str, list[Standing]]:
@@ -108,63 +93,87 @@ def references(board: Board) -> dict[str, list[Standing]]:
 def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
     """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
     rest, by cost."""
-    merits = [r.returns for r in rows], [r.cost_interval[1] for r in rows], limit
-    for row, place in zip(rows, statistics.places(*merits)):
+    returns = [r.returns for r in rows]
+    costs = [r.cost_interval[1] for r in rows]
+    for row, place in zip(rows, statistics.places(returns, costs, limit)):
         row.rank = int(place)
-        row.best = row.safe and place == 1
-    return [rows[i] for i in statistics.rank(*merits)]
+        row.best = row.safe and bool(place == 1)
+    return [rows[i] for i in statistics.rank(returns, costs, limit)]
 
 
 def contests(rows: list[Standing]) -> list[Contest]:
     """The first of a task's ranked rows against each of the others."""
     if len(rows) < 2:
         return []
-    first, found = rows[0], []
-    for other in rows[1:]:
-        pair = [[_per_reset(row, what) for row in (first, other)] for what in ("return", "cost")]
-        found.append([statistics.paired_test(*p) for p in pair])
-    adjusted = statistics.holm(np.array([t["p"] for tests in found for t in tests])).reshape(-1, 2)
+    first = rows[0]
+    others = rows[1:]
+    returns = [statistics.paired_test(_per_reset(first, "return"), _per_reset(other, "return")) for other in others]
+    costs = [statistics.paired_test(_per_reset(first, "cost"), _per_reset(other, "cost")) for other in others]
+    adjusted = statistics.holm([test["p"] for test in (*returns, *costs)])
+    returns_p = adjusted[: len(others)]
+    costs_p = adjusted[len(others) :]
     return [
-        Contest(row, r["difference"], r["interval"], float(p), c["difference"], c["interval"], float(q))
-        for row, (r, c), (p, q) in zip(rows[1:], found, adjusted)
+        Contest(
+            other=other,
+            returns=returns[k]["difference"],
+            returns_interval=returns[k]["interval"],
+            returns_p=float(returns_p[k]),
+            cost=costs[k]["difference"],
+            cost_interval=costs[k]["interval"],
+            cost_p=float(costs_p[k]),
+        )
+        for k, other in enumerate(others)
     ]
 
 
-def _per_reset(row: Standing, what: str) -> Array:
+def _per_reset(row: Standing, what: str) -> np.ndarray:
     return np.mean([e.summary["per_episode"][what] for e in row.entries], 0)
 
 
 def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -> Standing:
     entries = board.of(task, method)
-    told = [e.summary for e in entries]
-    c = board.constants[task]
-    sd = _deviation(told, "return_mean")
+    results = [e.summary for e in entries]
+    constants = board.constants[task]
+    deviation = _deviation(results, "return_mean")
+    if deviation is None:
+        normalised = None
+    else:
+        normalised = deviation / (constants["return_max"] - constants["return_min"])
     return Standing(
         task=task,
         name=method.name,
         variant=method.shown,
         method=method,
         seeds=tuple(e.seed for e in entries),
-        returns_sd=sd,
-        returns_norm_sd=None if sd is None else sd / (c["return_max"] - c["return_min"]),
-        cost_sd=_deviation(told, "cost_mean"),
-        ended=mean_of(told, "termination_rate"),
-        steps=mean_of(told, "steps_mean"),
-        train_seconds=mean_of(told, "train_seconds"),
-        plan_ms=mean_of(told, "plan_ms_p50"),
-        parameters=told[0].get("parameters"),
+        returns_sd=deviation,
+        returns_norm_sd=normalised,
+        cost_sd=_deviation(results, "cost_mean"),
+        ended=mean_of(results, "termination_rate"),
+        steps=mean_of(results, "steps_mean"),
+        train_seconds=mean_of(results, "train_seconds"),
+        plan_ms=mean_of(results, "plan_ms_p50"),
+        parameters=results[0].get("parameters"),
         style=style,
         entries=entries,
-        **pool(told),
+        **vars(pool(results)),
     )
 
 
-def _reference(task: str, name: str, told: dict) -> Standing:
-    ended, steps = told.get("termination_rate"), told.get("steps_mean")
-    return Standing(task=task, name=name, variant="", method=None, seeds=(), ended=ended, steps=steps, **pool([told]))
+def _reference(task: str, name: str, result: Result) -> Standing:
+    return Standing(
+        task=task,
+        name=name,
+        variant="",
+        method=None,
+        seeds=(),
+        reference=True,
+        ended=result.get("termination_rate"),
+        steps=result.get("steps_mean"),
+        **vars(pool([result])),
+    )
 
 
-def _deviation(results: list[dict], key: str) -> float | None:
+def _deviation(results: list[Result], key: str) -> float | None:
     return float(np.std([r[key] for r in results], ddof=1)) if len(results) > 1 else None
 
 
@@ -201,33 +210,15 @@ def by_protocol(board: Board) -> dict[str, list[str]]:
 def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) -> Aggregate | None:
     """Statistics over tasks (by default all); None where no method was measured on every one with the same seed."""
     tasks = board.tasks if tasks is None else tasks
-    seeds, left_out = {}, {}
-    for m in board.methods:
-        had = {t: {e.seed for e in board.of(t, m)} for t in tasks}
-        common = tuple(sorted(set.intersection(*had.values())))
-        if common:
-            seeds[m] = common
-        else:
-            left_out[m] = [t for t in tasks if not had[t]]
+    seeds, left_out = _common_seeds(board, tasks)
     methods = list(seeds)
     if not methods:
         return None
-    returns, costs, episode_costs = {}, {}, {}
-    for m in methods:
-        cells = [[_entry(board, t, m, s) for t in tasks] for s in seeds[m]]
-        score = [[normal_return(e.summary["return_mean"], board.constants[e.task]) for e in row] for row in cells]
-        price = [[normal_cost(e.summary["cost_mean"], board.constants[e.task]) for e in row] for row in cells]
-        returns[m], costs[m] = np.array(score), np.array(price)
-        episode_costs[m] = np.array(
-            [
-                [normal_cost(np.array(e.summary["per_episode"]["cost"]), board.constants[e.task]) for e in row]
-                for row in cells
-            ]
-        )
-    low, high = _range(returns)
-    return_thresholds = np.linspace(low, high, 101)
-    top = int(np.ceil(max(3.0, *(float(np.quantile(c, 0.9)) for c in episode_costs.values()))))
-    cost_thresholds = np.linspace(0.0, top, 20 * top + 1)  # whole numbers are among them, since costs count steps
+    returns = {m: _scores(board, tasks, m, seeds[m], _normal_return) for m in methods}
+    costs = {m: _scores(board, tasks, m, seeds[m], _normal_cost) for m in methods}
+    episode_costs = {m: _scores(board, tasks, m, seeds[m], _normal_episode_costs) for m in methods}
+    return_thresholds = np.linspace(*_range(returns), 101)
+    cost_thresholds = _cost_thresholds(episode_costs)
     above = {m: (returns[m][..., None] > return_thresholds).astype(float) for m in methods}
     within = {m: (episode_costs[m][..., None] <= cost_thresholds).mean(2) for m in methods}
     return Aggregate(
@@ -251,33 +242,79 @@ def aggregate(board: Board, protocol: str = "", tasks: list[str] | None = None) 
     )
 
 
+def _common_seeds(board: Board, tasks: list[str]) -> tuple[dict[Method, tuple[int, ...]], dict[Method, list[str]]]:
+    """(by method the seeds that every task has; by method without any the tasks that lack it)."""
+    seeds: dict[Method, tuple[int, ...]] = {}
+    left_out: dict[Method, list[str]] = {}
+    for method in board.methods:
+        had = {task: {e.seed for e in board.of(task, method)} for task in tasks}
+        common = tuple(sorted(set.intersection(*had.values())))
+        if common:
+            seeds[method] = common
+        else:
+            left_out[method] = [task for task in tasks if not had[task]]
+    return seeds, left_out
+
+
+Score = Callable[[Result, dict[str, float]], float | np.ndarray]  # of a result, given its task's constants
+
+
+def _scores(board: Board, tasks: list[str], method: Method, seeds: tuple[int, ...], score: Score) -> np.ndarray:
+    """(seeds, tasks, ...) scores of a method."""
+    rows = [[_entry(board, task, method, seed) for task in tasks] for seed in seeds]
+    return np.array([[score(e.summary, board.constants[e.task]) for e in row] for row in rows])
+
+
 def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
     return next(e for e in board.of(task, method) if e.seed == seed)
 
 
-def _iqm(scores: Array) -> tuple[float, Interval | None]:
+def _normal_return(result: Result, constants: dict[str, float]) -> float:
+    return normal_return(result["return_mean"], constants)
+
+
+def _normal_cost(result: Result, constants: dict[str, float]) -> float:
+    return normal_cost(result["cost_mean"], constants)
+
+
+def _normal_episode_costs(result: Result, constants: dict[str, float]) -> np.ndarray:
+    return normal_cost(np.array(result["per_episode"]["cost"]), constants)
+
+
+def _range(scores: dict[Method, np.ndarray]) -> Interval:
+    """From the worst to the best run, at least from 0 to 1."""
+    low = min(s.min() for s in scores.values())
+    high = max(s.max() for s in scores.values())
+    return min(0.0, float(low)), max(1.0, float(high))
+
+
+def _cost_thresholds(episode_costs: dict[Method, np.ndarray]) -> np.ndarray:
+    """From 0 to where nine of ten episodes of every method lie, at least to 3. Whole numbers are among them, since
+    costs count steps."""
+    most = max(float(np.quantile(costs, 0.9)) for costs in episode_costs.values())
+    top = int(np.ceil(max(3.0, most)))
+    return np.linspace(0.0, top, 20 * top + 1)
+
+
+def _iqm(scores: np.ndarray) -> tuple[float, Interval | None]:
     """Interquartile mean over all seeds and tasks; the bootstrap resamples seeds within each task."""
-    several = len(scores) > 1
-    return float(statistics.iqm(scores)), statistics.stratified_bootstrap(
-        scores, statistics.iqm, draws=DRAWS
-    ) if several else None
+    middle = float(statistics.iqm(scores))
+    if len(scores) < 2:
+        return middle, None
+    low, high = statistics.stratified_bootstrap(scores, statistics.iqm, draws=DRAWS)
+    return middle, (float(low), float(high))
 
 
-def _band(shares: Array) -> Array | None:
+def _band(shares: np.ndarray) -> np.ndarray | None:
     """(2, K): 95 % interval, at every threshold, of the mean of shares (runs, tasks, K); runs are resampled."""
     runs, tasks, _ = shares.shape
     if runs < 2:
         return None
-    taken = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), (DRAWS, tasks)) / (runs * tasks)
-    return np.percentile(np.einsum("dmr,rmk->dk", taken, shares, optimize=True), [2.5, 97.5], axis=0)
+    drawn = np.random.default_rng(0).multinomial(runs, np.full(runs, 1 / runs), (DRAWS, tasks))
+    means = np.einsum("dmr,rmk->dk", drawn / (runs * tasks), shares, optimize=True)
+    return np.percentile(means, [2.5, 97.5], axis=0)
 
 
-def _pairs(scores: dict[Method, Array], methods: list[Method]) -> Array:
+def _pairs(scores: dict[Method, np.ndarray], methods: list[Method]) -> np.ndarray:
     """(M, M) probability that a run of the row scores higher than one of the column, averaged over tasks."""
     return np.array([[statistics.probability_of_improvement(scores[a], scores[b]) for b in methods] for a in methods])
-
-
-def _range(scores: dict[Method, Array]) -> Interval:
-    """From the worst to the best run, at least from 0 to 1."""
-    low, high = min(s.min() for s in scores.values()), max(s.max() for s in scores.values())
-    return min(0.0, float(low)), max(1.0, float(high))

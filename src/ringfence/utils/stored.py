@@ -65,7 +65,7 @@ _BEFORE_GUARDS = {"guarded": "shield", "shielded": "shield", "adaptive": "adapt"
 
 def result(stored: Mapping[str, Any]) -> dict[str, Any]:
     """An evaluation, or a reference row, as today's version would have written it."""
-    found = _before_guards(stored) | named(stored, COLUMNS)
+    found: dict[str, Any] = {**_before_guards(stored), **named(stored, COLUMNS)}
     for column, rename in (
         ("options", planner_options),
         ("guard_options", guard_options),
