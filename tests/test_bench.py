@@ -90,8 +90,8 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
     """Results that the named planner of today would not give do not count."""
     cell = grid.Cell("simple_spread-random", "bc", "default", 0, (), (("default+shield-learned", "shield-learned"),))
     options = grid.dataclasses.asdict(GuardOptions(**{**GUARDS["shield"], "margin": 1.0}))
-    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "guard_options": options}
-    Run(cell.folder(tmp_path)).add_result("default+shield-learned", told)
+    result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "guard_options": options}
+    Run(cell.folder(tmp_path)).add_result("default+shield-learned", result)
     assert cell.state(tmp_path, 4) == "done"
     assert cell.state(tmp_path, 5) == "to do"
     with monkeypatch.context() as patch:
@@ -99,7 +99,7 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
         assert cell.state(tmp_path, 4) == "to do"
     world = grid.dataclasses.asdict(Settings(labels="formula"))  # which follows from the data
     for change, state in (({}, "done"), ({"members": 5}, "to do"), ({"view": "centralized"}, "to do")):
-        stored = told | {"world_settings": world | change}
+        stored = result | {"world_settings": world | change}
         Run(cell.folder(tmp_path)).add_result("default+shield-learned", stored)
         assert cell.state(tmp_path, 4) == state
 
@@ -109,8 +109,8 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
     cell = made.cells[0]
     before = cell.status(out)
     results = cell.folder(out) / "results.json"
-    told = json.loads(results.read_text())
-    results.write_text(json.dumps({k: {**v, "protocol": -1} for k, v in told.items()}))  # of an older protocol
+    results = json.loads(results.read_text())
+    results.write_text(json.dumps({k: {**v, "protocol": -1} for k, v in results.items()}))  # of an older protocol
     grid.write_json(cell.folder(out) / "status.json", {**before, "train_seconds": 1234.0, "adopted": "cells/elsewhere"})
     grid.run_group([cell], out, made.episodes, lambda event, cell: None)
     after = cell.status(out)
@@ -121,20 +121,20 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
 
 def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
     cell = grid.Cell("simple_spread-expert", "bc", "default", 0, (), (("default", "plain"),))
-    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "step": 7}
-    Run(cell.folder(tmp_path)).add_result("default", told)
+    result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "step": 7}
+    Run(cell.folder(tmp_path)).add_result("default", result)
     assert cell.state(tmp_path, 4) == "to do"
-    Run(cell.folder(tmp_path)).add_result("default", {**told, "step": cell.config.steps})
+    Run(cell.folder(tmp_path)).add_result("default", {**result, "step": cell.config.steps})
     assert cell.state(tmp_path, 4) == "done"
 
 
 @pytest.mark.parametrize(("task", "state"), [("ant_4x2-poor", "to do"), ("halfcheetah_2x3-poor", "done")])
 def test_a_result_that_hides_falls_is_played_again(tmp_path, task, state):
     cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "plain"),))
-    told = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}}
-    Run(cell.folder(tmp_path)).add_result("mujoco", told)
+    result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}}
+    Run(cell.folder(tmp_path)).add_result("mujoco", result)
     assert cell.state(tmp_path, 4) == state
-    Run(cell.folder(tmp_path)).add_result("mujoco", {**told, "termination_rate": 0.0})
+    Run(cell.folder(tmp_path)).add_result("mujoco", {**result, "termination_rate": 0.0})
     assert cell.state(tmp_path, 4) == "done"
 
 
@@ -190,7 +190,7 @@ def test_the_papers_grids_are_refused_or_made_as_a_whole(tmp_path, capsys):
     assert not (tmp_path / "simple_spread").exists(), "the second part was looked at before the first was begun"
 
 
-def test_a_reference_whose_worker_dies_is_told(made, capsys):
+def test_a_reference_whose_worker_dies_is_reported(made, capsys):
     pool = local._Pool(made, queue.Queue(), None, 1, 2.0, -1)
     dead, job = SimpleNamespace(pid=1, returncode=-9), {"reference": "simple_spread-random"}
     pool._died(dead, None, [], job)
@@ -198,10 +198,10 @@ def test_a_reference_whose_worker_dies_is_told(made, capsys):
     pool._died(dead, None, [], job)
     pool.too_big.add(2)
     pool._died(SimpleNamespace(pid=2, returncode=-9), None, [], {"reference": "other"})
-    told = capsys.readouterr().err
+    said = capsys.readouterr().err
     assert pool.jobs.empty()
-    assert "simple_spread-random could not be made: its worker died 2 times (exit status -9)" in told
-    assert "other could not be made: its worker grew beyond 2 GiB" in told
+    assert "simple_spread-random could not be made: its worker died 2 times (exit status -9)" in said
+    assert "other could not be made: its worker grew beyond 2 GiB" in said
 
 
 def test_a_folder_that_was_moved_aside_is_found(made, tmp_path):
@@ -227,9 +227,9 @@ def test_table(made):
 def test_mixed_protocols_are_refused(made, tmp_path):
     file = made.cells[0].folder(made.out) / "results.json"
     kept = file.read_text()
-    told = json.loads(kept)
-    told["default"]["episodes"] = 5
-    file.write_text(json.dumps(told))
+    results = json.loads(kept)
+    results["default"]["episodes"] = 5
+    file.write_text(json.dumps(results))
     try:
         with pytest.raises(UserError, match="episodes=5"):
             rows(made.out)
@@ -314,8 +314,8 @@ def test_a_failing_cell_is_recorded_and_stops_nobody(tmp_path, monkeypatch):
     grid.run_group(list(g.cells), g.out, g.episodes, lambda event, cell: heard.append((event, cell.seed)))
     assert heard == [("start", 0), ("failed", 0), ("start", 1), ("done", 1)]
     assert g.count() == {"done": 1, "failed": 1, "to do": 0}
-    told = g.cells[0].status(g.out)
-    assert "moon" in told["error"] and "Traceback" in told["traceback"]
+    status = g.cells[0].status(g.out)
+    assert "moon" in status["error"] and "Traceback" in status["traceback"]
     monkeypatch.undo()
     grid.run_group(g.groups()[0], g.out, g.episodes, lambda *_: None)
     assert g.count()["done"] == 2 and g.cells[0].status(g.out)["attempts"] == 2
@@ -378,11 +378,11 @@ def test_one_runner_per_folder(tmp_path):
 
 
 def test_one_training_per_run_folder(small_store, tmp_path):
-    told = dict(out=tmp_path, changes={"steps": 2, "batch": 4, "width": 8, "depth": 1}, quiet=True)
+    settings = dict(out=tmp_path, changes={"steps": 2, "batch": 4, "width": 8, "depth": 1}, quiet=True)
     folder = tmp_path / "simple_spread-random" / "bc" / "seed-0"
     with files.owned(folder, "not said"):
         with pytest.raises(UserError, match="Another process trains '.*seed-0'; wait for it or stop it"):
-            loop.train("bc", small_store, preset="default", **told)
+            loop.train("bc", small_store, preset="default", **settings)
     assert not (folder / "metrics.jsonl").exists()
 
 
@@ -401,7 +401,7 @@ def test_what_a_grid_cannot_be_is_refused(tmp_path):
         pass
 
 
-def test_a_cell_that_failed_before_it_began_is_told(tmp_path):
+def test_a_cell_that_failed_before_it_began_is_reported(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
     g.open()
     grid.record_failure(g.cells[0], g.out, "RuntimeError: no data")
@@ -478,16 +478,16 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     found = {r["task"]: r for r in rows(g.out)}
     assert len(found) == 2 and found[names[0]]["return_mean"] == found[names[1]]["return_mean"]
     grid.make_reference(names[0], g.out, 1, 1000)
-    told = [Run(c.folder(g.out)).config for c in g.cells]
-    assert [t["task"] for t in told] == names and told[0]["hazard"]["limit"] > told[1]["hazard"]["limit"]
+    configs = [Run(c.folder(g.out)).config for c in g.cells]
+    assert [t["task"] for t in configs] == names and configs[0]["hazard"]["limit"] > configs[1]["hazard"]["limit"]
     shutil.rmtree(other.folder(g.out))
     card = grid.data_of(other.task, 1000).card
     assert grid.adopt(other, g.out, card | {"simulator": "another"}) is None  # what other steps taught
-    told = native.folder(g.out) / "config.json"
-    now = told.read_text()
-    told.write_text(json.dumps(json.loads(now) | {"revision": 0}))
+    config = native.folder(g.out) / "config.json"
+    now = config.read_text()
+    config.write_text(json.dumps(json.loads(now) | {"revision": 0}))
     assert grid.adopt(other, g.out, card) is None  # or an older algorithm
-    told.write_text(now)
+    config.write_text(now)
     shutil.rmtree(native.folder(g.out) / "ckpt")  # results alone, as a copied folder has them, teach nobody
     assert grid.adopt(other, g.out, card) is None
 
@@ -498,14 +498,14 @@ def test_a_stale_cell_is_named_and_stops_no_other(tmp_path):
     g.open()
     stale = g.cells[1].folder(g.out)
     grid.run_group([g.cells[1]], g.out, 2, lambda event, cell: None)
-    told = json.loads((stale / "config.json").read_text())
-    (stale / "config.json").write_text(json.dumps(told | {"revision": 0}))
+    config = json.loads((stale / "config.json").read_text())
+    (stale / "config.json").write_text(json.dumps(config | {"revision": 0}))
     (stale / "results.json").unlink()
     grid.run_group(list(g.cells), g.out, 2, lambda event, cell: None)
     assert [c.status(g.out)["state"] for c in g.cells] == ["done", "failed"]
     assert "its revision differs" in g.cells[1].status(g.out)["error"]
     # a card that has come to tell more is of the same data
-    (stale / "config.json").write_text(json.dumps(told | {"data": told["data"] | {"more": 1}}))
+    (stale / "config.json").write_text(json.dumps(config | {"data": config["data"] | {"more": 1}}))
     grid.run_group([g.cells[1]], g.out, 2, lambda event, cell: None)
     assert g.cells[1].status(g.out)["state"] == "done"
 

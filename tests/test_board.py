@@ -51,7 +51,7 @@ def cell(root: Path, results: dict | None, algorithm="bc", preset="default", see
     """One cell of the grid, with what the runner leaves in it."""
     job = algorithm if preset == "default" else f"{algorithm}-{preset}"
     path = root / "cells" / task / job / f"seed-{seed}-{mark}"
-    told = {
+    config = {
         "algorithm": algorithm,
         "preset": preset,
         "config": {"steps": 100} | config,
@@ -60,7 +60,7 @@ def cell(root: Path, results: dict | None, algorithm="bc", preset="default", see
         "hazard": {"kind": "Separation", "radius": 0.3, "safe_margin": 0.075},
         "data": {"provenance": "made up"},
     }
-    write(path / "config.json", told)
+    write(path / "config.json", config)
     if results is not None:
         write(path / "results.json", results)
         write(path / "env.json", {"python": "3.11"})
@@ -142,9 +142,9 @@ def test_a_cell_that_failed_after_an_evaluation_keeps_its_row_and_is_named(folde
 
 def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
     for task, preset in ((EXPERT, "expert"), (MEDIUM, "default")):
-        told = {preset: summary([1] * 4, [0] * 4, task), f"{preset}+plans8": summary([2] * 4, [0] * 4, task)}
+        results = {preset: summary([1] * 4, [0] * 4, task), f"{preset}+plans8": summary([2] * 4, [0] * 4, task)}
         for seed in (0, 1):
-            cell(folder, told, "omar", preset, seed, task)
+            cell(folder, results, "omar", preset, seed, task)
     board = read(folder)
     labels = {e.method.label for e in board.entries if e.algorithm == "omar"}
     assert labels == {"OMAR", "OMAR plans8"}
@@ -158,9 +158,9 @@ def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
 
 def test_fields_younger_than_a_run_do_not_set_it_apart(folder):
     steps = cell(folder, {"default": summary([1] * 4, [0] * 4)}, seed=2)
-    told = json.loads((steps / "config.json").read_text())
+    config = json.loads((steps / "config.json").read_text())
     defaults = {f.name: f.default for f in dataclasses.fields(algos.get("bc").Config)}
-    write(steps / "config.json", told | {"config": defaults | {"steps": 100}})
+    write(steps / "config.json", config | {"config": defaults | {"steps": 100}})
     assert [m.label for m in read(folder).methods if m.algorithm == "bc"] == ["BC"]
 
 
@@ -263,11 +263,11 @@ def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
     twin = cell(folder, {"default": summary([1] * 4, [0] * 4)}, mark="b2")
     with pytest.raises(UserError, match="seed-0-a1' and .*seed-0-b2' are the same cell"):
         read(folder)
-    told = json.loads((twin / "config.json").read_text())
-    write(twin / "config.json", told | {"seed": 5})
+    config = json.loads((twin / "config.json").read_text())
+    write(twin / "config.json", config | {"seed": 5})
     with pytest.raises(UserError, match="seed-0-b2/config.json' names seed 5, its folder 0"):
         read(folder)
-    write(twin / "config.json", told | {"data": {"provenance": "public"}, "config": {"steps": 1}})
+    write(twin / "config.json", config | {"data": {"provenance": "public"}, "config": {"steps": 1}})
     with pytest.raises(UserError, match=r"seed-0-b2' was trained on other data \(its provenance is public\)"):
         read(folder)
 
@@ -317,8 +317,8 @@ def test_equal_methods_share_a_place(folder):
 
 def test_settings_chosen_on_validation_stay_off_the_table(folder):
     path = folder / "cells" / EXPERT / "bc" / "seed-0-a1" / "results.json"
-    told = json.loads(path.read_text())
-    write(path, told | {"default@validation": summary([999] * 4, [0] * 4, split="validation")})
+    results = json.loads(path.read_text())
+    write(path, results | {"default@validation": summary([999] * 4, [0] * 4, split="validation")})
     assert len(read(folder).entries) == 6 and row(folder, "BC").returns == 310.0
 
 
@@ -335,8 +335,8 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
     assert second.tasks == names[2:] and [r.name for r in second.rows] == ["BC"]  # who has no result has no row
     native, quantile = aggregates(board)
     assert (native.protocol, native.tasks, quantile.tasks) == ("native", names[:2], names[2:])
-    (told,) = native.iqm_returns.values()
-    assert told[1] is None and native.return_bands == native.cost_bands == [None]
+    (iqm,) = native.iqm_returns.values()
+    assert iqm[1] is None and native.return_bands == native.cost_bands == [None]
     page = text_of(build_board(root, tmp_path / "p.html").read_text())
     assert page.count("The 2 tasks with quantile limits") == 2 and "Older revisions" in page
     assert f"{names[0]}, ICBF-Diffuser, seed 0" in page  # whose run tells no revision, so it is of the first
@@ -345,9 +345,9 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
     assert danger({"kind": "SpeedLimit", "limit": 1.026}) == "a speed above 1.026 m/s"
 
 
-def test_falls_are_told(folder, tmp_path):
-    told = summary([400] * 4, [0] * 4) | {"termination_rate": 0.75, "steps_mean": 12.0}
-    cell(folder, {"default": told}, "omar")
+def test_falls_are_shown(folder, tmp_path):
+    fallen = summary([400] * 4, [0] * 4) | {"termination_rate": 0.75, "steps_mean": 12.0}
+    cell(folder, {"default": fallen}, "omar")
     page = text_of(section_of(build_board(folder, tmp_path).read_text(), EXPERT))
     assert "ended early mean length" in page and "75.0 % 12 steps" in page
     assert "| 75.0 % |" in board_markdown(read(folder)) and "ended early" not in section_of(
@@ -377,27 +377,27 @@ def test_references_keep_their_own_numbers(folder):
 
 
 def test_aggregate_takes_methods_with_every_task(folder):
-    told = aggregate(read(folder))
+    found = aggregate(read(folder))
     bc = Method("bc", "default", "default")
-    assert told.methods == [bc] and told.seeds == {bc: (0, 1)}
-    assert {m.label: t for m, t in told.left_out.items()} == {
+    assert found.methods == [bc] and found.seeds == {bc: (0, 1)}
+    assert {m.label: t for m, t in found.left_out.items()} == {
         "ICBF-Diffuser split": [MEDIUM],
         "ICBF-Diffuser split+guarded": [MEDIUM],
     }
     scores = np.array([[300, 250], [320, 250]])
-    assert told.returns[bc] == pytest.approx((scores - LOW) / (HIGH - LOW))
-    assert told.costs[bc] == pytest.approx(np.array([[3, 0], [2, 0]]))
+    assert found.returns[bc] == pytest.approx((scores - LOW) / (HIGH - LOW))
+    assert found.costs[bc] == pytest.approx(np.array([[3, 0], [2, 0]]))
     # the middle half of the four runs: 250 and 300
-    assert told.iqm_returns[bc][0] == pytest.approx((275 - LOW) / (HIGH - LOW))
-    assert told.iqm_costs[bc][0] == pytest.approx(1.0)  # of 0, 0, 2, 3
+    assert found.iqm_returns[bc][0] == pytest.approx((275 - LOW) / (HIGH - LOW))
+    assert found.iqm_costs[bc][0] == pytest.approx(1.0)  # of 0, 0, 2, 3
     # 10 of the 16 episodes cost nothing, 4 cost three, 2 cost four
-    at = [int(np.argmin(abs(told.cost_thresholds - x))) for x in (0.0, 3.0)]
-    assert told.cost_profiles[0, at] == pytest.approx([10 / 16, 14 / 16])
-    assert told.return_profiles[0, 0] == 1.0 and told.return_profiles[0, -1] == 0.0
-    for shares, bands in ((told.return_profiles, told.return_bands), (told.cost_profiles, told.cost_bands)):
+    at = [int(np.argmin(abs(found.cost_thresholds - x))) for x in (0.0, 3.0)]
+    assert found.cost_profiles[0, at] == pytest.approx([10 / 16, 14 / 16])
+    assert found.return_profiles[0, 0] == 1.0 and found.return_profiles[0, -1] == 0.0
+    for shares, bands in ((found.return_profiles, found.return_bands), (found.cost_profiles, found.cost_bands)):
         assert (bands[0][0] <= shares[0] + 1e-12).all() and (shares[0] <= bands[0][1] + 1e-12).all()
     # at cost 0, expert has 0 of 4 and 2 of 4 episodes, medium all: drawing a seed twice gives 1/2 or 3/4
-    assert told.cost_bands[0][:, at[0]] == pytest.approx([0.5, 0.75])
+    assert found.cost_bands[0][:, at[0]] == pytest.approx([0.5, 0.75])
 
 
 def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
@@ -415,18 +415,18 @@ def test_probability_of_improvement_has_the_row_ahead(folder):
     for seed in (0, 1):
         cell(folder, {"default": summary([310] * 4, [1] * 4)}, "omar", seed=seed)
         cell(folder, {"default": summary([240] * 4, [0] * 4, MEDIUM)}, "omar", seed=seed, task=MEDIUM)
-    told = aggregate(read(folder))
-    assert [m.label for m in told.methods] == ["BC", "OMAR"]
+    found = aggregate(read(folder))
+    assert [m.label for m in found.methods] == ["BC", "OMAR"]
     # BC over OMAR: expert 300, 320 against 310 is one of two, medium 250 against 240 always
-    assert told.improves[0, 1] == pytest.approx(0.75) and told.improves[1, 0] == pytest.approx(0.25)
+    assert found.improves[0, 1] == pytest.approx(0.75) and found.improves[1, 0] == pytest.approx(0.25)
     # cost: expert 3, 2 against 1 never less; medium 0 against 0 are ties
-    assert told.cheaper[0, 1] == pytest.approx(0.25) and told.cheaper[1, 0] == pytest.approx(0.75)
+    assert found.cheaper[0, 1] == pytest.approx(0.25) and found.cheaper[1, 0] == pytest.approx(0.75)
 
 
 def test_seeds_that_some_task_lacks_do_not_count_over_tasks(folder):
     cell(folder, {"default": summary([330] * 4, [1] * 4)}, seed=2)
-    told = aggregate(read(folder))
-    assert list(told.seeds.values()) == [(0, 1)] and row(folder, "BC").seeds == (0, 1, 2)
+    found = aggregate(read(folder))
+    assert list(found.seeds.values()) == [(0, 1)] and row(folder, "BC").seeds == (0, 1, 2)
 
 
 def test_nothing_is_averaged_when_no_method_has_every_task(folder, tmp_path):
@@ -450,9 +450,9 @@ class Checker(HTMLParser):
         self.open, self.links, self.ids, self.wrong = [], [], [], []
 
     def handle_starttag(self, tag, attributes):
-        told = dict(attributes)
-        self.links += [told[k] for k in ("href", "src") if k in told]
-        self.ids += [told["id"]] if "id" in told else []
+        values = dict(attributes)
+        self.links += [values[k] for k in ("href", "src") if k in values]
+        self.ids += [values["id"]] if "id" in values else []
         if tag not in self.VOID:
             self.open.append(tag)
 
@@ -508,11 +508,11 @@ def test_page_does_not_hide_what_is_missing(folder, tmp_path):
 
 
 def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
-    told = text_of(section_of(build_board(folder, tmp_path).read_text(), "Ranking"))
-    assert told.index("BC 1.00") < told.index("ICBF-Diffuser split+guarded –")
+    text = text_of(section_of(build_board(folder, tmp_path).read_text(), "Ranking"))
+    assert text.index("BC 1.00") < text.index("ICBF-Diffuser split+guarded –")
     # the only method with every task: the mean of its ranks among such methods is 1, whatever the others did on one
-    assert "BC 1.00 1 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit" in told
-    assert "1 ★ 0.70, cost 0.25 within limit 1 of 2 seeds" in told
+    assert "BC 1.00 1 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit" in text
+    assert "1 ★ 0.70, cost 0.25 within limit 1 of 2 seeds" in text
 
 
 def test_published_values_stand_beside_ours_and_apart(folder, tmp_path):

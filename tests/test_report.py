@@ -54,7 +54,7 @@ def folder(
     name = algorithm if preset == "default" else f"{algorithm}-{preset}"
     path = root / "runs" / task / name / f"seed-{seed}"
     path.mkdir(parents=True)
-    told = {
+    config = {
         "algorithm": algorithm,
         "preset": preset,
         "config": {"steps": 4000, "history": 0} | config,
@@ -64,7 +64,7 @@ def folder(
         "seed": seed,
         "data": {"provenance": provenance, "collected": "by hand <b>", "seed": 0},
     }
-    (path / "config.json").write_text(json.dumps(told))
+    (path / "config.json").write_text(json.dumps(config))
     (path / "env.json").write_text(json.dumps({"python": "3.11", "packages": {"jax": "0.5"}}))
     rows = [{"step": s, "seconds": 1.0, "loss/denoising": 1 / s, "barrier/weight": 0.3} for s in (10, 20, 30)]
     (path / "metrics.jsonl").write_text("".join(json.dumps(r) + "\n" for r in rows))
@@ -130,9 +130,9 @@ def test_page_goes_into_a_folder(runs, tmp_path):
 
 
 def test_what_is_no_row_is_refused(runs):
-    told = json.loads((runs[1].path / "config.json").read_text())
-    write = lambda more: (runs[1].path / "config.json").write_text(json.dumps(told | more))  # noqa: E731
-    write({"data": told["data"] | {"seed": 3}})
+    config = json.loads((runs[1].path / "config.json").read_text())
+    write = lambda more: (runs[1].path / "config.json").write_text(json.dumps(config | more))  # noqa: E731
+    write({"data": config["data"] | {"seed": 3}})
     with pytest.raises(UserError, match="its seed is 3"):
         sections(runs)
     write({})
@@ -144,10 +144,10 @@ def test_what_is_no_row_is_refused(runs):
 
 
 def test_what_was_played_before_training_went_on_is_dated(runs):
-    told = json.loads((runs[0].path / "config.json").read_text())
+    config = json.loads((runs[0].path / "config.json").read_text())
     for run in runs[:2]:
-        told = json.loads((run.path / "config.json").read_text())
-        (run.path / "config.json").write_text(json.dumps(told | {"config": told["config"] | {"steps": 30}}))
+        config = json.loads((run.path / "config.json").read_text())
+        (run.path / "config.json").write_text(json.dumps(config | {"config": config["config"] | {"steps": 30}}))
     results = runs[0].results
     results["split"]["step"] = 10
     (runs[0].path / "results.json").write_text(json.dumps(results))
@@ -158,9 +158,9 @@ def test_what_was_played_before_training_went_on_is_dated(runs):
 
 
 def test_a_run_that_is_older_than_a_field_had_its_default(runs):
-    told = json.loads((runs[0].path / "config.json").read_text())
-    whole = told["config"] | {"barrier_width": ICBF.Config().barrier_width}
-    (runs[0].path / "config.json").write_text(json.dumps(told | {"config": whole}))
+    config = json.loads((runs[0].path / "config.json").read_text())
+    whole = config["config"] | {"barrier_width": ICBF.Config().barrier_width}
+    (runs[0].path / "config.json").write_text(json.dumps(config | {"config": whole}))
     (section,) = sections(runs)
     assert [r.seeds for r in section.tables["test"] if r.label == "ICBF-Diffuser split"] == [(0, 1)]
 
@@ -169,8 +169,8 @@ def test_seeds_are_pooled(runs):
     (section,) = sections(runs)
     bc, plain, chosen = section.tables["test"]
     assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+plans4"]
-    told = [r.results["split"]["per_episode"] for r in runs[:2]]
-    returns, costs = (np.array([t[k] for t in told]) for k in ("return", "cost"))
+    episodes = [r.results["split"]["per_episode"] for r in runs[:2]]
+    returns, costs = (np.array([t[k] for t in episodes]) for k in ("return", "cost"))
     assert plain.seeds == (0, 1) and plain.episodes == 40
     assert plain.returns == pytest.approx(returns.mean())
     low, high = plain.returns_interval
@@ -190,8 +190,8 @@ def test_the_commands_name_another_number_of_agents(runs):
     results["split"]["agents"] = 5
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
-    told = made.commands(section, Path("r.html"))
-    assert sum("--agents 5" in line for line in told) == 1 and not any("--agents 3" in line for line in told)
+    lines = made.commands(section, Path("r.html"))
+    assert sum("--agents 5" in line for line in lines) == 1 and not any("--agents 3" in line for line in lines)
 
 
 def test_headline_names_the_best_safe_method(runs, tmp_path):
@@ -201,8 +201,8 @@ def test_headline_names_the_best_safe_method(runs, tmp_path):
 
 
 def test_revisions_get_rows_of_their_own(runs):
-    told = json.loads((runs[1].path / "config.json").read_text())
-    (runs[1].path / "config.json").write_text(json.dumps(told | {"revision": 2}))
+    config = json.loads((runs[1].path / "config.json").read_text())
+    (runs[1].path / "config.json").write_text(json.dumps(config | {"revision": 2}))
     (section,) = sections(runs)
     rows = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
     assert rows["split [revision=1]"] == (0,) and rows["split [revision=2]"] == (1,)
@@ -217,14 +217,14 @@ def test_one_run_and_one_path_make_a_page(runs, tmp_path):
     "lost", ["cost_cvar10", "cost_safe_start_interval", "unsafe_starts", "return_interval", "split"]
 )
 def test_results_of_another_version_are_named(runs, tmp_path, lost):
-    told = runs[2].results
-    del told["default"][lost]
-    (runs[2].path / "results.json").write_text(json.dumps(told))
+    results = runs[2].results
+    del results["default"][lost]
+    (runs[2].path / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match=f"lacks '{lost}'|has split 'None'"):
         build_report(runs, tmp_path)
 
 
-def test_lists_in_configs_can_be_told(tmp_path):
+def test_lists_in_configs_are_shown(tmp_path):
     run = folder(tmp_path, "mine", "default", results={"default": result([1.0, 2.0], [0, 1])}, sizes=[64, 64])
     assert "sizes=[64, 64]" in build_report([run], tmp_path).read_text()
 
@@ -312,9 +312,9 @@ def test_players_keep_the_chosen_plan_first(runs):
 def test_many_plans_are_cut_to_the_budget(monkeypatch):
     plans = np.arange(2 * 6 * 3 * 2 * 2, dtype=float).reshape(2, 6, 3, 2, 2) / 1000
     monkeypatch.setattr(animation, "NUMBERS", 2 * 3 * 2 * 2 * 2)
-    told = animation.few(plans, np.array([5, 0]))
-    assert told["shape"] == [2, 2, 3, 2]
-    assert np.allclose(animation.unpack(told["plans"]).reshape(2, 2, 3, 2, 2)[0, 0], plans[0, 5])
+    packed = animation.few(plans, np.array([5, 0]))
+    assert packed["shape"] == [2, 2, 3, 2]
+    assert np.allclose(animation.unpack(packed["plans"]).reshape(2, 2, 3, 2, 2)[0, 0], plans[0, 5])
 
 
 def test_a_plan_is_repeated_while_it_is_followed():

@@ -54,10 +54,10 @@ def test_errors_are_quoted_as_the_code_prints_them(sayings):
 
 
 def test_the_citation_is_of_this_version():
-    told = dict(re.findall(r"^(\w+): (.*)$", (ROOT / "CITATION.cff").read_text(), re.M))
+    citation = dict(re.findall(r"^(\w+): (.*)$", (ROOT / "CITATION.cff").read_text(), re.M))
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    assert told["version"] == project["version"] == ringfence.__version__
-    assert told["license"] == project["license"]
+    assert citation["version"] == project["version"] == ringfence.__version__
+    assert citation["license"] == project["license"]
     assert f"## {ringfence.__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
 
 

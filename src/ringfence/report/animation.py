@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ringfence.datasets import registry
 from ringfence.evaluation import recordings
+from ringfence.report.pooling import Result
 from ringfence.report.table import Row, Section
 from ringfence.training.runs import Run
 
@@ -16,48 +19,61 @@ VARIANTS = 2  # per task
 NUMBERS = 20_000  # of an episode's plans; more plans than fit are left out, never the chosen one
 
 
-def variant_key(row: Row, run: Run) -> str:
-    """The variant's name in results.json, which the recording carries too."""
-    return next(result["variant"] for member, result in row.members if member == run)
+@dataclass(frozen=True)
+class Recorded:
+    """A row with the first recording of it."""
+
+    row: Row
+    run: Run
+    arrays: recordings.Recording
+    size: tuple[float, float]  # what it is chosen by: plans drawn, guidance by value
 
 
-def of_row(row: Row) -> tuple[Run, recordings.Recording] | None:
+def of_row(row: Row) -> Recorded | None:
     """The first seed of a row that has a recording."""
-    for run, _ in sorted(row.members, key=lambda m: m[0].config["seed"]):
-        arrays = recordings.read(run.path, variant_key(row, run))
+    for run, result in sorted(row.members, key=_seed):
+        arrays = recordings.read(run.path, result["variant"])
         if arrays is not None:
-            return run, arrays
+            options = row.members[0][1].get("options") or {}
+            size = (options.get("plans", 0), options.get("value_guidance", 0.0))
+            return Recorded(row, run, arrays, size)
     return None
 
 
-def players(section: Section) -> list[dict]:
+def _seed(member: tuple[Run, Result]) -> int:
+    return member[0].config["seed"]
+
+
+def players(section: Section[Row]) -> list[dict[str, Any]]:
     """At most two variants of a task: the planner with the most plans and one that draws a single plan."""
-    found = []
-    for row in section.rows:
-        if row.split == "test" and (kept := of_row(row)):
-            options = row.members[0][1].get("options") or {}
-            found.append(((options.get("plans", 0), options.get("value_guidance", 0.0)), row, *kept))
+    found = [recorded for row in section.rows if row.split == "test" and (recorded := of_row(row))]
     if not found:
         return []
-    most = max(found, key=lambda f: f[0])  # of equals the first; the flagship is last in the table, so look backwards
-    most = [f for f in found if f[0] == most[0]][-1]
-    rest = [f for f in found if f[1] is not most[1]]
-    single = [f for f in rest if f[0][0] <= 1] or rest
-    same = [f for f in single if (f[1].algorithm, f[1].preset) == (most[1].algorithm, most[1].preset)]
-    chosen = [most, *(same or single)[-1:]][:VARIANTS]
-    made = [p for _, row, run, arrays in chosen if (p := player(section, row, run, arrays))]
+    made = [p for chosen in _two(found) if (p := player(section, chosen))]
     for pair in zip(*(p["episodes"] for p in made)):  # the same resets at the same scale
-        reach = max(e["reach"] for e in pair)
-        for e in pair:
-            e["reach"] = reach
+        reach = max(episode["reach"] for episode in pair)
+        for episode in pair:
+            episode["reach"] = reach
     return made
 
 
-def films(section: Section) -> list[dict]:
+def _two(found: list[Recorded]) -> list[Recorded]:
+    """The one with the most plans; and the last one beside it, of a single plan and of its algorithm where there is
+    one. Of equals the last, since the flagship is last in the table."""
+    size = max(recorded.size for recorded in found)
+    most = [recorded for recorded in found if recorded.size == size][-1]
+    rest = [recorded for recorded in found if recorded.row is not most.row]
+    single = [recorded for recorded in rest if recorded.size[0] <= 1] or rest
+    family = (most.row.algorithm, most.row.preset)
+    same = [recorded for recorded in single if (recorded.row.algorithm, recorded.row.preset) == family]
+    return [most, *(same or single)[-1:]][:VARIANTS]
+
+
+def films(section: Section[Row]) -> list[dict[str, Any]]:
     """GIFs of robots that lie beside recordings, at most two: {label, seed, gif (base64)}."""
     found = []
     for row in section.rows:
-        for run, result in sorted(row.members, key=lambda m: m[0].config["seed"]):
+        for run, result in sorted(row.members, key=_seed):
             file = run.path / f"rollout-{result['variant']}.gif"
             if row.split == "test" and file.exists():
                 gif = base64.b64encode(file.read_bytes()).decode()
@@ -66,41 +82,50 @@ def films(section: Section) -> list[dict]:
     return found[-VARIANTS:]
 
 
-def player(section: Section, row: Row, run: Run, arrays: dict[str, np.ndarray]) -> dict | None:
+def player(section: Section[Row], recorded: Recorded) -> dict[str, Any] | None:
     """One variant's episodes, or None where the states are not those of agents on a plane with landmarks."""
-    spec, n = run.config["spec"], run.config["spec"]["n_agents"]
+    config = recorded.run.config
+    arrays = recorded.arrays
+    n = config["spec"]["n_agents"]
     states = arrays["states"][:EPISODES].astype(np.float64)
     if states.shape[-1] != 6 * n or "radius" not in section.hazard:
         return None
-    plans = tracks(arrays, spec["feature_names"], n, run.config["config"].get("history", 0))
-    arena = getattr(registry.TASKS[section.task].env, "half_width", 1.0) if section.task in registry.TASKS else 1.0
-    episodes = []
-    for e in range(len(states)):
-        places = np.abs(np.concatenate([states[e, :, : 2 * n].ravel(), states[e, 0, 4 * n :]]))
-        told = {
-            "reach": round(max(arena, float(places.max())) + 0.2, 2),  # half the width of what is shown
-            "positions": pack(states[e, :, : 2 * n]),
-            "landmarks": pack(states[e, 0, 4 * n :]),
-            "rewards": [round(float(x), 2) for x in arrays["rewards"][e]],
-            "costs": [round(float(x), 2) for x in arrays["costs"][e]],
-        }
-        if plans is not None:
-            told |= few(plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
-        episodes.append(told)
+    plans = tracks(arrays, config["spec"]["feature_names"], n, config["config"].get("history", 0))
+    env = registry.TASKS[section.task].env if section.task in registry.TASKS else None
+    arena = getattr(env, "half_width", 1.0)
     return {
-        "label": row.label,
-        "seed": run.config["seed"],
+        "label": recorded.row.label,
+        "seed": config["seed"],
         "agents": n,
         "steps": states.shape[1] - 1,
         "arena": arena,
         "radius": section.hazard["radius"] / 2,
         "contact": section.hazard["radius"],
         "total": int(plans.shape[2]) if plans is not None else 0,
-        "episodes": episodes,
+        "episodes": [_episode(arrays, states[e], plans, e, n, arena) for e in range(len(states))],
     }
 
 
-def tracks(arrays: dict[str, np.ndarray], names: list[str], n: int, history: int) -> np.ndarray | None:
+def _episode(
+    arrays: recordings.Recording, states: np.ndarray, plans: np.ndarray | None, e: int, n: int, arena: float
+) -> dict[str, Any]:
+    """The e-th episode, of states (L+1, S)."""
+    positions = states[:, : 2 * n]
+    landmarks = states[0, 4 * n :]
+    reach = np.abs(np.concatenate([positions.ravel(), landmarks])).max()
+    episode: dict[str, Any] = {
+        "reach": round(max(arena, float(reach)) + 0.2, 2),  # half the width of what is shown
+        "positions": pack(positions),
+        "landmarks": pack(landmarks),
+        "rewards": [round(float(x), 2) for x in arrays["rewards"][e]],
+        "costs": [round(float(x), 2) for x in arrays["costs"][e]],
+    }
+    if plans is not None:
+        episode |= few(plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
+    return episode
+
+
+def tracks(arrays: recordings.Recording, names: list[str], n: int, history: int) -> np.ndarray | None:
     """Plans (R, L, P, H, N, 2): positions from the present on; steps without a new plan repeat the last one."""
     if "plans" not in arrays:
         return None
@@ -118,15 +143,16 @@ def tracks(arrays: dict[str, np.ndarray], names: list[str], n: int, history: int
     return xy
 
 
-def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict:
+def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict[str, Any]:
     """An episode's plans (L, P, H, N, 2) within the budget, the chosen one first."""
-    steps, p, h, n, _ = plans.shape
-    keep = int(np.clip(NUMBERS // (steps * h * n * 2), 1, p))
+    steps, drawn, horizon, n, _ = plans.shape
+    keep = int(np.clip(NUMBERS // (steps * horizon * n * 2), 1, drawn))
     chosen = np.zeros(steps, int) if chosen is None else chosen
     chosen = np.broadcast_to(chosen.reshape(steps, -1), (steps, n))  # agents that execute apart choose apart
-    order = np.argsort(np.arange(p)[None, :, None] != chosen[:, None], axis=1, kind="stable")[:, :keep]
+    rejected = np.arange(drawn)[None, :, None] != chosen[:, None]
+    order = np.argsort(rejected, axis=1, kind="stable")[:, :keep]
     kept = np.take_along_axis(plans, order[:, :, None, :, None], 1)
-    return {"plans": pack(kept), "shape": [steps, keep, h, n]}
+    return {"plans": pack(kept), "shape": [steps, keep, horizon, n]}
 
 
 def pack(metres: np.ndarray) -> str:

@@ -9,12 +9,12 @@
   const redraws = [];
 
   function start(box) {
-    const told = JSON.parse(document.getElementById(box.dataset.source).textContent)[+box.dataset.index];
+    const recording = JSON.parse(document.getElementById(box.dataset.source).textContent)[+box.dataset.index];
     const canvas = box.querySelector("canvas"), ink = canvas.getContext("2d");
     const play = box.querySelector(".play"), scrub = box.querySelector(".scrub"), status = box.querySelector(".status");
     const episode = box.querySelector(".episode"), speed = box.querySelector(".speed"), toggle = box.querySelector(".plans");
-    const n = told.agents, steps = told.steps;
-    const read = told.episodes.map((e) => ({
+    const n = recording.agents, steps = recording.steps;
+    const read = recording.episodes.map((e) => ({
       positions: millimetres(e.positions), landmarks: millimetres(e.landmarks),
       plans: e.plans ? millimetres(e.plans) : null, shape: e.shape, reach: e.reach, rewards: e.rewards, costs: e.costs,
     }));
@@ -29,7 +29,7 @@
     function touching(points) {
       const hit = new Array(n).fill(false);
       for (let i = 0; i < n; i++) for (let j = i + 1; j < n; j++)
-        if (Math.hypot(points[i][0] - points[j][0], points[i][1] - points[j][1]) < told.contact) hit[i] = hit[j] = true;
+        if (Math.hypot(points[i][0] - points[j][0], points[i][1] - points[j][1]) < recording.contact) hit[i] = hit[j] = true;
       return hit;
     }
 
@@ -44,7 +44,7 @@
       ink.lineJoin = ink.lineCap = "round";
       ink.strokeStyle = rule;
       ink.lineWidth = 1.2 * unit;
-      ink.strokeRect(X(-told.arena), Y(told.arena), 2 * told.arena * scale, 2 * told.arena * scale);
+      ink.strokeRect(X(-recording.arena), Y(recording.arena), 2 * recording.arena * scale, 2 * recording.arena * scale);
       ink.strokeStyle = dark;
       ink.lineWidth = 2 * unit;
       for (let k = 0; k < e.landmarks.length; k += 2) {
@@ -70,7 +70,7 @@
       for (let i = 0; i < n; i++) {  // bodies
         const colour = hit[i] ? danger : colours[i % 7];
         ink.beginPath();
-        ink.arc(X(points[i][0]), Y(points[i][1]), told.radius * scale, 0, 2 * Math.PI);
+        ink.arc(X(points[i][0]), Y(points[i][1]), recording.radius * scale, 0, 2 * Math.PI);
         ink.globalAlpha = hit[i] ? 0.5 : 0.22;
         ink.fillStyle = colour;
         ink.fill();

@@ -86,8 +86,8 @@ def animate(env: Env, states: np.ndarray, costs: np.ndarray, out: str | Path) ->
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
         file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
         kind = f"{type(env).__module__}:{type(env).__qualname__}"
-        told = json.dumps([kind, dataclasses.asdict(env)])
-        np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=told)
+        made_of = json.dumps([kind, dataclasses.asdict(env)])
+        np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=made_of)
         made = _run([sys.executable, "-m", "ringfence.report.video", str(file), str(picture)], name)
         if made.returncode:
             said = (made.stderr.strip().splitlines() or ["nothing"])[-1]
