@@ -68,8 +68,8 @@ class Ahead(Barrier):
 
 def by_value(world: World) -> World:
     """V in the place of ℓ, in the margin of ℓ."""
-    told = world.barrier
-    return eqx.tree_at(lambda w: w.barrier, world, Ahead(**{f.name: getattr(told, f.name) for f in fields(told)}))
+    barrier = world.barrier
+    return eqx.tree_at(lambda w: w.barrier, world, Ahead(**{f.name: getattr(barrier, f.name) for f in fields(barrier)}))
 
 
 def by_simulator(world: World) -> World:
@@ -192,9 +192,9 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
             row |= {"return": found["return_mean"], "cost": found["cost_mean"]}
             row |= {"infeasible_rate": found["infeasible_rate"]}
             for key in ("return", "cost"):
-                told = statistics.paired_test(*(r["per_episode"][key] for r in (found, usual)))
-                row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), told["interval"]))
-                row |= {f"more_{key}": told["difference"], f"p_{key}": told["p"]}
+                test = statistics.paired_test(*(r["per_episode"][key] for r in (found, usual)))
+                row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), test["interval"]))
+                row |= {f"more_{key}": test["difference"], f"p_{key}": test["p"]}
             row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
             print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
             if way not in there:
@@ -215,8 +215,8 @@ def table(rows: list[dict]) -> str:
 
     def more(r: dict, key: str) -> str:
         mean, low, high = (float(r[f"more_{key}{x}"]) for x in ("", "_low", "_high"))
-        told = f"{mean:+.3g} [{low:.3g}, {high:.3g}]" if mean or low or high else "0"
-        return f"**{told}**" if r[f"holm_{key}"] < 0.05 and not low <= 0 <= high else told
+        text = f"{mean:+.3g} [{low:.3g}, {high:.3g}]" if mean or low or high else "0"
+        return f"**{text}**" if r[f"holm_{key}"] < 0.05 and not low <= 0 <= high else text
 
     out = []
     for study in dict.fromkeys((r["task"], r["proposal"], r["guard"]) for r in rows):

@@ -162,8 +162,8 @@ def main() -> None:
 def cell(suite: str, task: str, row: Row, keys: tuple[str, str], digits: tuple[int, int]) -> tuple[str, int]:
     """Two means of a row on a task, as words, and of how many seeds."""
     here = variant(task, row)
-    told = [(mean(suite, task, here, key), n) for key, n in zip(keys, digits)]
-    words = "–" if told[0][0] is None else " / ".join(f"{value:z.{n}f}" for value, n in told)
+    means = [(mean(suite, task, here, key), n) for key, n in zip(keys, digits)]
+    words = "–" if means[0][0] is None else " / ".join(f"{value:z.{n}f}" for value, n in means)
     return words, len(of(suite, task, here))
 
 
@@ -174,15 +174,15 @@ def crossed(suite: str) -> str:
         for guard, ending in GUARDS.items():
             row, cells = (algorithm, plain + ending), []
             for task in names:
-                told, seeds = cell(suite, task, row, ("return_norm", "cost_safe_start"), (2, 3))
-                cells.append((told, seeds if plain != "reference" else 0))
-            if any(told != "–" for told, _ in cells):
+                text, seeds = cell(suite, task, row, ("return_norm", "cost_safe_start"), (2, 3))
+                cells.append((text, seeds if plain != "reference" else 0))
+            if any(text != "–" for text, _ in cells):
                 lines.append(([words, sees, guard if plain != "reference" else ""], cells))
     usual = [Counter(cells[i][1] for _, cells in lines if cells[i][1]).most_common(1)[0][0] for i in range(len(names))]
     heads = [f"{name.partition('-')[2]} [{seeds}]" for name, seeds in zip(names, usual)]
     out = ["| " + " | ".join(["proposal", "sees", "guard", *heads]) + " |", "|---" * (3 + len(names)) + "|"]
     for about, cells in lines:
-        marked = [told + (f" [{n}]" if n and n != seeds else "") for (told, n), seeds in zip(cells, usual)]
+        marked = [text + (f" [{n}]" if n and n != seeds else "") for (text, n), seeds in zip(cells, usual)]
         out.append("| " + " | ".join([*about, *marked]) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])
 
@@ -213,8 +213,8 @@ def robots(suite: str) -> str:
     for words, row in ROBOTS.items():
         cells = []
         for task in names:
-            told, seeds = cell(suite, task, row, ("return_mean", "cost_mean"), (0, 1))
-            cells.append(told + (f" [{seeds}]" if seeds not in (0, 5) else ""))
+            text, seeds = cell(suite, task, row, ("return_mean", "cost_mean"), (0, 1))
+            cells.append(text + (f" [{seeds}]" if seeds not in (0, 5) else ""))
         out.append(f"| {words} | " + " | ".join(cells) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, else of five."])
 
@@ -242,8 +242,8 @@ def questions(suite: str) -> str:
     for q, key, ds in answers(suite):
         if not ds:
             continue
-        told = {d.task: d for d in ds}
-        cells = [shown(told[n], key) if n in told else "–" for n in names]
+        by_task = {d.task: d for d in ds}
+        cells = [shown(by_task[n], key) if n in by_task else "–" for n in names]
         out.append(f"| {q.words} | {'return' if key == 'return' else 'cost'} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
@@ -256,10 +256,10 @@ def counted(suite: str) -> str:
             continue
         sides = [[f"`{d.task}` {d.mean:+.3g}" for d in ds if d.holds and d.mean * sign > 0] for sign in (1, -1)]
         listed = [f": {', '.join(side)}" if len(side) <= 6 else "" for side in sides]
-        told = [f"**{len(side)}**{names}" if side else "0" for side, names in zip(sides, listed)]
+        counts = [f"**{len(side)}**{names}" if side else "0" for side, names in zip(sides, listed)]
         seeds = sorted({len(d.seeds) for d in ds})
         some = "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))
-        out.append(f"| {q.words} | {key} | {len(ds)} | {some} | {told[0]} | {told[1]} |")
+        out.append(f"| {q.words} | {key} | {len(ds)} | {some} | {counts[0]} | {counts[1]} |")
     return "\n".join(out)
 
 
@@ -272,10 +272,10 @@ def hours(suites: tuple[str, ...]) -> str:
         unpack(RESULTS / suite)
         took = defaultdict(list)
         for file in sorted((RESULTS / suite / "cells").glob("*/*/*/status.json")):
-            told, name = json.loads(file.read_text()), file.parent.parent.name
-            if told["state"] == "done":
-                played = told.get("eval_seconds", 0.0)
-                took[name, bool(registry.twin(file.parts[-4]))].append(told.get("train_seconds", 0.0) + played)
+            status, name = json.loads(file.read_text()), file.parent.parent.name
+            if status["state"] == "done":
+                played = status.get("eval_seconds", 0.0)
+                took[name, bool(registry.twin(file.parts[-4]))].append(status.get("train_seconds", 0.0) + played)
                 took[name, "played"].append(played)
         made = [seconds for (_, how), times in took.items() if how != "played" for seconds in times]
         cells = make_grid(suite, RESULTS / suite, seeds=5).cells

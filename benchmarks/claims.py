@@ -48,8 +48,8 @@ def tested(row, twin, key: str, verdict: Callable[[list], bool]) -> Callable[[],
 
     def check():
         found = next(ds for q, k, ds in answers("guards") if q == asked(row, twin) and k == key)
-        told = ", ".join(f"{d.mean:+.3g}{'' if d.holds else ' (chance)'}" for d in found)
-        return len(found) == 4 and verdict(found), f"{key} {told}; Wilcoxon over resets, Holm"
+        differences = ", ".join(f"{d.mean:+.3g}{'' if d.holds else ' (chance)'}" for d in found)
+        return len(found) == 4 and verdict(found), f"{key} {differences}; Wilcoxon over resets, Holm"
 
     return check
 
@@ -62,8 +62,8 @@ def on_robots(row, twin, more: int, less: int) -> Callable[[], tuple[bool, str]]
         answered = answers("guards-mujoco", OF_ROBOTS)
         found = next(ds for q, key, ds in answered if (q.row, q.twin) == (row, twin) and key == "return")
         sides = [[f"{d.task} {d.mean:+.0f}" for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1)]
-        told = "; ".join(f"{words}: {', '.join(side) or 'none'}" for words, side in zip(("more", "less"), sides))
-        return (len(found), *map(len, sides)) == (9, more, less), f"{told}; {len(found[0].seeds)} to " + (
+        text = "; ".join(f"{words}: {', '.join(side) or 'none'}" for words, side in zip(("more", "less"), sides))
+        return (len(found), *map(len, sides)) == (9, more, less), f"{text}; {len(found[0].seeds)} to " + (
             f"{max(len(d.seeds) for d in found)} seeds"
         )
 
@@ -101,8 +101,8 @@ def shielded_all() -> tuple[bool, str]:
             left.append(mean("guards", task, (algorithm, variant), "cost_safe_start"))
             both = set(runs) & set(alone)
             lost.append(np.mean([alone[s]["return_norm"] - runs[s]["return_norm"] for s in both]))
-    told = f"{len(left)} proposals and tiers: at most {max(left):.3f} cost left, {max(lost):.3f} normalised return lost"
-    return max(left) <= 0.03 and max(lost) <= 0.02, told
+    text = f"{len(left)} proposals and tiers: at most {max(left):.3f} cost left, {max(lost):.3f} normalised return lost"
+    return max(left) <= 0.03 and max(lost) <= 0.02, text
 
 
 def same_safety() -> tuple[bool, str]:
@@ -171,8 +171,8 @@ def one_barrier_loses() -> tuple[bool, str]:
     """The bound of a barrier for each lies below what a guard's absence has, and that below one barrier for both."""
     none, one, each = (rows_of("constraints.csv", guard=g, barriers=b)[0] for g, b in TWO)
     contact = [float(r["contact"]) for r in (none, one, each)]
-    told = " / ".join(f"{100 * c:.1f} %" for c in contact) + " of episodes without a guard, with one, with each"
-    return contact[1] > float(none["contact_bound"]) and contact[2] == 0, told
+    text = " / ".join(f"{100 * c:.1f} %" for c in contact) + " of episodes without a guard, with one, with each"
+    return contact[1] > float(none["contact_bound"]) and contact[2] == 0, text
 
 
 TWO = (("none", ""), ("shield", "one"), ("shield", "each"))
@@ -185,10 +185,10 @@ def brakes_in_time() -> tuple[bool, str]:
         float(rows_of("yard.csv", method=who, options=how, **ask)[0]["contact"])
         for who, how in (("cloning", "terminal_value=False"), ("blind", "terminal_value=False"), ("blind", ""))
     )
-    told = (
+    text = (
         f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * blind:.3g} % of the blind; V: {100 * seen:.2g} %"
     )
-    return clone <= 0.005 and blind > 0.5 and seen <= 0.01, told
+    return clone <= 0.005 and blind > 0.5 and seen <= 0.01, text
 
 
 def learned_sees_more() -> tuple[bool, str]:
@@ -214,8 +214,8 @@ def as_safe_by_v() -> tuple[bool, str]:
         mean("crossing-guards", "crossing-hasty", ("bc", name + more), "violation_rate")
         for more in ("+rows1+futureFalse", "+rows3+futureFalse", "+rows15+futureFalse", "+rows1", "")
     ]
-    told = ", ".join(f"{100 * s:.3g} %" for s in shares)
-    return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {told} of episodes"
+    text = ", ".join(f"{100 * s:.3g} %" for s in shares)
+    return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {text} of episodes"
 
 
 def told_clones_earn() -> tuple[bool, str]:
@@ -223,8 +223,8 @@ def told_clones_earn() -> tuple[bool, str]:
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
     better = [difference(suite, task, ("bc-return", key), twin, "return") for twin in (("bc", key), CERTIFICATES)]
     touched = mean(suite, task, ("bc-return", key), "violation_rate")
-    told = ", ".join(f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})" for d in better)
-    return touched == 0 and all(d.low > 0 for d in better), f"{told} than cloning and than certificates; contact in 0 %"
+    text = ", ".join(f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})" for d in better)
+    return touched == 0 and all(d.low > 0 for d in better), f"{text} than cloning and than certificates; contact in 0 %"
 
 
 CERTIFICATES = ("certificates", "reference")
@@ -238,10 +238,10 @@ def full_is_safe() -> tuple[bool, str]:
     cost = difference(suite, task, ("bc", key), ("bc", wide), "cost")
     share = more.mean / mean(suite, task, ("bc", "default+shield-learned"), "return_mean")
     touched = mean(suite, task, ("bc", key), "violation_rate")
-    told = (
+    text = (
         f"contact in {100 * touched:g} %, {100 * share:.0f} % more; with one margin, anywhere {-cost.mean:+.2g} steps"
     )
-    return touched == 0 and 0.23 < share < 0.27 and cost.high < 0 and cost.p < 0.001, told
+    return touched == 0 and 0.23 < share < 0.27 and cost.high < 0 and cost.p < 0.001, text
 
 
 def limits_learned() -> tuple[bool, str]:
@@ -260,16 +260,16 @@ def guards_price() -> tuple[bool, str]:
     for task in ("simple_spread-expert", "simple_spread-medium-replay", "crossing-hasty"):
         of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, method="cloning, guarded")}
         shares[task] = float(of["1.0"]["return"]) / float(of["-1.0"]["return"]), float(of["1.0"]["cost"])
-    told = ", ".join(f"{task} {100 * share:.1f} % at {cost:g}" for task, (share, cost) in shares.items())
-    return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), told
+    text = ", ".join(f"{task} {100 * share:.1f} % at {cost:g}" for task, (share, cost) in shares.items())
+    return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), text
 
 
 def diffusion_on_crossing() -> tuple[bool, str]:
     """MADIFF less the actor that is told the same return: alone the interval is above 0, under the shield around it."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
     both = [difference(suite, task, ("madiff", v), ("bc-return", v), "return") for v in ("default", key)]
-    told = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
-    return both[0].low > 0 and both[1].low <= 0 <= both[1].high, f"alone and under the shield {told}"
+    text = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
+    return both[0].low > 0 and both[1].low <= 0 <= both[1].high, f"alone and under the shield {text}"
 
 
 def no_size_touches() -> tuple[bool, str]:
@@ -285,33 +285,33 @@ def has_to_have_seen() -> tuple[bool, str]:
     few, many = (
         [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight blind")
     )
-    told = " / ".join(f"{100 * x:.3g} %" for x in (*few, *many))
-    return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {told} of episodes"
+    text = " / ".join(f"{100 * x:.3g} %" for x in (*few, *many))
+    return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {text} of episodes"
 
 
 def error_costs_nothing() -> tuple[bool, str]:
     """The simulator itself as the World's dynamics: intervals of return and cost reach 0 under shield and `full`."""
     rows = rows_of("ablations.csv", way="the true dynamics")
-    told = "; ".join(
+    text = "; ".join(
         f"{r['guard']} {r['more_return']} ({r['more_return_low']} to {r['more_return_high']})" for r in rows
     )
     reach = [float(r[f"more_{k}_low"]) <= 0 <= float(r[f"more_{k}_high"]) for r in rows for k in ("return", "cost")]
-    return len(rows) == 2 and all(reach), f"return {told}"
+    return len(rows) == 2 and all(reach), f"return {text}"
 
 
 def by_value_alone() -> tuple[bool, str]:
     """V in the place of ℓ: as safe on Crossing, not on Simple Spread, and less return on the robot."""
     spread, crossing, robot = (r for r in adjusted(rows_of("ablations.csv")) if r["way"] == "by V alone")
-    told = f"cost {spread['more_cost']} more, {crossing['cost']}; return {robot['more_return']}"
+    text = f"cost {spread['more_cost']} more, {crossing['cost']}; return {robot['more_return']}"
     worse = float(spread["more_cost_low"]) > 0 and spread["holm_cost"] < LEVEL
-    return worse and float(crossing["cost"]) == 0 and robot["holm_return"] < LEVEL, told
+    return worse and float(crossing["cost"]) == 0 and robot["holm_return"] < LEVEL, text
 
 
 def guess_is_worth() -> tuple[bool, str]:
     """Own sight without its guess earns less on medium-replay, under `full` and under a shield."""
     _, *mixed = (r for r in adjusted(rows_of("ablations.csv")) if r["way"] == "foreseen by the own action alone")
-    told = ", ".join(f"{r['more_return']} (Holm p {r['holm_return']:.2g})" for r in mixed)
-    return all(float(r["more_return_high"]) < 0 and r["holm_return"] < LEVEL for r in mixed), told
+    text = ", ".join(f"{r['more_return']} (Holm p {r['holm_return']:.2g})" for r in mixed)
+    return all(float(r["more_return_high"]) < 0 and r["holm_return"] < LEVEL for r in mixed), text
 
 
 def of_irsim(words: str) -> list[dict[str, str]]:

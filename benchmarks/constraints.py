@@ -36,9 +36,9 @@ class Strict(yard.Yard):
     """The yard, which names what its costs are of."""
 
     def step(self, actions):
-        seen, *told, infos = super().step(actions)
+        seen, *rest, infos = super().step(actions)
         too_fast = float(fast(np.stack(list(seen.values()))))
-        return seen, *told, {a: {"cost": {"contact": i["cost"], "fast": too_fast}} for a, i in infos.items()}
+        return seen, *rest, {a: {"cost": {"contact": i["cost"], "fast": too_fast}} for a, i in infos.items()}
 
 
 def stores() -> tuple[EpisodeStore, EpisodeStore]:

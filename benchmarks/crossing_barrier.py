@@ -29,8 +29,8 @@ def main() -> None:
     names, line = list(world.map.names), np.linspace(-REACH, REACH, FINE)
     x, y = np.meshgrid(line, line)
     figure, rows = plt.subplots(2, len(SPEEDS), figsize=(9, 6.2), sharex=True, sharey=True, layout="constrained")
-    told = ("ℓ: touching now", "V: will touch, whatever one does")
-    for axes, score, what in zip(rows, (lambda s: world.barrier.of_steps(s, s), world.barrier.ahead), told):
+    words = ("ℓ: touching now", "V: will touch, whatever one does")
+    for axes, score, what in zip(rows, (lambda s: world.barrier.of_steps(s, s), world.barrier.ahead), words):
         for axis, speed in zip(axes, SPEEDS):
             seen = np.zeros((x.size, 1, len(names)), np.float32)
             for name, value in {

@@ -83,9 +83,9 @@ def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Differen
     if key == "cost_safe_start":
         fine = ~np.array(ours[seeds[0]]["per_episode"]["unsafe_start"], bool)
         d = d[:, fine]
-    told = statistics.paired_test(d.mean(0), np.zeros(d.shape[1]))
-    low, high = statistics.mean_of_runs(d) if len(seeds) > 1 else told["interval"]
-    return Difference(task, seeds, float(d.mean()), low, high, told["p"])
+    test = statistics.paired_test(d.mean(0), np.zeros(d.shape[1]))
+    low, high = statistics.mean_of_runs(d) if len(seeds) > 1 else test["interval"]
+    return Difference(task, seeds, float(d.mean()), low, high, test["p"])
 
 
 def family(found: list[Difference]) -> list[Difference]:

@@ -34,14 +34,15 @@ def main() -> None:
         parser.add_argument(side, type=Path, help="run folder with a recording")
         parser.add_argument(f"{side}_variant", help="as results.json names it")
     parser.add_argument("--out", type=Path, default=Path("docs/images/rollout.gif"))
-    told = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        (left, shown), (right, _) = half(Run(told.left), told.left_variant), half(Run(told.right), told.right_variant)
+        left, shown = half(Run(arguments.left), arguments.left_variant)
+        right, _ = half(Run(arguments.right), arguments.right_variant)
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
     films = video.with_one_palette([pair(*frames) for frames in zip(left, right)])
-    films[0].save(told.out, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
-    print(told.out, f"{told.out.stat().st_size / 1e6:.1f} MB")
+    films[0].save(arguments.out, save_all=True, append_images=films[1:], duration=shown, loop=0, optimize=True)
+    print(arguments.out, f"{arguments.out.stat().st_size / 1e6:.1f} MB")
 
 
 def half(run: Run, variant: str) -> tuple[list[Image.Image], int]:

@@ -88,9 +88,9 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
             if value == "alone":
                 _play(name, GUARDED[algorithm], "none", value, run, out, **how)
                 continue
-            told = {"guard": "adapt", "rate": value / 2000} if task.protocol else {"guard": "shield", "margin": value}
-            told |= {"danger": "learned", "world": worlds.fit(store)}
-            _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **told)
+            guard = {"guard": "adapt", "rate": value / 2000} if task.protocol else {"guard": "shield", "margin": value}
+            guard |= {"danger": "learned", "world": worlds.fit(store)}
+            _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **guard)
 
 
 def _missing(name: str, method: str, values: tuple, out: Path) -> list:
@@ -112,10 +112,10 @@ def _play(name: str, method: str, knob: str, value, run, out: Path, **how) -> No
 
 def table(rows: list[dict]) -> str:
     """Every point of the picture."""
-    out = ["| task | method | told | return | cost |", "|---|---|---|---|---|"]
+    out = ["| task | method | setting | return | cost |", "|---|---|---|---|---|"]
     for r in sorted(rows, key=lambda r: (list(LIMITS).index(r["task"]), r["method"])):
-        told = "nothing" if r["knob"] == "none" else f"{r['knob']} {float(r['value']):g}"
-        out.append(f"| `{r['task']}` | {r['method']} | {told} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
+        setting = "nothing" if r["knob"] == "none" else f"{r['knob']} {float(r['value']):g}"
+        out.append(f"| `{r['task']}` | {r['method']} | {setting} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
     return "\n".join(out)
 
 

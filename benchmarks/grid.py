@@ -37,10 +37,10 @@ def grid_of(out: Path, tasks, algorithms, seeds, episodes, steps=None):
 
 
 def command(out: Path, tasks, algorithms, seeds, episodes, steps=None) -> list[str]:
-    told = ["--tasks", *tasks, "--algorithms", *algorithms, "--seeds", str(seeds), "--episodes", str(episodes)]
-    told += [] if steps is None else ["--steps", str(steps)]
+    chosen = ["--tasks", *tasks, "--algorithms", *algorithms, "--seeds", str(seeds), "--episodes", str(episodes)]
+    chosen += [] if steps is None else ["--steps", str(steps)]
     start = [sys.executable, "-c", "from ringfence.cli.app import main; main()", "bench", "simple_spread"]
-    return [*start, *told, "--workers", "1", "--out", str(out)]
+    return [*start, *chosen, "--workers", "1", "--out", str(out)]
 
 
 def prepared(folder: str, **what):
@@ -58,8 +58,8 @@ def overhead() -> list[dict]:
         begun = time.perf_counter()
         subprocess.run(command(grid.out, **WORK), check=True, capture_output=True)
         wall = time.perf_counter() - begun
-        told = [c.status(grid.out) for c in grid.cells]
-        work = sum(s["train_seconds"] + s["eval_seconds"] for s in told)
+        statuses = [c.status(grid.out) for c in grid.cells]
+        work = sum(s["train_seconds"] + s["eval_seconds"] for s in statuses)
     return [
         {"name": "grid of 6 cells on one worker, wall clock", "value": wall, "unit": "s"},
         {"name": "in training and evaluation", "value": work, "unit": "s"},

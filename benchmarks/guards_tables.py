@@ -104,8 +104,8 @@ def table(suite: str, columns: dict[str, Row], cell) -> str:
         for words, row in columns.items()
     }
     seeds = {w: {len(rows) for (_, words), rows in found.items() if words == w and rows} for w in columns}
-    told = [w + (f" ({max(seeds[w])} seeds)" if len(seeds[w]) == 1 and max(seeds[w]) > 1 else "") for w in columns]
-    out = ["| | " + " | ".join(told) + " |", "|---" * (1 + len(columns)) + "|"]
+    heads = [w + (f" ({max(seeds[w])} seeds)" if len(seeds[w]) == 1 and max(seeds[w]) > 1 else "") for w in columns]
+    out = ["| | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
     for task in tasks_of(suite):
         cells = []
         for words in columns:
@@ -127,8 +127,8 @@ def short(rows: list[dict]) -> str:
 
 def long(rows: list[dict]) -> str:
     fell = mean(rows, "termination_rate")
-    told = f"{mean(rows, 'return_mean'):.0f} / {mean(rows, 'cost_mean'):.1f}"
-    return told + (f" ({100 * fell:.0f} % fall)" if fell else "")
+    text = f"{mean(rows, 'return_mean'):.0f} / {mean(rows, 'cost_mean'):.1f}"
+    return text + (f" ({100 * fell:.0f} % fall)" if fell else "")
 
 
 def crossing(suite: str, named: dict[str, str]) -> str:

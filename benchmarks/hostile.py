@@ -85,7 +85,7 @@ Case = tuple[str, Callable, Callable]  # what was done, reading it, and whether 
 
 
 def count(cases: Iterator[Case], place: Path) -> list[int]:
-    told, there = Counter(), None
+    counts, there = Counter(), None
     for what, read, same in cases:
         there = there or set(place.rglob("*"))
         signal.alarm(SECONDS)
@@ -101,10 +101,10 @@ def count(cases: Iterator[Case], place: Path) -> list[int]:
             print(f"{what}: {type(error).__name__}: {error}", file=sys.stderr)
         finally:
             signal.alarm(0)
-        told[kind] += 1
-        told["tried"] += 1
-    told["left"] = len({p for p in set(place.rglob("*")) - there if p.name.endswith(".part") or p.name == "victim"})
-    return [told[k] for k in ("tried", "refused", "unchanged", "traceback", "believed", "hang", "left")]
+        counts[kind] += 1
+        counts["tried"] += 1
+    counts["left"] = len({p for p in set(place.rglob("*")) - there if p.name.endswith(".part") or p.name == "victim"})
+    return [counts[k] for k in ("tried", "refused", "unchanged", "traceback", "believed", "hang", "left")]
 
 
 def always(_) -> bool:
@@ -138,8 +138,8 @@ def stores(place: Path, times: int) -> Iterator[Case]:
 
 
 def checkpoints(place: Path, times: int) -> Iterator[Case]:
-    told = {"view": "decentralized", "steps": 4, "width": 16}
-    run = loop.train("bc", corpus.small_store(), out=place / "runs", changes=told, quiet=True)[0]
+    changes = {"view": "decentralized", "steps": 4, "width": 16}
+    run = loop.train("bc", corpus.small_store(), out=place / "runs", changes=changes, quiet=True)[0]
     for _, old in run.checkpoints()[:-1]:
         old.unlink()
     file = run.checkpoints()[-1][1]

@@ -51,14 +51,14 @@ def main() -> None:
     done = {tuple(r[k] for k in HEAD[:4]) for r in rows}
     for cell in sorted((args.folder / "cells").glob("*/*/seed-*")) if args.folder else []:
         run = Run(cell)
-        told = run.config
-        if (args.tasks and told["task"] not in args.tasks) or told["seed"] >= args.seeds or not run.checkpoints():
+        config = run.config
+        if (args.tasks and config["task"] not in args.tasks) or config["seed"] >= args.seeds or not run.checkpoints():
             continue
-        task = registry.get(told["task"])
+        task = registry.get(config["task"])
         store = make(task, EPISODES * task.env.episode_length, LOGS_SEED)[0]
         world = worlds.fit(store, seed=1)
         for variant, result in run.results.items():
-            key = (told["task"], told["algorithm"], variant, str(told["seed"]))
+            key = (config["task"], config["algorithm"], variant, str(config["seed"]))
             if args.without and args.without in variant:
                 continue
             if key in done or (result.get("execution") == "decentralized" and not task.alike):

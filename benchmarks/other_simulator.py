@@ -170,8 +170,8 @@ def main() -> None:
     rows = [r for r in read(OUT) if a.of and r["learned from"] not in mine]
 
     def played(words: str, run, world, n: int, **guard) -> None:
-        told = {} if not guard else {"world": world} | guard
-        r = play(run, lambda: IrSim(n), episodes=a.episodes, agents=n, at_once=50, **told)
+        guarded = {} if not guard else {"world": world} | guard
+        r = play(run, lambda: IrSim(n), episodes=a.episodes, agents=n, at_once=50, **guarded)
         row = {"learned from": words, "agents": n, "guard": guard.get("guard", "none"), "seed": a.seed}
         row |= {"options": ", ".join(f"{k}={v}" for k, v in guard.items() if k != "guard")}
         row |= {"episodes": a.episodes, "return": round(r["return_mean"], 3), "steps with contact": r["cost_mean"]}

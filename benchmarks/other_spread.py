@@ -41,8 +41,8 @@ def main() -> None:
             run = zoo.get(name, there)
             for place, make in PLACES.items():
                 for how in ({}, {"guard": "shield"}):
-                    told = ringfence.play(run, make, episodes=EPISODES, at_once=100, **how)
-                    rows.append(row(name, "OMAR's rules", place, told))
+                    result = ringfence.play(run, make, episodes=EPISODES, at_once=100, **how)
+                    rows.append(row(name, "OMAR's rules", place, result))
         pilot = ringfence.Controller(zoo.get("simple_spread-expert/bc", there))
         rng = np.random.default_rng(0)
         unsure = lambda seen, state: np.clip(pilot.act(seen, state) + 0.5 * rng.normal(size=(3, 2)), -1, 1)  # noqa: E731
@@ -51,26 +51,26 @@ def main() -> None:
         world = ringfence.fit(store)
         run = ringfence.train("bc", store, out=there, quiet=True)[0]
         for how in ({}, {"guard": "shield", "world": world}):
-            told = ringfence.play(run, Spread, episodes=EPISODES, at_once=100, **how)
-            rows.append(row("bc, learned of logs recorded there", "mpe2", "mpe2", told))
+            result = ringfence.play(run, Spread, episodes=EPISODES, at_once=100, **how)
+            rows.append(row("bc, learned of logs recorded there", "mpe2", "mpe2", result))
     write(OUT, rows)
     put("docs/evaluation.md", "mpe2", table(rows))
 
 
-def row(policy: str, logs: str, place: str, told: dict) -> dict:
+def row(policy: str, logs: str, place: str, result: dict) -> dict:
     found = {
         "policy": policy,
         "logs": logs,
         "place": place,
-        "guard": told["guard"],
-        "episodes": told["episodes"],
-        "return": round(told["return_mean"], 3),
-        "low": round(told["return_interval"][0], 3),
-        "high": round(told["return_interval"][1], 3),
-        "cost": round(told["cost_mean"], 4),
-        "cost_safe_start": round(told["cost_safe_start"], 4),
-        "violation_rate": round(told["violation_rate"], 4),
-        "infeasible_rate": round(told.get("infeasible_rate", 0.0), 4),
+        "guard": result["guard"],
+        "episodes": result["episodes"],
+        "return": round(result["return_mean"], 3),
+        "low": round(result["return_interval"][0], 3),
+        "high": round(result["return_interval"][1], 3),
+        "cost": round(result["cost_mean"], 4),
+        "cost_safe_start": round(result["cost_safe_start"], 4),
+        "violation_rate": round(result["violation_rate"], 4),
+        "infeasible_rate": round(result.get("infeasible_rate", 0.0), 4),
     }
     print(found, flush=True)
     return found

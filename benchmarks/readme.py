@@ -257,10 +257,10 @@ def searched(file: Path, task: str) -> str:
     lines = ["| algorithm | setting | changes | return | norm. return | cost |", "|---|---|---|---|---|---|"]
     rows = [r for r in stored.table(file) if r["task"] == task]
     for r in sorted(rows, key=lambda r: (r["algorithm"], int(r["setting"]))):
-        told = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
+        changes = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
         name, gain, cost = f"{r['algorithm']} {r['preset']}".strip(), float(r["return"]), float(r["cost"])
         norm = float(r["return_norm"])
-        lines.append(f"| `{name}` | {r['setting']} | {told} | {gain:.0f} | {norm:.3f} | {cost:.2f} |")
+        lines.append(f"| `{name}` | {r['setting']} | {changes} | {gain:.0f} | {norm:.3f} | {cost:.2f} |")
     return "\n".join(lines)
 
 
@@ -271,15 +271,15 @@ def spent(folder: Path) -> str:
     seconds = defaultdict(list)
     unpack(folder)
     for file in sorted((folder / "cells").glob("*/*/*/status.json")):
-        told, name = json.loads(file.read_text()), file.parent.parent.name
-        if told["state"] != "done":
+        status, name = json.loads(file.read_text()), file.parent.parent.name
+        if status["state"] != "done":
             continue
-        if "adopted" in told or (registry.twin(file.parts[-4]) and not _reads_danger(file.parent)):
-            trained, name = told.get("train_seconds", 0.0), f"{name}, trained before"
+        if "adopted" in status or (registry.twin(file.parts[-4]) and not _reads_danger(file.parent)):
+            trained, name = status.get("train_seconds", 0.0), f"{name}, trained before"
         else:  # of a cell that was played again the last attempt trained nothing
             results = json.loads((file.parent / "results.json").read_text())
-            trained = max([told.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
-        seconds[name].append(trained + told.get("eval_seconds", 0.0))
+            trained = max([status.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
+        seconds[name].append(trained + status.get("eval_seconds", 0.0))
     lines = ["| cells | number | mean s | longest s |", "|---|---:|---:|---:|"]
     lines += [f"| `{k}` | {len(v)} | {np.mean(v):.0f} | {max(v):.0f} |" for k, v in sorted(seconds.items())]
     total = sum(map(sum, seconds.values())) / 3600
@@ -289,10 +289,10 @@ def spent(folder: Path) -> str:
 
 
 def _reads_danger(cell: Path) -> bool:
-    told = json.loads((cell / "config.json").read_text())
-    algorithm = algos.get(told["algorithm"])
-    known = {k: v for k, v in told["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
-    return algorithm.reads(build_config(algorithm.Config, known, told["algorithm"])) != "nothing"
+    config = json.loads((cell / "config.json").read_text())
+    algorithm = algos.get(config["algorithm"])
+    known = {k: v for k, v in config["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
+    return algorithm.reads(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"
 
 
 def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:

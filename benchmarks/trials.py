@@ -31,16 +31,16 @@ def differing(values: dict, defaults) -> str:
 
 def rows_of(run: Run) -> list[dict]:
     """Evaluations of a run on validation resets."""
-    told, found = run.config, []
-    config = differing(told["config"], algos.get(told["algorithm"]).Config())
+    settings, found = run.config, []
+    config = differing(settings["config"], algos.get(settings["algorithm"]).Config())
     for r in run.results.values():
         if r["split"] == "validation":
             found.append(
                 {
                     "task": r["task"],
-                    "transitions": told["data"].get("transitions"),
+                    "transitions": settings["data"].get("transitions"),
                     "algorithm": r["algorithm"],
-                    "revision": told.get("revision", 1),
+                    "revision": settings.get("revision", 1),
                     "seed": r["seed"],
                     "changes": config,
                     "planner": differing(r["options"], PlanOptions()),

@@ -65,11 +65,11 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
             if updates not in wanted or updates in there:
                 return
             found, _ = evaluate_policy(load(run, step=updates)[1], task, EPISODES, "validation", 0)
-            told = [r for r in run.metrics if r["step"] <= updates]
-            row = dict(zip(FIELDS, (name, algorithm, SEED, updates, round(sum(r["seconds"] for r in told)))))
+            logged = [r for r in run.metrics if r["step"] <= updates]
+            row = dict(zip(FIELDS, (name, algorithm, SEED, updates, round(sum(r["seconds"] for r in logged)))))
             row |= {k: f"{found[v]:.5g}" for k, v in (("return", "return_mean"), ("return_norm", "return_norm"))}
             row |= {"cost": f"{found['cost_mean']:.4g}", "falls": f"{found['termination_rate']:.3g}"}
-            row |= {"value": f"{told[-1].get('value', float('nan')):.4g}", "heard": f"{heard:.4g}"}
+            row |= {"value": f"{logged[-1].get('value', float('nan')):.4g}", "heard": f"{heard:.4g}"}
             print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
             append(out, row, FIELDS)
 

@@ -57,7 +57,7 @@ def main() -> None:
             task, run = name.split("/")[0], zoo.get(name, there)
             planner = "steady" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "plain"
             for guard in ("none", GUARDS[task]):
-                told = evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
+                result = evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
                 files = [zoo.FOLDER / f"{name}.safetensors", zoo.FOLDER / f"{name}-world.safetensors"]
                 old = before.get((name, guard), {})
                 rows.append(
@@ -65,9 +65,9 @@ def main() -> None:
                         "policy": name,
                         "guard": guard,
                         "episodes": EPISODES[task],
-                        "return": f"{told['return_mean']:.5g}",
-                        "cost": f"{told['cost_mean']:.4g}",
-                        "violation_rate": f"{told['violation_rate']:.4g}",
+                        "return": f"{result['return_mean']:.5g}",
+                        "cost": f"{result['cost_mean']:.4g}",
+                        "violation_rate": f"{result['violation_rate']:.4g}",
                         "return_before": old.get("return_before", ""),
                         "cost_before": old.get("cost_before", ""),
                         "kib": round(sum(f.stat().st_size for f in files if f.exists()) / 1024),

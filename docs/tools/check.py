@@ -40,13 +40,13 @@ class Page(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        told = {name: value or "" for name, value in attrs}
-        self.places |= {told[k] for k in ("id", "name") if k in told}
-        kind = told.get("rel", "")
-        if LOADED.get(tag) in told and kind not in ("canonical", "prev", "next", "edit", "alternate"):
-            self.loaded.append(told[LOADED[tag]])
-        if tag == "a" and "href" in told:
-            self.led.append(told["href"])
+        values = {name: value or "" for name, value in attrs}
+        self.places |= {values[k] for k in ("id", "name") if k in values}
+        kind = values.get("rel", "")
+        if LOADED.get(tag) in values and kind not in ("canonical", "prev", "next", "edit", "alternate"):
+            self.loaded.append(values[LOADED[tag]])
+        if tag == "a" and "href" in values:
+            self.led.append(values["href"])
         self.heads += tag == "h1"
         if tag == "p":
             self.paragraphs.append("")
@@ -103,8 +103,8 @@ def _outside(address: str) -> bool:
 
 def _there(file: Path, address: str) -> tuple[Path, str]:
     """The file that an address leads to from another, and the place in it."""
-    told = urlsplit(address)
-    return (file.parent / unquote(told.path)).resolve() if told.path else file, unquote(told.fragment)
+    parts = urlsplit(address)
+    return (file.parent / unquote(parts.path)).resolve() if parts.path else file, unquote(parts.fragment)
 
 
 def main() -> None:

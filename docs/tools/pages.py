@@ -182,10 +182,10 @@ def _names() -> str:
 def _modules(title: str, modules: tuple[str, ...]) -> str:
     parts = [f"# {title}"]
     for module in modules:
-        told = f"::: {module}"
+        directive = f"::: {module}"
         if module.startswith(VALUES):
-            told += "\n    options:\n      filters: ['^Config$', '^Settings$', '^[A-Z][A-Z0-9_]+$']"
-        parts.append(told)
+            directive += "\n    options:\n      filters: ['^Config$', '^Settings$', '^[A-Z][A-Z0-9_]+$']"
+        parts.append(directive)
     return "\n\n".join(parts) + "\n"
 
 
@@ -260,15 +260,15 @@ def _signed(x: float) -> str:
 
 def _commands(task: Task) -> list[str]:
     guard = "adapt" if task.protocol else "shield"  # a limit that may be exceeded sometimes, or contact
-    told = {
+    commands = {
         f"ringfence data make {task.name}": "the data set, seeded and cached",
         f"ringfence fit {task.name}": "its World; prints the card",
         f"ringfence train bc {task.name}": "a policy; prints its run folder",
         f"ringfence eval runs/{task.name} --guard {guard}": "played on the test resets under a guard",
         f"ringfence report runs/{task.name}": "report.html",
     }
-    wide = max(map(len, told)) + 3
-    return ["```text", *(f"{command:{wide}}# {words}" for command, words in told.items()), "```"]
+    wide = max(map(len, commands)) + 3
+    return ["```text", *(f"{command:{wide}}# {words}" for command, words in commands.items()), "```"]
 
 
 def _logged(task: Task) -> dict[str, str]:
@@ -331,5 +331,5 @@ def _row(names: tuple[str, ...], rows: list[dict], falls: bool) -> str:
 
 def _mean(rows: list[dict], key: str) -> float:
     """Of the seeds that tell it; older rows may not."""
-    told = [float(row[key]) for row in rows if row[key]]
-    return sum(told) / len(told) if told else float("nan")
+    values = [float(row[key]) for row in rows if row[key]]
+    return sum(values) / len(values) if values else float("nan")
