@@ -221,8 +221,12 @@ def table(rows: list[dict]) -> str:
     out = []
     for study in dict.fromkeys((r["task"], r["proposal"], r["guard"]) for r in rows):
         found = [r for r in rows if (r["task"], r["proposal"], r["guard"]) == study]
-        out += [f"`{study[0]}`, `{study[1]}` under `{study[2]}`, {found[0]['episodes']} episodes:", ""]
-        out += ["| | return | cost | not met | return, more | cost, more |", "|---|---|---|---|---|---|"]
+        guard = study[2].replace(OWN, ", decentralized")
+        out += [
+            f"`{study[0]}`, `{study[1]}` under `{guard}`, {found[0]['episodes']} episodes:",
+            "",
+        ]
+        out += ["| | return | cost | infeasible_rate | return, more | cost, more |", "|---|---|---|---|---|---|"]
         for r in found:
             if r != found[0] and all(r[k] == found[0][k] for k in FIELDS if k != "way"):
                 continue  # a way that is the default here

@@ -1,5 +1,5 @@
 """Writes docs/attribution.md's tables between their markers, from results/ alone: proposals crossed with guards, and
-every question beside its twin.
+every question beside its paired baseline.
 
 python benchmarks/attribution.py
 """
@@ -22,59 +22,59 @@ from ringfence.datasets import registry
 PROPOSALS: dict[str, tuple[str, Row]] = {
     "logs": ("", ("behaviour data", "reference")),
     "do nothing": ("", ("do-nothing", "reference")),
-    "cloning": ("own", ("bc", "default")),
-    "cloning, all in sight": ("all", ("bc", "joint")),
-    "cloning, best tenth": ("own", ("bc-best", "default")),
-    "cloning, episodes without cost": ("own", ("bc-safe", "default")),
-    "cloning, told the return": ("all", ("bc-return", "default")),
-    "cloning, told the advantage": ("all", ("bc-return", "advantage")),
-    "MA-TD3+BC": ("own", ("ma-td3bc", "default")),
-    "MA-TD3+BC, Lagrange": ("own", ("ma-td3bc-lag", "default")),
-    "OMAR": ("own", ("omar", "default")),
-    "our MADIFF (return)": ("all", ("madiff", "default")),
-    "our MADIFF, each for itself": ("own", ("madiff", "own")),
-    "our MADIFF, four times the updates": ("all", ("madiff", "long")),
-    "ICBF as printed, λ = 0.1": ("all", ("icbf", "paper")),
-    "ICBF as printed, λ = 1": ("all", ("icbf", "paper-1")),
-    "ICBF as printed, λ = 3": ("all", ("icbf", "paper-3")),
-    "ICBF as printed, λ = 10": ("all", ("icbf", "paper-10")),
-    "ICBF, ours (advantage, λ = 3)": ("all", ("icbf", "split")),
-    "its twin with λ = 0": ("all", ("icbf", "split-0")),
-    "ICBF, ours, four times the updates": ("all", ("icbf", "long")),
-    "no prior (`mpc`)": ("all", ("mpc", "default")),
+    "BC": ("decentralized", ("bc", "default")),
+    "BC, centralized": ("centralized", ("bc", "joint")),
+    "10 % BC": ("decentralized", ("bc-best", "default")),
+    "BC on episodes without cost": ("decentralized", ("bc-safe", "default")),
+    "return-conditioned BC": ("centralized", ("bc-return", "default")),
+    "advantage-conditioned BC": ("centralized", ("bc-return", "advantage")),
+    "MA-TD3+BC": ("decentralized", ("ma-td3bc", "default")),
+    "MA-TD3+BC, Lagrange": ("decentralized", ("ma-td3bc-lag", "default")),
+    "OMAR": ("decentralized", ("omar", "default")),
+    "our MADIFF (return)": ("centralized", ("madiff", "default")),
+    "our MADIFF, each for itself": ("decentralized", ("madiff", "own")),
+    "our MADIFF, four times the updates": ("centralized", ("madiff", "long")),
+    "ICBF as printed, λ = 0.1": ("centralized", ("icbf", "paper")),
+    "ICBF as printed, λ = 1": ("centralized", ("icbf", "paper-1")),
+    "ICBF as printed, λ = 3": ("centralized", ("icbf", "paper-3")),
+    "ICBF as printed, λ = 10": ("centralized", ("icbf", "paper-10")),
+    "ICBF, ours (advantage, λ = 3)": ("centralized", ("icbf", "split")),
+    "its ablation λ = 0": ("centralized", ("icbf", "split-0")),
+    "ICBF, ours, four times the updates": ("centralized", ("icbf", "long")),
+    "MPC from a zero proposal (`mpc`)": ("centralized", ("mpc", "default")),
 }
 GUARDS = {
     "none": "",
     "select": "+select-learned",
     "shield": "+shield-learned",
-    "shield, formula": "+shield-formula",
+    "shield, analytic": "+shield-formula",
     "full": "+full-learned",
 }
 
 
 @dataclass(frozen=True)
 class Question:
-    """Does what `row` has and `twin` lacks change `key`?"""
+    """Does what `row` has and `paired` lacks change `key`?"""
 
     words: str
     row: Row
-    twin: Row
+    paired: Row
     keys: tuple[str, ...] = ("return", "cost_safe_start")
 
 
 SHIELD, FULL = "+shield-learned", "+full-learned"
 ROBOT_KEYS = ("return", "cost")  # nobody starts above the limit
 QUESTIONS = (
-    Question("a shield, under cloning", ("bc", f"default{SHIELD}"), ("bc", "default")),
+    Question("a shield, under BC", ("bc", f"default{SHIELD}"), ("bc", "default")),
     Question(
         "danger learned, not the formula, in that shield",
         ("bc", f"default{SHIELD}"),
         ("bc", "default+shield-formula"),
     ),
     Question("`full`, not the shield alone", ("bc", f"default{FULL}"), ("bc", f"default{SHIELD}")),
-    Question("cloning under `full`, not no prior", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
-    Question("ICBF under `full`, not cloning", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
-    Question("ICBF under a shield, not cloning", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
+    Question("BC under `full`, not MPC from a zero proposal", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
+    Question("ICBF under `full`, not BC", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
+    Question("ICBF under a shield, not BC", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
     Question("the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0")),
     Question("the barrier in training, under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
     *(
@@ -82,12 +82,12 @@ QUESTIONS = (
         for weight, name in (("0.1", ""), ("1", "-1"), ("3", "-3"), ("10", "-10"))
     ),
     Question(
-        "diffusion (λ = 0), not an actor told the same, under a shield",
+        "diffusion (λ = 0), not return-conditioned BC, under a shield",
         ("icbf", f"split-0{SHIELD}"),
         ("bc-return", f"advantage{SHIELD}"),
     ),
     Question(
-        "diffusion (MADIFF), not an actor told the same, under a shield",
+        "diffusion (MADIFF), not return-conditioned BC, under a shield",
         ("madiff", f"default{SHIELD}"),
         ("bc-return", f"default{SHIELD}"),
     ),
@@ -96,15 +96,15 @@ QUESTIONS = (
         "four times MADIFF's updates, under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")
     ),
     Question(
-        "diffusion of four times the updates, not an actor told the same, under a shield",
+        "diffusion of four times the updates, not return-conditioned BC, under a shield",
         ("madiff", f"long{SHIELD}"),
         ("bc-return", f"default{SHIELD}"),
     ),
     Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
-    Question("everybody in sight of cloning", ("bc", "joint"), ("bc", "default")),
-    Question("everybody in sight of MADIFF, one plan for all", ("madiff", "default"), ("madiff", "own")),
+    Question("centralized, not decentralized BC", ("bc", "joint"), ("bc", "default")),
+    Question("centralized, not decentralized MADIFF, one plan for all", ("madiff", "default"), ("madiff", "own")),
     Question(
-        "everybody in sight of MADIFF, one plan for all, under a shield",
+        "centralized, not decentralized MADIFF, one plan for all, under a shield",
         ("madiff", f"default{SHIELD}"),
         ("madiff", f"own{SHIELD}"),
     ),
@@ -112,14 +112,14 @@ QUESTIONS = (
 
 ADAPT, STEADY = "+adapt-learned", "+steady+adapt-learned"
 OF_ROBOTS = (
-    Question("a guard (`adapt`), under cloning", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
+    Question("a guard (`adapt`), under BC", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
     Question("danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-formula"), ROBOT_KEYS),
     Question("`full`, not `adapt`", ("bc", f"default{FULL}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
-    Question("ICBF, not cloning", ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
+    Question("ICBF, not BC", ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
     Question(
-        "ICBF, not an actor told the return", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
+        "ICBF, not return-conditioned BC", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
     ),
-    Question("ICBF under `full`, not cloning", ("icbf", f"default+steady{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS),
+    Question("ICBF under `full`, not BC", ("icbf", f"default+steady{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS),
     Question(
         "the barrier in training (ICBF, not MADIFF)",
         ("icbf", f"default{STEADY}"),
@@ -127,21 +127,19 @@ OF_ROBOTS = (
         ROBOT_KEYS,
     ),
     Question(
-        "diffusion (MADIFF), not an actor told the return",
+        "diffusion (MADIFF), not return-conditioned BC",
         ("madiff", f"default{STEADY}"),
         ("bc-return", f"default{ADAPT}"),
         ROBOT_KEYS,
     ),
-    Question(
-        "an actor told the return, not cloning", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS
-    ),
+    Question("return-conditioned BC, not BC", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
     *(
-        Question(f"{words}, not cloning", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
-        for words, name in (("the best tenth", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
+        Question(f"{words}, not BC", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
+        for words, name in (("10 % BC", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
     ),
     *(
         Question(
-            f"cloning under `full`, not no prior ({where})",
+            f"BC under `full`, not MPC from a zero proposal ({where})",
             ("bc", f"default{FULL}"),
             ("mpc", f"default{FULL}{reach}"),
             ROBOT_KEYS,
@@ -189,26 +187,26 @@ def crossed(suite: str) -> str:
 
 # Robots' proposals under `adapt`, danger learned, and by climbing under `full`: their words and rows.
 ROBOTS: dict[str, Row] = {
-    "cloning": ("bc", f"default{ADAPT}"),
-    "best tenth": ("bc-best", f"default{ADAPT}"),
+    "BC": ("bc", f"default{ADAPT}"),
+    "10 % BC": ("bc-best", f"default{ADAPT}"),
     "episodes within the limit": ("bc-safe", f"default{ADAPT}"),
-    "told the return": ("bc-return", f"default{ADAPT}"),
+    "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
     "MA-TD3+BC": ("ma-td3bc", f"default{ADAPT}"),
     "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", f"default{ADAPT}"),
     "OMAR": ("omar", f"default{ADAPT}"),
-    "our MADIFF (steady)": ("madiff", f"default{STEADY}"),
-    "ICBF (steady)": ("icbf", f"default{STEADY}"),
-    "cloning, `full`": ("bc", f"default{FULL}"),
-    "ICBF (steady), `full`": ("icbf", f"default+steady{FULL}"),
-    "no prior (`mpc`), `full`": ("mpc", f"default{FULL}"),
-    "no prior, `full`, anywhere": ("mpc", f"default{FULL}+reach2.0"),
+    "our MADIFF (low temperature)": ("madiff", f"default{STEADY}"),
+    "ICBF (low temperature)": ("icbf", f"default{STEADY}"),
+    "BC, `full`": ("bc", f"default{FULL}"),
+    "ICBF (low temperature), `full`": ("icbf", f"default+steady{FULL}"),
+    "MPC from a zero proposal (`mpc`), `full`": ("mpc", f"default{FULL}"),
+    "MPC from a zero proposal, `full`, anywhere": ("mpc", f"default{FULL}+reach2.0"),
 }
 
 
 def robots(suite: str) -> str:
     """A line per proposal, a column per data set under the limit that proposals were played with: return / steps above
     it."""
-    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ROBOTS["ICBF (steady)"]))]
+    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ROBOTS["ICBF (low temperature)"]))]
     out = ["| | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
     for words, row in ROBOTS.items():
         cells = []
@@ -225,7 +223,7 @@ def answers(suite: str, asked: tuple[Question, ...] = QUESTIONS) -> list[tuple[Q
         (
             q,
             key,
-            [d for t in tasks_of(suite) if (d := difference(suite, t, variant(t, q.row), variant(t, q.twin), key))],
+            [d for t in tasks_of(suite) if (d := difference(suite, t, variant(t, q.row), variant(t, q.paired), key))],
         )
         for q in asked
         for key in q.keys
@@ -235,7 +233,7 @@ def answers(suite: str, asked: tuple[Question, ...] = QUESTIONS) -> list[tuple[Q
 
 
 def questions(suite: str) -> str:
-    """A line per question and number: the difference on every task, bold where it is no chance."""
+    """A line per question and number: the difference on every task, bold where it is significant."""
     names = tasks_of(suite)
     out = ["| what differs | of | " + " | ".join(n.partition("-")[2] for n in names) + " |"]
     out.append("|---" * (2 + len(names)) + "|")
@@ -275,11 +273,11 @@ def hours(suites: tuple[str, ...]) -> str:
             status, name = json.loads(file.read_text()), file.parent.parent.name
             if status["state"] == "done":
                 played = status.get("eval_seconds", 0.0)
-                took[name, bool(registry.twin(file.parts[-4]))].append(status.get("train_seconds", 0.0) + played)
+                took[name, bool(registry.paired(file.parts[-4]))].append(status.get("train_seconds", 0.0) + played)
                 took[name, "played"].append(played)
         made = [seconds for (_, how), times in took.items() if how != "played" for seconds in times]
         cells = make_grid(suite, RESULTS / suite, seeds=5).cells
-        wanted = [(c.folder(RESULTS / suite).parent.name, bool(registry.twin(c.task))) for c in cells]
+        wanted = [(c.folder(RESULTS / suite).parent.name, bool(registry.paired(c.task))) for c in cells]
         whole = sum(np.mean(took[cell] or took[cell[0], "played"] or made) for cell in wanted)
         out.append(f"| `{suite}` | {len(made)} | {sum(made) / 7200:.1f} | {len(wanted)} | {whole / 7200:.1f} |")
         total += sum(made) / 7200, whole / 7200

@@ -39,28 +39,28 @@ class Claim:
     check: Callable[[], tuple[bool, str]]
 
 
-def asked(row, twin) -> Question:
-    return next(q for q in QUESTIONS if (q.row, q.twin) == (row, twin))
+def asked(row, paired) -> Question:
+    return next(q for q in QUESTIONS if (q.row, q.paired) == (row, paired))
 
 
-def tested(row, twin, key: str, verdict: Callable[[list], bool]) -> Callable[[], tuple[bool, str]]:
+def tested(row, paired, key: str, verdict: Callable[[list], bool]) -> Callable[[], tuple[bool, str]]:
     """A question of attribution.py: `verdict` of its differences on all tiers, adjusted with all others."""
 
     def check():
-        found = next(ds for q, k, ds in answers("guards") if q == asked(row, twin) and k == key)
+        found = next(ds for q, k, ds in answers("guards") if q == asked(row, paired) and k == key)
         differences = ", ".join(f"{d.mean:+.3g}{'' if d.holds else ' (chance)'}" for d in found)
         return len(found) == 4 and verdict(found), f"{key} {differences}; Wilcoxon over resets, Holm"
 
     return check
 
 
-def on_robots(row, twin, more: int, less: int) -> Callable[[], tuple[bool, str]]:
-    """On how many of the nine data sets the row earns more and less than its twin, adjusted with all other questions of
-    robots."""
+def on_robots(row, paired, more: int, less: int) -> Callable[[], tuple[bool, str]]:
+    """On how many of the nine data sets the row earns more and less than its paired baseline, adjusted with all other
+    questions of robots."""
 
     def check():
         answered = answers("guards-mujoco", OF_ROBOTS)
-        found = next(ds for q, key, ds in answered if (q.row, q.twin) == (row, twin) and key == "return")
+        found = next(ds for q, key, ds in answered if (q.row, q.paired) == (row, paired) and key == "return")
         sides = [[f"{d.task} {d.mean:+.0f}" for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1)]
         text = "; ".join(f"{words}: {', '.join(side) or 'none'}" for words, side in zip(("more", "less"), sides))
         return (len(found), *map(len, sides)) == (9, more, less), f"{text}; {len(found[0].seeds)} to " + (
@@ -122,6 +122,7 @@ def same_safety() -> tuple[bool, str]:
 
 DANGERS = ("learned", "formula")  # in names of variants
 BARRIERS = ("learned", "analytic")
+NAIVE = "naive controller"
 
 
 def limits(suite: str, algorithm: str, variant: str) -> int:
@@ -183,7 +184,7 @@ def brakes_in_time() -> tuple[bool, str]:
     ask = dict(guard="shield", barrier="learned")
     clone, blind, seen = (
         float(rows_of("yard.csv", method=who, options=how, **ask)[0]["contact"])
-        for who, how in (("cloning", "terminal_value=False"), ("blind", "terminal_value=False"), ("blind", ""))
+        for who, how in (("BC", "terminal_value=False"), (NAIVE, "terminal_value=False"), (NAIVE, ""))
     )
     text = (
         f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * blind:.3g} % of the blind; V: {100 * seen:.2g} %"
@@ -193,7 +194,7 @@ def brakes_in_time() -> tuple[bool, str]:
 
 def learned_sees_more() -> tuple[bool, str]:
     """Under the same three rows the formula's interval lies above V's bound."""
-    learned, formula = (rows_of("yard.csv", method="blind", guard="shield", barrier=b, options="")[0] for b in BARRIERS)
+    learned, formula = (rows_of("yard.csv", method=NAIVE, guard="shield", barrier=b, options="")[0] for b in BARRIERS)
     shares = [float(r["contact"]) for r in (learned, formula)]
     return shares[1] > 0.6 and float(learned["bound"]) < 0.02, f"{100 * shares[0]:.2g} % and {100 * shares[1]:.3g} %"
 
@@ -221,7 +222,7 @@ def as_safe_by_v() -> tuple[bool, str]:
 def told_clones_earn() -> tuple[bool, str]:
     """More than plain cloning and than the certificates on the same resets, and without contact."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
-    better = [difference(suite, task, ("bc-return", key), twin, "return") for twin in (("bc", key), CERTIFICATES)]
+    better = [difference(suite, task, ("bc-return", key), paired, "return") for paired in (("bc", key), CERTIFICATES)]
     touched = mean(suite, task, ("bc-return", key), "violation_rate")
     text = ", ".join(f"{d.mean:+.2f} ({d.low:+.2f} to {d.high:+.2f})" for d in better)
     return touched == 0 and all(d.low > 0 for d in better), f"{text} than cloning and than certificates; contact in 0 %"
@@ -258,7 +259,7 @@ def guards_price() -> tuple[bool, str]:
     """Return of guarded cloning at the calibrated margin over that at the loosest, where there is no time to adapt."""
     shares = {}
     for task in ("simple_spread-expert", "simple_spread-medium-replay", "crossing-hasty"):
-        of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, method="cloning, guarded")}
+        of = {r["value"]: r for r in rows_of("frontiers.csv", task=task, method="BC, guarded")}
         shares[task] = float(of["1.0"]["return"]) / float(of["-1.0"]["return"]), float(of["1.0"]["cost"])
     text = ", ".join(f"{task} {100 * share:.1f} % at {cost:g}" for task, (share, cost) in shares.items())
     return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), text

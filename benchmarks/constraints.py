@@ -1,5 +1,5 @@
 """Two constraints of the yard of examples/yard.py, each with its limit: contact (0 of 80 steps) and speed above 0.8 m/s
-(20 of 80). What a guard makes of them when the logs name them, beside the twin whose logs tell their maximum alone.
+(20 of 80). What a guard makes of them when the logs name them, beside a baseline whose logs tell their maximum alone.
 
     python benchmarks/constraints.py     # writes results/constraints.csv and docs/guard.md's table; twenty minutes
 """

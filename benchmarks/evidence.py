@@ -1,5 +1,5 @@
 """What tables and claims are made of: every evaluation of a results folder with the numbers of its episodes, and the
-test of one row against its twin."""
+test of one row against its paired baseline."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def mean(suite: str, task: str, row: Row, key: str) -> float | None:
 
 @dataclass(frozen=True)
 class Difference:
-    """A row minus its twin on the same resets, by the same seeds."""
+    """A row minus its paired baseline on the same resets, by the same seeds."""
 
     task: str
     seeds: tuple[int, ...]
@@ -70,10 +70,10 @@ class Difference:
         return self.p < LEVEL and not self.low <= 0 <= self.high
 
 
-def difference(suite: str, task: str, row: Row, twin: Row, key: str) -> Difference | None:
+def difference(suite: str, task: str, row: Row, paired: Row, key: str) -> Difference | None:
     """Of `return`, `cost` or `cost_safe_start` (cost of the resets that start safe); None where one of the two is
     missing."""
-    ours, theirs = of(suite, task, row), of(suite, task, twin)
+    ours, theirs = of(suite, task, row), of(suite, task, paired)
     seeds = tuple(sorted(set(ours) & set(theirs)))
     if not seeds:
         return None

@@ -41,8 +41,8 @@ LIMITS = {
     "halfcheetah_2x3-medium": (5, 12.5, 25, 50, 100),
     "ant_2x4-medium": (5, 12.5, 25, 50, 100),
 }
-TRAINED = {"ma-td3bc-lag": "MA-TD3+BC, Lagrange", "bc-safe": "cloning, episodes within"}
-GUARDED = {"bc": "cloning, guarded", "icbf": "ICBF, guarded"}
+TRAINED = {"ma-td3bc-lag": "MA-TD3+BC, Lagrange", "bc-safe": "BC on episodes within the limit"}
+GUARDED = {"bc": "BC, guarded", "icbf": "ICBF, guarded"}
 
 
 def main() -> None:

@@ -17,49 +17,51 @@ from ringfence.utils import stored
 RESULTS = Path(__file__).resolve().parent.parent / "results"
 # Columns: their heads, and their rows.
 SPREAD = {
-    "cloning": ("bc", "default"),
-    "shield, formula": ("bc", "default+shield-formula"),
+    "BC": ("bc", "default"),
+    "shield, analytic": ("bc", "default+shield-formula"),
     "**shield, learned**": ("bc", "default+shield-learned"),
     "**full, learned**": ("bc", "default+full-learned"),
-    "no prior (`mpc`), full, learned": ("mpc", "default+full-learned"),
+    "MPC from a zero proposal (`mpc`), full, learned": ("mpc", "default+full-learned"),
 }
 ROBOTS = {
-    "cloning": ("bc", "default"),
-    "adapt, formula": ("bc", "default+adapt-formula"),
+    "BC": ("bc", "default"),
+    "adapt, analytic": ("bc", "default+adapt-formula"),
     "adapt, learned": ("bc", "default+adapt-learned"),
-    "full, formula": ("bc", "default+full-formula"),
+    "full, analytic": ("bc", "default+full-formula"),
     "**full, learned**": ("bc", "default+full-learned"),
-    "`icbf` (steady)": ("icbf", "default+steady"),
-    "`icbf`, adapt, formula": ("icbf", "default+steady+adapt-formula"),
+    "`icbf` (low temperature)": ("icbf", "default+steady"),
+    "`icbf`, adapt, analytic": ("icbf", "default+steady+adapt-formula"),
     "`icbf`, adapt, learned": ("icbf", "default+steady+adapt-learned"),
 }
 OWN = {
-    "cloning": ("bc", "default"),
-    "shield, learned, own sight": ("bc", "default+shield-learned-own"),
-    "full, learned, own sight": ("bc", "default+full-learned-own"),
+    "BC": ("bc", "default"),
+    "shield, learned, decentralized": ("bc", "default+shield-learned-own"),
+    "full, learned, decentralized": ("bc", "default+full-learned-own"),
 }
 # Crossing's rows: algorithm and variant, and their words.
 BESIDE = {
     "behaviour data reference": "the logs",
     "certificates reference": "certificates (true state and brakes)",
 }
-TIERS = BESIDE | {"bc default": "cloning", "bc default+shield-learned": "**cloning, shield, learned**"}
+TIERS = BESIDE | {"bc default": "BC", "bc default+shield-learned": "**BC, shield, learned**"}
 WAYS = BESIDE | {
-    "bc default": "cloning",
+    "bc default": "BC",
     **{f"bc default+shield-learned+rows{k}+futureFalse": f"shield, ℓ, {k} row{'s' * (k > 1)}" for k in (1, 3, 7, 15)},
     "bc default+shield-learned+rows1": "shield, ℓ and V, 1 row",
     "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
-    "bc default+shield-formula+rows15+futureFalse": "shield, formula, 15 rows",
+    "bc default+shield-formula+rows15+futureFalse": "shield, analytic, 15 rows",
     "bc default+full-learned": "**full**",
     "bc default+full-learned+margin1.0": "full, a margin of 1",
     "bc default+full-learned+reach2.0+margin1.0": "full, a margin of 1, climbing anywhere",
-    "mpc default+full-learned+reach2.0+margin1.0": "no prior (`mpc`), full, a margin of 1, climbing anywhere",
-    "bc-best default": "cloning the best tenth",
-    "bc-best default+shield-learned": "cloning the best tenth, shield",
-    "bc-return default": "cloning told its return",
-    "bc-return default+shield-learned": "cloning told its return, shield",
-    "bc-safe default": "cloning episodes without contact",
-    "bc-safe default+shield-learned": "cloning episodes without contact, shield",
+    "mpc default+full-learned+reach2.0+margin1.0": (
+        "MPC from a zero proposal (`mpc`), full, a margin of 1, climbing anywhere"
+    ),
+    "bc-best default": "10 % BC",
+    "bc-best default+shield-learned": "10 % BC, shield",
+    "bc-return default": "return-conditioned BC",
+    "bc-return default+shield-learned": "return-conditioned BC, shield",
+    "bc-safe default": "BC on episodes without contact",
+    "bc-safe default+shield-learned": "BC on episodes without contact, shield",
     **{
         f"{name}{more}": words + (", shield" if more else "")
         for name, words in (
@@ -74,11 +76,11 @@ WAYS = BESIDE | {
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
-SIZES = {"cloning": "", "shield": "+shield-learned", "full": "+full-learned"}
+SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 OWN_ROBOTS = {
-    "cloning": ("bc", "default"),
-    "adapt, learned, own sight": ("bc", "default+adapt-learned-own"),
-    "full, learned, own sight": ("bc", "default+full-learned-own"),
+    "BC": ("bc", "default"),
+    "adapt, learned, decentralized": ("bc", "default+adapt-learned-own"),
+    "full, learned, decentralized": ("bc", "default+full-learned-own"),
 }
 
 
@@ -135,13 +137,13 @@ def crossing(suite: str, named: dict[str, str]) -> str:
     """A row per task and variant. Seeds share their resets, so the bound is of resets: those in which any seed touched,
     at most."""
     head = (
-        "who",
+        "method",
         "return",
         "steps with contact",
         "episodes with contact (bound)",
         "agents who touch",
-        "not met",
-        "made of",
+        "infeasible_rate",
+        "n_episodes",
     )
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     rows = stored.table(RESULTS / suite / "table.csv")
@@ -160,7 +162,7 @@ def crossing(suite: str, named: dict[str, str]) -> str:
                 part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.3g} %)"
             part += [f"{100 * mean(own, 'agent_violation_rate'):.2g} %" if own else ""]
             part += [f"{100 * mean(found, 'infeasible_rate'):.2g} %" if found[0]["infeasible_rate"] else ""]
-            part += [f"{episodes} episodes" + (f", {len(found)} seeds" if len(found) > 1 else "")]
+            part += [f"{episodes}" + (f", {len(found)} seeds" if len(found) > 1 else "")]
             out.append("| " + " | ".join(part) + " |")
     return "\n".join(out)
 
@@ -184,13 +186,13 @@ def sizes() -> str:
 def other_simulator() -> str:
     """Rows of benchmarks/other_simulator.py."""
     rows = stored.table(RESULTS / "other_simulator.csv")
-    head = ("learned from", "agents", "guard", "return", "steps with contact", "episodes with contact", "made of")
+    head = ("learned from", "agents", "guard", "return", "steps with contact", "episodes with contact", "n_episodes")
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for r in rows:
         part = [r[k] for k in ("learned from", "agents", "guard", "return", "steps with contact")]
         part.append(f"{100 * float(r['episodes with contact']):.3g} %")
         part[-1] += f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
-        out.append("| " + " | ".join([*part, f"{r['episodes']} episodes"]) + " |")
+        out.append("| " + " | ".join([*part, r["episodes"]]) + " |")
     return "\n".join(out)
 
 

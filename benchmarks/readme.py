@@ -64,12 +64,12 @@ ROBOT_ROWS = (
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
     ("fisor", "mujoco", "FISOR per agent"),
     ("madiff", "mujoco", "MADIFF (no barrier)"),
-    ("madiff", "mujoco+steady", "MADIFF, steady"),
+    ("madiff", "mujoco+steady", "MADIFF, low temperature"),
     ("madiff", "mujoco+shielded", "MADIFF, shielded"),
     ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
     ("icbf", "mujoco-paper", "ICBF-Diffuser `paper`"),
     ("icbf", "mujoco", "ICBF-Diffuser `split`"),
-    ("icbf", "mujoco+steady", "`split`, steady"),
+    ("icbf", "mujoco+steady", "`split`, low temperature"),
     ("icbf", "mujoco+shielded", "`split`, shielded"),
     ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
 )
@@ -122,7 +122,7 @@ def main() -> None:
 
 # The README's rows: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
 FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
-    "cloning": (("simple_spread", "bc", ""), ("mujoco", "bc", ""), ("crossing", "bc", "default")),
+    "BC": (("simple_spread", "bc", ""), ("mujoco", "bc", ""), ("crossing", "bc", "default")),
     "MA-TD3+BC with a Lagrange multiplier": (
         ("simple_spread", "ma-td3bc-lag", ""),
         ("mujoco", "ma-td3bc-lag", ""),
@@ -134,17 +134,17 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         ("mujoco", "icbf", "mujoco-paper"),
         None,
     ),
-    "cloning + guard, *formula*": (
+    "BC + guard, *analytic*": (
         ("guards", "bc", "default+shield-formula"),
         ("guards-mujoco", "bc", "+adapt-formula"),
         None,
     ),
-    "**cloning + guard**": (
+    "**BC + guard**": (
         ("guards", "bc", "default+shield-learned"),
         ("guards-mujoco", "bc", "+adapt-learned"),
         ("crossing", "bc", "default+shield-learned"),
     ),
-    "**cloning + guard that also climbs values** (`full`)": (
+    "**BC + guard that also climbs values** (`full`)": (
         ("guards", "bc", "default+full-learned"),
         ("guards-mujoco", "bc", "+full-learned"),
         ("crossing-guards", "bc", "default+full-learned"),
@@ -158,7 +158,7 @@ def front() -> str:
     robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
     logs = [data["simple_spread"][f"simple_spread-{t}", "behaviour data", "reference"][0] for t in TIERS]
     logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
-    lines = ["| who acts | Simple Spread | robots | Crossing |", "|---|---|---|---|"]
+    lines = ["| method | Simple Spread | robots | Crossing |", "|---|---|---|---|"]
     lines.append(f"| *the logs* | {_spread_cell(logs)} | | {_crossing_cell(logged)} |")
     for words, places in FRONT.items():
         cells = []
@@ -274,7 +274,7 @@ def spent(folder: Path) -> str:
         status, name = json.loads(file.read_text()), file.parent.parent.name
         if status["state"] != "done":
             continue
-        if "adopted" in status or (registry.twin(file.parts[-4]) and not _reads_danger(file.parent)):
+        if "adopted" in status or (registry.paired(file.parts[-4]) and not _reads_danger(file.parent)):
             trained, name = status.get("train_seconds", 0.0), f"{name}, trained before"
         else:  # of a cell that was played again the last attempt trained nothing
             results = json.loads((file.parent / "results.json").read_text())

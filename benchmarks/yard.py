@@ -1,4 +1,4 @@
-"""The yard of examples/yard.py, 1000 test episodes: cloning, and a blind controller at full speed, alone and under
+"""The yard of examples/yard.py, 1000 test episodes: BC, and a naive controller at full speed, alone and under
 guard; danger learned of the team's cost column beside the formula that the logs are not told.
 
     python benchmarks/yard.py            # writes results/yard.csv and docs/guard.md's table; an hour
@@ -31,19 +31,19 @@ import yard  # noqa: E402
 OUT = ROOT / "results" / "yard.csv"
 # Who acts, under which guard, of how many episodes one (`full` takes ten times as long).
 ROWS = (
-    ("cloning", "none", "none", {}, 1),
-    ("cloning", "shield", "learned", {"future": False}, 1),
-    ("cloning", "shield", "learned", {}, 1),
-    ("cloning", "shield", "formula", {}, 1),
-    ("cloning", "full", "learned", {}, 5),
-    ("cloning", "full", "learned", {"rows": 3, "future": True}, 5),
-    ("cloning", "full", "formula", {}, 5),
-    ("blind", "none", "none", {}, 1),
-    ("blind", "shield", "learned", {"future": False}, 1),
-    ("blind", "shield", "learned", {}, 1),
-    ("blind", "shield", "learned", {"rows": 7}, 1),
-    ("blind", "shield", "learned", {"rows": 10}, 1),
-    ("blind", "shield", "formula", {}, 1),
+    ("BC", "none", "none", {}, 1),
+    ("BC", "shield", "learned", {"future": False}, 1),
+    ("BC", "shield", "learned", {}, 1),
+    ("BC", "shield", "formula", {}, 1),
+    ("BC", "full", "learned", {}, 5),
+    ("BC", "full", "learned", {"rows": 3, "future": True}, 5),
+    ("BC", "full", "formula", {}, 5),
+    ("naive controller", "none", "none", {}, 1),
+    ("naive controller", "shield", "learned", {"future": False}, 1),
+    ("naive controller", "shield", "learned", {}, 1),
+    ("naive controller", "shield", "learned", {"rows": 7}, 1),
+    ("naive controller", "shield", "learned", {"rows": 10}, 1),
+    ("naive controller", "shield", "formula", {}, 1),
 )
 HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
 AT = {name: k for k, name in enumerate(yard.NAMES)}
@@ -68,14 +68,14 @@ def main() -> None:
     run = ringfence.train("bc", logs_of_both, out=ROOT / "runs")[0]
     there = {tuple(r.values())[:4]: list(r.values()) for r in stored.table(OUT)} if OUT.exists() else {}
     rows = [logs(store)]
-    for who, guard, danger, options, part in ROWS:
+    for method, guard, danger, options, part in ROWS:
         words = " ".join(f"{k}={v}" for k, v in options.items())
-        if kept := there.get((who, guard, danger, words)):
+        if kept := there.get((method, guard, danger, words)):
             rows.append(kept)
             continue
         episodes = max(100, most // part)
         asked = {} if guard == "none" else {"guard": guard, "danger": danger, **options}
-        if who == "cloning":
+        if method == "BC":
             r = ringfence.play(
                 run, yard.Yard, episodes=episodes, at_once=100, **asked, **({"world": world} if asked else {})
             )
@@ -85,7 +85,7 @@ def main() -> None:
             r = ringfence.play(pilot, yard.Yard, episodes=episodes, at_once=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]
         bound = upper_bound(round(r["violation_rate"] * episodes), episodes)
-        rows.append([who, guard, danger, words, episodes, *measured, bound])
+        rows.append([method, guard, danger, words, episodes, *measured, bound])
         print(rows[-1], flush=True)
         write(rows)
     write(rows)
@@ -106,7 +106,7 @@ def write(rows: list[list]) -> None:
 
 
 def table(file: Path) -> str:
-    lines = ["| who | guard | return | episodes with contact (bound) | made of |", "|---|---|---|---|---|"]
+    lines = ["| method | guard | return | episodes with contact (bound) | n_episodes |", "|---|---|---|---|---|"]
     ways = {"": "", "terminal_value=False": ", 3 rows without V", "horizon=7": ", 7 rows"}
     ways |= {"horizon=10": ", 10 rows"}
     ways |= {"horizon=3 terminal_value=True": ", 3 rows"}
@@ -114,7 +114,7 @@ def table(file: Path) -> str:
         guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['barrier']}{ways[r['options']]}"
         bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
         touched = f"{100 * float(r['contact']):.3g} %{bound}"
-        lines.append(f"| {r['method']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} episodes |")
+        lines.append(f"| {r['method']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} |")
     return "\n".join(lines)
 
 

@@ -108,9 +108,9 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
     out = shutil.copytree(made.out, tmp_path / "again")
     cell = made.cells[0]
     before = cell.status(out)
-    results = cell.folder(out) / "results.json"
-    results = json.loads(results.read_text())
-    results.write_text(json.dumps({k: {**v, "protocol": -1} for k, v in results.items()}))  # of an older protocol
+    file = cell.folder(out) / "results.json"
+    results = json.loads(file.read_text())
+    file.write_text(json.dumps({k: {**v, "protocol": -1} for k, v in results.items()}))  # of an older protocol
     grid.write_json(cell.folder(out) / "status.json", {**before, "train_seconds": 1234.0, "adopted": "cells/elsewhere"})
     grid.run_group([cell], out, made.episodes, lambda event, cell: None)
     after = cell.status(out)
@@ -465,8 +465,8 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     few = dict(seeds=1, episodes=1, only_tasks=names, only=["bc"], steps=20, transitions=1000)
     g = make_grid("mujoco", tmp_path / "out", **few)
     native, other = g.cells
-    assert other.twin() == native and native.twin() is None
-    assert grid.Cell(names[1], "bc-safe", "mujoco", 0).twin() is None
+    assert other.paired() == native and native.paired() is None
+    assert grid.Cell(names[1], "bc-safe", "mujoco", 0).paired() is None
     g.open()
     grid.run_group([native], g.out, 1, lambda event, cell: None)
     with monkeypatch.context() as m:

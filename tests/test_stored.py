@@ -89,7 +89,7 @@ def test_tables_are_read_under_todays_names(tmp_path):
     file = tmp_path / "table.csv"
     file.write_text('who,danger,options,infeasible\ncloning,formula,"rows=3 future=True",0.5\n')
     row = {
-        "method": "cloning",
+        "method": "BC",
         "barrier": "analytic",
         "options": "horizon=3 terminal_value=True",
         "infeasible_rate": "0.5",

@@ -302,7 +302,7 @@ def _rows(task: Task) -> list[str]:
         if not found:
             continue
         lines += [f"### `results/{suite}`", ""]
-        heads = ["who", "guard", "return", "normalised", "cost", "avoidable", "with any cost"]
+        heads = ["method", "guard", "return", "normalised", "cost", "cost_safe_start", "violation_rate"]
         heads += ["fell"] * task.env.terminates + ["seeds"]
         lines += ["| " + " | ".join(heads) + " |", "|---|---|" + "---:|" * (len(heads) - 2)]
         lines += [*(_row(names, rows, task.env.terminates) for names, rows in found.items()), ""]

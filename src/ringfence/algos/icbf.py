@@ -118,7 +118,7 @@ _MUJOCO = {
 }
 PRESETS: dict[str, dict] = {
     "split": {},
-    "split-0": {"barrier_weight": 0.0},  # the twin of `split` that follows no barrier
+    "split-0": {"barrier_weight": 0.0},  # the ablation of `split` that follows no barrier
     "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "mujoco": _MUJOCO,
     "paper": _PAPER,

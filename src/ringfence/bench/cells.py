@@ -89,12 +89,12 @@ class Cell:
         name = self.algorithm if self.preset == "default" else f"{self.algorithm}-{self.preset}"
         return out / "cells" / self.task / name / f"seed-{self.seed}-{self.id}"
 
-    def twin(self) -> Cell | None:
+    def paired(self) -> Cell | None:
         """The same cell on the task that shares this one's data under another definition of danger, if the algorithm
         reads none: it learned the same there."""
         if algos.get(self.algorithm).reads(self.config) != "nothing":
             return None
-        other = registry.twin(self.task)
+        other = registry.paired(self.task)
         return None if other is None else dataclasses.replace(self, task=other)
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
@@ -363,8 +363,8 @@ class _Group:
         first = self.left[0]
         store = data_of(first.task, first.transitions)
         for cell in self.left:
-            if twin := adopt(cell, self.out, store.card):
-                self.adopted[cell] = str(twin.folder(self.out).relative_to(self.out))
+            if paired := adopt(cell, self.out, store.card):
+                self.adopted[cell] = str(paired.folder(self.out).relative_to(self.out))
         loop.train(
             first.algorithm,
             store,
@@ -418,12 +418,12 @@ def data_of(task: str, transitions: int | None) -> EpisodeStore:
 
 
 def adopt(cell: Cell, out: Path, card: dict[str, Any]) -> Cell | None:
-    """Begin a cell on data of this card with what its twin has learned, where that is there, of the same data and by
-    the same revision, and return the twin; its training is then over at once."""
-    twin = cell.twin()
-    if twin is None or twin.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
+    """Begin a cell on data of this card with what its paired cell has learned, and return that one; its training is
+    then over at once. None where that cell is not done, or learned of other data or by another revision."""
+    paired = cell.paired()
+    if paired is None or paired.status(out).get("state") != "done" or Run(cell.folder(out)).checkpoints():
         return None
-    there = Run(twin.folder(out))
+    there = Run(paired.folder(out))
     here = Run(cell.folder(out))
     config = there.config
     apart = {name for name, *_ in other_data(config["data"], card)} - {"task", "hazard"}
@@ -435,7 +435,7 @@ def adopt(cell: Cell, out: Path, card: dict[str, Any]) -> Cell | None:
     for file in (there.path / "metrics.jsonl", *learned):
         with whole(here.path / file.relative_to(there.path)) as temporary:
             shutil.copyfile(file, temporary)
-    return twin
+    return paired
 
 
 def _record(cell: Cell, out: Path, state: str, more: Mapping[str, Any]) -> None:

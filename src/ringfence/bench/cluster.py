@@ -44,12 +44,14 @@ def run_ray(grid: Grid, *, address: str | None = None, threads: int = 1, quiet: 
                 tell_lost(f"the reference rows of {name}", f"{type(error).__name__}: {error}")
         cells = [c for group in grid.groups() for c in group]
         ours = set(cells)
-        later = {c.twin(): c for c in cells if c.twin() in ours}  # they take what their twins will have learned
+        later = {
+            c.paired(): c for c in cells if c.paired() in ours
+        }  # they take what their paired cells will have learned
 
         def submit(cell: Cell) -> Any:
             return make_cell.remote(cell, grid.episodes, begun(cell, grid.out))
 
-        waiting = {submit(c): c for c in cells if c.twin() not in ours}
+        waiting = {submit(c): c for c in cells if c.paired() not in ours}
         with Progress(f"{grid.suite}: cells on Ray", len(cells), 0, quiet) as bar:
             while waiting:
                 (ready,), _ = ray.wait(list(waiting), num_returns=1)
@@ -91,10 +93,10 @@ def knock(address: str | None, seconds: float = 5.0) -> None:
 
 
 def begun(cell: Cell, out: Path) -> bytes:
-    """What `out` holds of a cell and of its twin, as a tar file."""
+    """What `out` holds of a cell and of its paired cell, as a tar file."""
     buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
-        for known in (cell, cell.twin()):
+        for known in (cell, cell.paired()):
             if known is not None and found(known.folder(out)):
                 tar.add(known.folder(out), arcname=str(known.folder(out).relative_to(out)))
     return buffer.getvalue()

@@ -181,7 +181,16 @@ def evaluate(
 
     given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}
     given |= _options(_assignments(set), given)
-    names = ("run", "variant", "return", "cost", "avoidable", "violations/episode (95 % ≤)", "return norm", "cost norm")
+    names = (
+        "run",
+        "variant",
+        "return",
+        "cost",
+        "safe starts",
+        "violations/episode (95 % ≤)",
+        "return norm",
+        "cost norm",
+    )
     table = Table(*names, "ended early")
     if not runs:
         raise UserError("No run was given; name run folders that `ringfence train` made.")
@@ -636,7 +645,7 @@ def bench_results(folder: Positional[Path]) -> None:
 
     for task, rows in standings.standings(board.read(folder)).items():
         table = Table(
-            "", "method", "seeds", "return", "norm", "cost", "avoidable", "unsafe (95 % ≤)", title=terminal(task)
+            "", "method", "seeds", "return", "norm", "cost", "safe starts", "unsafe (95 % ≤)", title=terminal(task)
         )
         for r in rows:
             low, high = r.returns_interval

@@ -152,7 +152,7 @@ def of_team(task: Task, agents: int) -> Task:
     return task if task.env is None else replace(task, env=replace(task.env, n_agents=agents))
 
 
-def twin(name: str) -> str | None:
+def paired(name: str) -> str | None:
     """The task with the same data under safety-gymnasium's limit, of a task with a limit of its own."""
     other = name.removesuffix("-quantile")
     return other if other != name else None
@@ -160,8 +160,8 @@ def twin(name: str) -> str | None:
 
 def siblings(name: str) -> list[str]:
     """The tasks whose data are the same steps with costs of another limit."""
-    root = twin(name) or name
-    return [t for t in TASKS if t != name and root in (t, twin(t))]
+    root = paired(name) or name
+    return [t for t in TASKS if t != name and root in (t, paired(t))]
 
 
 def simulated(name: str, hazard: constraints.Hazard) -> Task | None:

@@ -50,7 +50,7 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "violation_upper": statistics.upper_bound(int(violated.sum()), n),
         **{RATES[k]: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
         # Share of (agent, episode) with a cost of the agent's own.
-        **({"agent_violation_rate": float(played["touched"].any(1).mean())} if "touched" in played else {}),
+        **({"agent_violation_rate": float(played["violated"].any(1).mean())} if "violated" in played else {}),
         "unsafe_starts": int(hazard_at_start.sum()),
         "cost_safe_start": float(cost_safe_start.mean()),
         "cost_safe_start_interval": statistics.bootstrap_mean(cost_safe_start),

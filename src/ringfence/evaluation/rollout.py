@@ -31,7 +31,7 @@ def rollout(
     quiet: bool = True,
 ) -> dict[str, np.ndarray]:
     """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
-    whether the task itself `terminated` (E,) it, and who was `touched` (E, L, N) where agents have costs of their own;
+    whether the task itself `terminated` (E,) it, and who was `violated` (E, L, N) where agents have costs of their own;
     the first `record` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise,
     never the resets."""
     if split not in RESETS:
@@ -50,7 +50,7 @@ def rollout(
             memory = heard(policy, memory, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
             if out.cost.ndim == 2:
-                kept["touched"] = out.cost > 0
+                kept["violated"] = out.cost > 0
             kept |= {name: decided.info[name] for name in COUNTED if name in decided.info}
             if keep:
                 kept |= {k: v[:keep] for k, v in decided.info.items() if k not in COUNTED}
@@ -77,7 +77,7 @@ def rollout(
             bar.advance(min(CHUNK, episodes - done))
             done += CHUNK
     out = {k: np.concatenate([c[k] for c in chunks if k in c]) for k in chunks[0]}
-    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state", "touched", *COUNTED) if k in out}
+    out |= {k: out[k][:episodes] for k in ("reward", "cost", "state", "violated", *COUNTED) if k in out}
     lost = ~(np.isfinite(out["reward"]) & np.isfinite(out["state"][:, 1:]).all(-1))
     if lost.any():  # nothing collides with what is nowhere, so it would pass for safe
         episode, step = np.argwhere(lost)[0]

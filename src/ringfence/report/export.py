@@ -18,9 +18,9 @@ from ringfence.utils.escape import latex, markdown, spreadsheet
 # CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
 COLUMNS = (
     "suite, task, algorithm, preset, variant, method, rank, within_limit, best, return_mean, return_sd, return_low, "
-    "return_high, return_norm, cost_mean, cost_sd, cost_low, cost_high, cost_norm, avoidable_cost, avoidable_low, "
-    "avoidable_high, unsafe_episodes, unsafe_upper, ended_early, steps_mean, seeds, episodes, "
-    "train_seconds, plan_ms_p50, parameters"
+    "return_high, return_norm, cost_mean, cost_sd, cost_low, cost_high, cost_norm, cost_safe_start, "
+    "cost_safe_start_low, cost_safe_start_high, unsafe_episodes, unsafe_upper, ended_early, steps_mean, seeds, "
+    "episodes, train_seconds, plan_ms_p50, parameters"
 ).split(", ")
 
 
@@ -76,9 +76,9 @@ def _numbers(r: Standing) -> dict[str, Any]:
         "cost_low": r.cost_interval[0],
         "cost_high": r.cost_interval[1],
         "cost_norm": r.cost_norm,
-        "avoidable_cost": r.cost_safe_start,
-        "avoidable_low": r.cost_safe_start_interval[0],
-        "avoidable_high": r.cost_safe_start_interval[1],
+        "cost_safe_start": r.cost_safe_start,
+        "cost_safe_start_low": r.cost_safe_start_interval[0],
+        "cost_safe_start_high": r.cost_safe_start_interval[1],
         "unsafe_episodes": r.violation_rate,
         "unsafe_upper": r.violation_upper,
         "ended_early": r.ended,
@@ -96,7 +96,7 @@ def _plain(value: Any) -> Any:
 
 # --- LaTeX ---
 
-HEAD = r"Method & Return & Norm.\ return & Cost & Avoidable cost & Unsafe episodes (\%) & Seeds \\"
+HEAD = r"Method & Return & Norm.\ return & Cost & Cost of safe starts & Unsafe episodes (\%) & Seeds \\"
 
 
 def board_latex(board: Board) -> str:
@@ -149,7 +149,7 @@ def _pm(value: float, deviation: float | None, digits: int, sign: str) -> str:
 
 def board_markdown(board: Board) -> str:
     """A table per task with every column of the page that is a number."""
-    head = ["method", "rank", "return", "norm. return", "cost", "avoidable cost", "unsafe episodes", "seeds"]
+    head = ["method", "rank", "return", "norm. return", "cost", "cost of safe starts", "unsafe episodes", "seeds"]
     head += ["training s", "plan ms", "parameters"]
     blocks = []
     for task, rows in _rows(board).items():
@@ -164,12 +164,12 @@ def board_markdown(board: Board) -> str:
 
 
 def board_markdown_short(board: Board) -> str:
-    """One table per protocol, methods by tasks: normalised return and avoidable cost, by mean rank."""
+    """One table per protocol, methods by tasks: normalised return and the cost of safe starts, by mean rank."""
     tables = standings(board)
     rows_to_beat = references(board)
     blocks = []
     for ranking in rankings(board, tables):
-        head = ["norm. return (avoidable cost)", *(short(t, board.suite) for t in ranking.tasks), "mean rank"]
+        head = ["norm. return (cost of safe starts)", *(short(t, board.suite) for t in ranking.tasks), "mean rank"]
         rows = []
         names = dict.fromkeys(r.name for t in ranking.tasks for r in rows_to_beat[t])
         for name in names:

@@ -176,12 +176,12 @@ def scatter(section: Section[LineT], rows: Sequence[LineT], x_label: str, name: 
             _point(ax, row)
         ax.margins(0.08, 0.1)
         _cost_axis(ax, section.constants["cost_limit"] if section.constants else 0.0)
-        ax.set_xlabel(f"avoidable {x_label}")
+        ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
         made.canvas.draw()
         _label(ax, points)
-        each = [f"{r.label}: return {r.returns:.1f}, avoidable cost {r.cost_safe_start:.3f}" for r in points]
-        return to_svg(made, f"Return against avoidable cost on {section.task}. {'; '.join(each)}", name)
+        each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
+        return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
 
 
 def _point(ax: Axes, row: Line) -> None:

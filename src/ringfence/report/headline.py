@@ -78,7 +78,7 @@ def _best(
     least = min(rows, key=lambda row: (row.cost_safe_start, -row.returns))
     if least is not best:
         sentences.append(
-            f"Fewest avoidable {unit}: {least.label}, {least.cost_safe_start:.3f} per episode against "
+            f"Fewest {unit} in episodes that start safe: {least.label}, {least.cost_safe_start:.3f} against "
             f"{best.cost_safe_start:.3f}, at a return of {least.returns:.1f}."
         )
     return sentences

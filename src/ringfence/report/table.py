@@ -22,8 +22,8 @@ SPLITS = ("test", "validation")
 NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
-    "bc-best": "BC on the best tenth",
-    "bc-return": "BC told the return",
+    "bc-best": "10 % BC",
+    "bc-return": "return-conditioned BC",
     "ma-td3bc": "MA-TD3+BC",
     "ma-td3bc-lag": "MA-TD3+BC, Lagrange",
     "fisor": "FISOR",
@@ -31,7 +31,7 @@ NAMES = {
     "omar": "OMAR",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
-    "mpc": "No prior",
+    "mpc": "MPC from a zero proposal",
 }
 ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
 NEEDED = ("episodes", "return_mean", "cost_mean", "cost_safe_start", "violation_rate", "constants", "protocol", "task")

@@ -48,7 +48,18 @@ WORLD_SETTINGS = {
 BARRIERS = {"formula": "analytic"}
 EXECUTIONS = {"all": "centralized", "own": "decentralized"}
 PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}
-VALUES = {"barrier": BARRIERS, "execution": EXECUTIONS, "planner": PLANNERS}  # by today's name of the column
+METHODS = {
+    "cloning": "BC",
+    "cloning, guarded": "BC, guarded",
+    "cloning, episodes within": "BC on episodes within the limit",
+    "blind": "naive controller",
+}
+VALUES = {
+    "method": METHODS,
+    "barrier": BARRIERS,
+    "execution": EXECUTIONS,
+    "planner": PLANNERS,
+}  # by today's name of the column
 
 # Heads of tables in results/ that no result has.
 HEADS = {
