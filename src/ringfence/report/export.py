@@ -185,7 +185,8 @@ def board_markdown_short(board: Board) -> str:
 
 def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
     if isinstance(r, Method):
-        return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *["–"] * (3 + ends)]
+        blank = ["–"] * (4 if ends else 3)
+        return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *blank]
     returns = _pm(r.returns, r.returns_sd, 1, "±")
     norm = _pm(r.returns_norm, r.returns_norm_sd, 3, "±")
     several = f"{len(r.seeds)}" if len(r.seeds) == len(board.seeds) else f"{len(r.seeds)} of {len(board.seeds)}"

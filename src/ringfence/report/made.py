@@ -103,9 +103,9 @@ def _playing(section: Section[Row]) -> list[str]:
     evaluations: dict[tuple[str, str, str], list[str]] = {}
     for row in section.rows:
         for run, result in row.members:
-            command, env = "eval", ""
-            if result.get("simulator"):
-                command, env = "play", f"--env {shell(result['simulator'])}"
+            simulator = result.get("simulator")
+            command = "play" if simulator else "eval"
+            env = f"--env {shell(simulator)}" if simulator else ""
             evaluations.setdefault((command, env, _how(result, run)), []).append(shell(run.path))
     return [
         " ".join(["ringfence", command, *dict.fromkeys(paths), *([env] if env else []), how])

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +24,6 @@ from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.loading.resolve import load_job
 from ringfence.training.runs import Run
-from ringfence.types import Env
 from ringfence.utils.files import whole
 
 EVERY = 2  # steps per frame, at least
@@ -35,7 +35,8 @@ HELP = "install EGL (Debian: libegl1 libgl1-mesa-dri) or OSMesa (libosmesa6)"
 
 def backend() -> str:
     """The value of MUJOCO_GL that works here; `UserError` where nothing can draw."""
-    wanted, reasons = os.environ.get("MUJOCO_GL"), []
+    wanted = os.environ.get("MUJOCO_GL")
+    reasons = []
     trial = "import mujoco; mujoco.Renderer(mujoco.MjModel.from_xml_string('<mujoco/>'), 16, 16).render()"
     for name in (wanted,) if wanted else BACKENDS.get(sys.platform, ("egl", "osmesa")):
         made = _run([sys.executable, "-c", trial], name)
@@ -48,13 +49,18 @@ def backend() -> str:
 
 def check(task: Task) -> None:
     """`UserError` where no film of a task's episodes can be made."""
-    if not hasattr(task.env, "frames"):
-        raise UserError(f"The simulator of '{task.name}' draws no films; `ringfence report` animates its episodes.")
-    if _opengl(task.env):
+    if _opengl(_filmed(task)):
         backend()
 
 
-def _opengl(env: Env) -> bool:
+def _filmed(task: Task) -> Any:
+    """A task's simulator, which draws its episodes."""
+    if not hasattr(task.env, "frames"):
+        raise UserError(f"The simulator of '{task.name}' draws no films; `ringfence report` animates its episodes.")
+    return task.env
+
+
+def _opengl(env: Any) -> bool:
     return getattr(env, "opengl", False)
 
 
@@ -63,7 +69,7 @@ def film(run: Run, variant: str) -> Path:
     task = load_job(run, run.results.get(variant, {}).get("agents")).task
     check(task)
     kept = recorded(run, variant)
-    return animate(task.env, kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
+    return animate(_filmed(task), kept["states"][0], kept["costs"][0], run.path / f"rollout-{variant}.gif")
 
 
 def recorded(run: Run, variant: str) -> recordings.Recording:
@@ -74,17 +80,19 @@ def recorded(run: Run, variant: str) -> recordings.Recording:
     return kept
 
 
-def animate(env: Env, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
+def animate(env: Any, states: np.ndarray, costs: np.ndarray, out: str | Path) -> Path:
     """Write an animated GIF of one episode: states (T+1, S), costs (T,), drawn by its simulator. The film ends with a
     fall, after which the last state is repeated.
 
     `UserError` where nothing can draw.
     """
-    out, name = Path(out), backend() if _opengl(env) else ""
+    out = Path(out)
+    name = backend() if _opengl(env) else ""
     moved = np.flatnonzero((states[1:] != states[:-1]).any(1))
     steps = int(moved[-1]) + 1 if len(moved) else len(costs)
     with tempfile.TemporaryDirectory() as folder, whole(out) as temporary:
-        file, picture = Path(folder) / "episode.npz", Path(folder) / "episode.gif"
+        file = Path(folder) / "episode.npz"
+        picture = Path(folder) / "episode.gif"
         kind = f"{type(env).__module__}:{type(env).__qualname__}"
         made_of = json.dumps([kind, dataclasses.asdict(env)])
         np.savez(file, states=states[: steps + 1], costs=costs[:steps], env=made_of)
@@ -137,7 +145,8 @@ def main() -> None:
     """Draw the episode in a file that `animate` wrote."""
     with np.load(sys.argv[1]) as file:
         kind, fields = json.loads(str(file["env"]))
-        states, costs = file["states"], file["costs"]
+        states = file["states"]
+        costs = file["costs"]
     env = getattr(importlib.import_module(kind.partition(":")[0]), kind.partition(":")[2])(**fields)
     pictures = with_one_palette(list(env.frames(states, moments(costs))))
     shown = round(1000 * env.dt * stride(len(costs)))  # ms
