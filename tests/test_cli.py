@@ -9,7 +9,7 @@ import pytest
 from ringfence.cli import demo
 from ringfence.cli.app import main
 from ringfence.errors import UserError
-from ringfence.evaluation import protocol
+from ringfence.evaluation import rollout
 from ringfence.guards import GUARDS
 from ringfence.logs.store import EpisodeStore
 
@@ -93,12 +93,10 @@ def test_errors_of_the_system_are_told_in_one_sentence(monkeypatch, capsys, tmp_
 
 
 def test_it_is_said_which_of_several_runs_was_refused(monkeypatch, capsys, tmp_path):
-    import ringfence.evaluation.protocol
-
     def refuse(run, **told):
         raise UserError("this policy has diverged." if run.path.name != "b" else f"'{run.path}' is damaged.")
 
-    monkeypatch.setattr(ringfence.evaluation.protocol, "evaluate", refuse)
+    monkeypatch.setattr("ringfence.evaluation.evaluate.evaluate", refuse)
     for name in "abc":
         (tmp_path / name).mkdir()
         (tmp_path / name / "config.json").write_text("{}")
@@ -146,7 +144,7 @@ def test_brackets_in_messages_are_no_markup(capsys, tmp_path, monkeypatch):
 def test_the_whole_job(tmp_path, monkeypatch, capsys):
     """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(protocol, "CHUNK", 10)
+    monkeypatch.setattr(rollout, "CHUNK", 10)
     monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "rows": 2, "starts": 2, "shield": 1})
     monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
     page = demo.run(tmp_path / "demo", "random", quick=True)

@@ -20,7 +20,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import unsafe_starts
-from ringfence.guards import filter
+from ringfence.guards import guard
 from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save
@@ -177,7 +177,7 @@ def test_logs_tell_whom_they_cost(logs):
 
 def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypatch):
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
-    monkeypatch.setattr(sys.modules["ringfence.evaluation.protocol"], "CHUNK", 2)
+    monkeypatch.setattr(sys.modules["ringfence.evaluation.rollout"], "CHUNK", 2)
     run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card["data"]["episodes"] == 20
@@ -194,7 +194,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     order = np.array([3, 1, 4, 0, 2])  # who is asked first changes nothing
     pilot.reset()
     np.testing.assert_allclose(pilot.act(seen[order]), acted[order], atol=1e-6)
-    mine = filter(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
+    mine = guard(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
     assert mine.act(seen).shape == (5, 2) and mine.info["infeasible"].shape == ()
     with pytest.raises(UserError, match="no sight='all'"):
         evaluate(run, episodes=2, guard="shield", world=world, sight="all")
