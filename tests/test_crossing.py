@@ -199,7 +199,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     with pytest.raises(UserError, match="no sight='all'"):
         evaluate(run, episodes=2, guard="shield", world=world, sight="all")
     with pytest.raises(UserError, match="say with agents="):
-        filter(lambda seen, state: np.zeros((len(seen), 2)), world)
+        guard(lambda seen, state: np.zeros((len(seen), 2)), world)
 
 
 def test_episodes_are_drawn():
