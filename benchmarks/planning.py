@@ -21,7 +21,7 @@ from ringfence.datasets import behaviour, registry
 from ringfence.datasets.task import Task
 from ringfence.envs import SimpleSpread
 from ringfence.evaluation.latency import plan_latency
-from ringfence.guards import filter
+from ringfence.guards import guard
 from ringfence.loading.resolve import make_policy
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
@@ -87,7 +87,7 @@ def main() -> None:
         row(f"compile time of the training step, {n} agents", cost["compile_s"], "s")
         planner = make_policy(job, state, {})
         for name in ("select", "full"):
-            policy = filter(planner, world, guard=name)
+            policy = guard(planner, world, guard=name)
             took = plan_latency(policy, job.task, a.calls)
             row(f"one joint action, guard {name}, {n} agents, p50", took["plan_ms_p50"], "ms")
             row(f"one joint action, guard {name}, {n} agents, p99", took["plan_ms_p99"], "ms")

@@ -18,7 +18,8 @@ from ringfence.evaluation import protocol, rollout
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
 from ringfence.loading.controller import Controller
-from ringfence.loading.resolve import asked, load, loaded
+from ringfence.loading.resolve import load
+from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import draw
 from ringfence.training import loop
@@ -364,10 +365,10 @@ def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
     stepped = {**load_file(file), "step": np.array(-7, np.int32)}
     for wrong in (whole[: len(whole) // 2], bytes(flipped), stepped):
         save_file(wrong, file) if isinstance(wrong, dict) else file.write_bytes(wrong)
-        assert loaded(run, None, asked())[2] == before
+        assert resolve.resolve(PolicySpec.of(run)).step == before
         assert "the one before is used" in capsys.readouterr().err
         with pytest.raises(CheckpointError, match="truncated or damaged.*train the run again"):
-            loaded(run, 12, asked())
+            resolve.resolve(PolicySpec.of(run, checkpoint=12))
     file.write_bytes(whole)
     again = loop.train("bc", small_store, folder=lambda seed: run.path, chunk=6, **job_of("bc"))[0]
     assert again.checkpoints()[-1] == (12, file) and file.read_bytes() == whole

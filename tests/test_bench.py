@@ -36,7 +36,7 @@ from ringfence.cli.app import _runs, main
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation import protocol, reference
-from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.evaluate import evaluate_spec
 from ringfence.guards import GUARDS, GuardOptions
 from ringfence.problem.constraints import Separation, to_dict
 from ringfence.training import loop
@@ -302,14 +302,14 @@ def test_bad_names_and_folders_are_refused(made, tmp_path):
 def test_a_failing_cell_is_recorded_and_stops_nobody(tmp_path, monkeypatch):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
     g.open()
-    real, broken = evaluate, g.cells[0].folder(g.out)
+    broken = g.cells[0].folder(g.out)
 
-    def fails(run, **options):
-        if run.path == broken:
+    def fails(spec, **options):
+        if spec.run.path == broken:
             raise RuntimeError("the moon is in the way")
-        return real(run, **options)
+        return evaluate_spec(spec, **options)
 
-    monkeypatch.setattr(grid, "evaluate", fails)
+    monkeypatch.setattr(grid, "evaluate_spec", fails)
     heard = []
     grid.run_group(list(g.cells), g.out, g.episodes, lambda event, cell: heard.append((event, cell.seed)))
     assert heard == [("start", 0), ("failed", 0), ("start", 1), ("done", 1)]

@@ -23,15 +23,15 @@ from typing import Any
 
 from ringfence import __version__, algos
 from ringfence.bench.packed import unpack
-from ringfence.bench.suites import COLLECTIONS, EVALUATIONS, SUITES
+from ringfence.bench.suites import COLLECTIONS, SUITES
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.task import Task
 from ringfence.errors import RunConflict, UserError, unknown, whole_number
 from ringfence.evaluation import protocol, reference
-from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.evaluate import evaluate_spec
 from ringfence.guards import GuardOptions, options_of
-from ringfence.loading.resolve import asked
+from ringfence.loading.spec import PolicySpec
 from ringfence.logs.provenance import other_data
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
@@ -58,7 +58,7 @@ class Cell:
     preset: str
     seed: int
     changes: tuple[tuple[str, float], ...] = ()  # to the preset, e.g. (("steps", 100),)
-    evaluations: tuple[tuple[str, str], ...] = ()  # (variant in results.json, name in EVALUATIONS)
+    evaluations: tuple[tuple[str, str], ...] = ()  # (variant in results.json, name of its PolicySpec)
     transitions: int | None = None  # of the data set; None: the task's own number
 
     @property
@@ -105,7 +105,7 @@ class Cell:
             r = known.get(variant, {})
             same = r.get("episodes") == episodes and r.get("protocol") == protocol.PROTOCOL
             same = same and protocol.complete(r, registry.get(self.task)) and protocol.of_last_step(r, config)
-            return same and same_options(r, EVALUATIONS[name], registry.get(self.task), plan_defaults(self.config))
+            return same and same_options(r, PolicySpec.parse(name), registry.get(self.task), plan_defaults(self.config))
 
         return [e for e in self.evaluations if not there(*e)]
 
@@ -125,24 +125,22 @@ def _status(folder: Path) -> schemas.Status | None:
     return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else None
 
 
-def same_options(stored: dict, evaluation: dict, task: Task, defaults: dict) -> bool:
-    """Whether a result was played with the options of planner and guard that an evaluation's name stands for on a task
-    today, given the planner's defaults, and in a World of the settings that it has there. What labels come from follows
-    from the data."""
-    how = asked(**evaluation)
-    plan = PlanOptions(**{**defaults, **PLANNERS[how.planner], **how.plan})
+def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> bool:
+    """Whether a result was played as a spec stands for on a task today: with its options of planner and guard, given
+    the planner's defaults, and in a World of today's settings. What labels come from follows from the data."""
+    plan = PlanOptions(**{**defaults, **PLANNERS[spec.planner], **dict(spec.plan_options)})
     usual = names.planner_options(dataclasses.asdict(PlanOptions()))
     wanted = names.planner_options(dataclasses.asdict(plan))
     if stored["options"] and {**usual, **stored["options"]} != wanted:
         return False
     guard = stored.get("guard_options") or {}
-    if not how.guarded:
+    if not spec.guarded:
         return not guard
-    options = GuardOptions(**options_of(how.guard, how.danger, task.guard, **how.given))
+    options = GuardOptions(**options_of(spec.guard, spec.danger, task.guard, **dict(spec.guard_options)))
     wanted = names.guard_options(dataclasses.asdict(options))
     usual = names.guard_options(dataclasses.asdict(GuardOptions()))
     played = {**usual, **guard}  # an option newer than the result had its default then
-    world = Settings(**worlds.usual(task, worlds.sight_of(task, how.sight)))
+    world = Settings(**worlds.usual(task, worlds.sight_of(task, spec.sight)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
     known = names.world_settings(dataclasses.asdict(world))
     known = {k: v for k, v in known.items() if k not in ("labels", "barrier")}
@@ -380,11 +378,9 @@ class _Group:
         """Play the cell whose run is trained, and go on to the next one."""
         cell = self.left[0]
         trained = time.perf_counter() - self.begun
-        for variant, name in cell.missing(self.out, self.episodes):
+        for _, name in cell.missing(self.out, self.episodes):
             record = 4 if cell.seed == 0 else 0
-            found = evaluate(run, episodes=self.episodes, record=record, **EVALUATIONS[name])
-            if found["variant"] != variant:
-                raise RuntimeError(f"{run.path} was played as {found['variant']}, not as {variant}")
+            evaluate_spec(PolicySpec.parse(name, run), episodes=self.episodes, record=record)
         played = time.perf_counter() - self.begun - trained
         _record(cell, self.out, "done", self._took(cell, trained, played))
         self.tell("done", self.left.pop(0))

@@ -7,41 +7,7 @@ from dataclasses import dataclass
 from ringfence import algos
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
-
-# Named sets of evaluation-time choices; keyword arguments of evaluate.evaluate.
-EVALUATIONS: dict[str, dict] = {
-    "plain": {},
-    "steady": {"planner": "steady"},
-    **{
-        f"{guard}-{danger}": {"guard": guard, "danger": danger}
-        for guard in ("select", "shield", "adapt", "refine", "full")
-        for danger in ("learned", "formula")
-    },
-    **{
-        f"steady+adapt-{danger}": {"planner": "steady", "guard": "adapt", "danger": danger}
-        for danger in ("learned", "formula")
-    },
-    "steady+full-learned": {"planner": "steady", "guard": "full", "danger": "learned"},
-    # Where danger is decided long before: by what is dangerous now alone, and by what will be.
-    **{
-        f"shield-{danger}+rows{rows}+futureFalse": {"guard": "shield", "danger": danger, "rows": rows, "future": False}
-        for danger, rows in (("learned", 1), ("learned", 3), ("learned", 7), ("learned", 15), ("formula", 15))
-    },
-    "shield-learned+rows1": {"guard": "shield", "danger": "learned", "rows": 1},
-    "full-learned+reach2.0": {"guard": "full", "danger": "learned", "reach": 2.0},
-    "full-learned+margin1.0": {"guard": "full", "danger": "learned", "margin": 1.0},
-    "full-learned+reach2.0+margin1.0": {"guard": "full", "danger": "learned", "reach": 2.0, "margin": 1.0},
-    **{
-        f"shield-learned+agents{n}": {"guard": "shield", "danger": "learned", "agents": n}
-        for n in (2, 4, 6, 16, 64, 256)
-    },
-    **{f"full-learned+agents{n}": {"guard": "full", "danger": "learned", "agents": n} for n in (2, 4, 6)},
-    **{f"agents{n}": {"agents": n} for n in (2, 4, 6)},
-    **{
-        f"{guard}-learned-own": {"guard": guard, "danger": "learned", "sight": "own"}
-        for guard in ("shield", "adapt", "full")
-    },
-}
+from ringfence.loading.spec import PolicySpec
 
 
 @dataclass(frozen=True)
@@ -50,7 +16,7 @@ class Entry:
 
     algorithm: str
     preset: str = ""  # empty: the one made for the task where there is one, else the default
-    evaluations: tuple[str, ...] = ("plain",)
+    evaluations: tuple[str, ...] = ("plain",)  # how its runs are played, as names of PolicySpec
     tiers: tuple[str, ...] = ()  # empty: all
 
     def plays(self, tier: str) -> bool:
@@ -70,8 +36,7 @@ class Entry:
 
     def variant(self, task: Task, evaluation: str) -> str:
         """The name of an evaluation in results.json."""
-        preset = self.preset_for(task)
-        return preset if evaluation == "plain" else f"{preset}+{evaluation}"
+        return PolicySpec.parse(evaluation).variant(self.preset_for(task))
 
 
 @dataclass(frozen=True)

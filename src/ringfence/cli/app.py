@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from ringfence.cli import data as data_commands
+from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError, whole_number
 from ringfence.utils import interrupts
@@ -21,8 +22,7 @@ from ringfence.utils.files import writable
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
-# --set a=1 b=2 and --set a=1 --set b=2 mean the same, and so do --tasks a b and --tasks a --tasks b.
-Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
+# --tasks a b and --tasks a --tasks b mean the same.
 Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]
 
 
@@ -70,7 +70,7 @@ def train(
     """
     from ringfence.training import loop
 
-    changes = _assignments(set)
+    changes = assignments(set)
     whole_number("seeds", seeds, 1, 10_000)
     _early(algorithm, preset, changes)
     runs = loop.train(
@@ -113,7 +113,7 @@ def fit(
 
     report = None if report is None else writable(report)
     store = _store(data)
-    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **_assignments(set))
+    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **assignments(set))
     out.print(str(made.card), soft_wrap=True, markup=False)
     if out_file is not None:
         print(world.save(made, out_file))
@@ -130,24 +130,8 @@ def evaluate(
     split: Literal["test", "validation"] = "test",
     record: int = 4,
     step: int | None = None,
-    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
-    danger: Literal["learned", "formula", "both"] | None = None,
-    sight: Literal["all", "own"] | None = None,
-    agents: int | None = None,
-    world: Path | None = None,
-    planner: Literal["plain", "climbing", "steady"] = "plain",
-    plans: int | None = None,
-    margin: float | None = None,
-    rows: int | None = None,
-    steps: int | None = None,
-    sampler: str | None = None,
-    guidance: float | None = None,
-    target: float | None = None,
-    temperature: float | None = None,
-    replan: int | None = None,
-    execution: str | None = None,
     video: bool = False,
-    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    playing: How = AS_IT_IS,
 ) -> None:
     """Play a trained policy on the protocol's resets, as it is or under guard; all of it are evaluation-time choices.
 
@@ -157,30 +141,11 @@ def evaluate(
         split: test resets, or validation resets for choosing settings.
         record: episodes kept for the animation of the report.
         step: of the checkpoint that is played; the last one by default.
-        guard: what is done with what the policy proposes: select among several plans, refine them up the value, shield
-            (correct them until danger keeps its distance), adapt the shield's margin to what happens; full does all.
-        danger: how the guard knows it: learned from the logs (default), by the task's formula, or the worse of both.
-        sight: all: one guard sees the team; own: every agent guards its own action by its own view.
-        agents: who play, where they are alike (Crossing); as many as in the logs by default.
-        world: a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed.
-        planner: how diffusion planners draw plans: plain, climbing (value steers them), steady (for robots).
-        plans: asked for by the guard.
-        margin: kept from danger, in units of its source: calibrated margins, or the hazard's safe margin.
-        rows: foreseen and judged.
-        steps: of the sampler.
-        sampler: ddim, ddpm or dpm++.
-        guidance: ω of classifier-free guidance.
-        target: return condition, as a normal score.
-        temperature: scale of the first noise.
-        replan: steps for which a plan is followed.
-        execution: centralized or decentralized.
         video: make a GIF of the first episode (robots).
-        set: any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them.
     """
     from ringfence.evaluation.evaluate import evaluate as run_evaluation
 
-    given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}
-    given |= _options(_assignments(set), given)
+    given = playing.arguments()
     names = (
         "run",
         "variant",
@@ -202,12 +167,11 @@ def evaluate(
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
         record = record or 1
-    told = dict(episodes=episodes, split=split, planner=planner, guard=guard, sight=sight, record=record, step=step)
-    told |= {"quiet": False, "danger": danger, "world": world, "agents": agents}
+    given |= {"episodes": episodes, "split": split, "record": record, "step": step, "quiet": False}
     refused: dict[str, list] = {}  # what several runs are refused for is said once
     for run in found:
         try:
-            r = run_evaluation(run, **told, **given)
+            r = run_evaluation(run, **given)
         except UserError as error:
             refused.setdefault(str(error), []).append(run)
             continue
@@ -244,13 +208,7 @@ def play(
     episodes: int = 100,
     split: Literal["test", "validation"] = "test",
     at_once: int = 16,
-    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
-    danger: Literal["learned", "formula", "both"] | None = None,
-    sight: Literal["all", "own"] | None = None,
-    agents: int | None = None,
-    world: Path | None = None,
-    planner: Literal["plain", "climbing", "steady"] = "plain",
-    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    playing: How = AS_IT_IS,
 ) -> None:
     """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports.
 
@@ -260,26 +218,19 @@ def play(
         episodes: a bound of 1 % takes 300 without an accident.
         split: test resets, or validation resets for choosing settings.
         at_once: simulators that are stepped side by side.
-        guard: as in `ringfence eval`, as are all that follow.
-        danger: how the guard knows it: learned, formula or both.
-        sight: all or own.
-        agents: who play, where they are alike.
-        world: a file of `ringfence fit --out`, needed for a guard of data of your own.
-        planner: plain, climbing or steady.
-        set: any other option of planner or guard, e.g. --set rows=7 future=true.
     """
     from ringfence.evaluation.play import play as run_play
     from ringfence.evaluation.play import simulator
 
-    given = _options(_assignments(set), {})
+    given = playing.arguments()
     if not runs:
         raise UserError("No run was given; name run folders that `ringfence train` made.")
     found, make = _runs(runs), simulator(env)
     table, refused = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible"), {}
-    told = dict(episodes=episodes, split=split, at_once=at_once, planner=planner, guard=guard, sight=sight)
+    given |= {"episodes": episodes, "split": split, "at_once": at_once, "keep": True, "quiet": False}
     for run in found:
         try:
-            r = run_play(run, make, keep=True, quiet=False, danger=danger, world=world, agents=agents, **told, **given)
+            r = run_play(run, make, **given)
         except UserError as error:
             refused.setdefault(str(error), []).append(run)
             continue
@@ -331,23 +282,7 @@ def export(
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
     format: Literal["onnx", "stablehlo"] = "onnx",
     step: int | None = None,
-    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
-    danger: Literal["learned", "formula", "both"] | None = None,
-    sight: Literal["all", "own"] | None = None,
-    agents: int | None = None,
-    world: Path | None = None,
-    planner: Literal["plain", "climbing", "steady"] = "plain",
-    plans: int | None = None,
-    margin: float | None = None,
-    rows: int | None = None,
-    steps: int | None = None,
-    sampler: str | None = None,
-    guidance: float | None = None,
-    target: float | None = None,
-    temperature: float | None = None,
-    replan: int | None = None,
-    execution: str | None = None,
-    set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
+    playing: How = AS_IT_IS,
 ) -> None:
     """Write a trained policy, guard included, as one file that needs neither Python nor this library.
 
@@ -356,67 +291,14 @@ def export(
         out_file: the file to write.
         format: onnx, for onnxruntime and the like, needs the extra `ringfence[export]`; stablehlo needs nothing.
         step: of the checkpoint that is written; the last one by default.
-        guard: as in `ringfence eval`, as are all that follow.
-        danger: how the guard knows it: learned, formula or both.
-        sight: all or own.
-        agents: who play, where they are alike; the file is of that many.
-        world: a file of `ringfence fit --out`, needed for data of your own.
-        planner: plain, climbing or steady.
-        plans: asked for by the guard.
-        margin: kept from danger.
-        rows: foreseen and judged.
-        steps: of the sampler.
-        sampler: ddim, ddpm or dpm++.
-        guidance: ω of classifier-free guidance.
-        target: return condition, as a normal score.
-        temperature: scale of the first noise.
-        replan: steps for which a plan is followed.
-        execution: centralized or decentralized.
-        set: any other option of planner or guard, e.g. --set shield=20.
     """
-    given = {k: v for k, v in locals().items() if k in FLAGS and v is not None}
-    given |= _options(_assignments(set), given)
+    given = playing.arguments()
     found = _runs([run])
     if len(found) > 1:
         raise UserError(f"'{run}' holds {len(found)} runs, and a file is of one; name it, e.g. {found[0].path}.")
     from ringfence.deploy.export import export as write
 
-    told = dict(planner=planner, guard=guard, danger=danger, sight=sight, agents=agents, world=world)
-    print(write(found[0], out_file, format, step, **told, **given))
-
-
-def _options(assigned: dict[str, str], given: dict) -> dict[str, str]:
-    """What --set says of planner and guard; refused where a flag said it already, or where it is an option of
-    neither."""
-    from ringfence.guards import GuardOptions
-    from ringfence.loading.resolve import asked
-    from ringfence.proposals.options import PlanOptions
-    from ringfence.utils.config import parse_as
-
-    for name, value in assigned.items():
-        if name in ("episodes", "split", "record", "step", "planner", "guard", "danger", "sight", "world", "agents"):
-            raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
-        if name in given:
-            raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
-    how = asked(**assigned)  # an unknown name is refused before any run is played
-    for kind, values in ((PlanOptions, how.plan), (GuardOptions, how.given)):
-        parse_as(kind, values)
-    return assigned
-
-
-# What is handed on to planner and guard.
-FLAGS = (
-    "plans",
-    "margin",
-    "rows",
-    "steps",
-    "sampler",
-    "guidance",
-    "target",
-    "temperature",
-    "replan",
-    "execution",
-)
+    print(write(found[0], out_file, format, step, **given))
 
 
 def judge(
@@ -760,19 +642,6 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _complain(message: str) -> None:
     Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
-
-
-def _assignments(given: list[list[str]]) -> dict[str, str]:
-    """Names and values of every --set; each of them takes several."""
-    changes: dict[str, str] = {}
-    for pair in (pair for pairs in given for pair in pairs):
-        name, equals, value = pair.partition("=")
-        if not equals or not name:
-            raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set steps=8000.")
-        if name in changes:
-            raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
-        changes[name] = value
-    return changes
 
 
 def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:

@@ -31,7 +31,8 @@ from jax.extend import core
 from ringfence import __version__
 from ringfence.errors import UserError, unknown
 from ringfence.guards import Guarded
-from ringfence.loading.resolve import asked, load, variant_name
+from ringfence.loading.resolve import resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.problem.homogeneous import Each
 from ringfence.proposals.base import heard
 from ringfence.proposals.planner import Planner
@@ -90,10 +91,12 @@ def export(
         raise unknown("format", str(format), FORMATS)
     file = writable(out)
     _converter() if format == "onnx" else _packer()
-    run, how = Run.of(run), asked(planner, **options)
-    job, policy = load(run, step, planner, **options)
-    made = step_of(job, policy)
-    told = facts(run, job, policy, made, variant_name(job, _inner(policy), how, "test"), how.danger)
+    resolved = resolve(PolicySpec.of(run, checkpoint=step, planner=planner, **options))
+    job = resolved.job
+    made = step_of(job, resolved.team)
+    # A file says beside its name which checkpoint it is of.
+    variant = dataclasses.replace(resolved.spec, checkpoint=None).variant(job.preset)
+    told = facts(Run.of(run), job, resolved.team, made, variant, resolved.spec.danger)
     write = {"onnx": _write_onnx, "stablehlo": _write_stablehlo}[format]
     with whole(file) as temporary:
         write(made, told, temporary)

@@ -18,8 +18,8 @@ from ringfence.envs.episode import Cost, Episode, Shape
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import evaluate, protocol, rollout, statistics
 from ringfence.guards import Pilot
-from ringfence.loading import resolve
-from ringfence.loading.resolve import asked, loaded
+from ringfence.loading.resolve import resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.problem.constraints import CostColumn
 from ringfence.problem.homogeneous import look
 from ringfence.proposals.base import act_with, heard
@@ -171,8 +171,9 @@ def _named(env: Any) -> str:
 
 def _trained(run: Run | str, planner: str, split: str, options: dict) -> Player:
     """A run, as it is to be played."""
-    run, how = Run.of(run), asked(planner, **options)
-    job, policy, step = loaded(run, None, how)
+    resolved = resolve(PolicySpec.of(run, planner=planner, **options))
+    run = Run.of(run)
+    job = resolved.job
 
     @jax.jit
     def unsafe(seen, state):
@@ -181,15 +182,15 @@ def _trained(run: Run | str, planner: str, split: str, options: dict) -> Player:
 
     return Player(
         job.algorithm.name,
-        resolve.of_team(job, policy),
+        resolved.team,
         job.task,
         Shape(job.team, job.widths[0], job.widths[1] or 0, job.task.alike),
         job.spec.episode_length,
         (lambda *seen: np.asarray(unsafe(*seen))) if job.hazard.has_formula else None,
-        {"step": step} | evaluate.about(run, job, policy, how),
+        {"step": resolved.step} | evaluate.about(resolved),
         run.config["data"].get("constraints") or {},
         run,
-        resolve.variant_name(job, policy, how, split),
+        resolved.variant(split),
     )
 
 

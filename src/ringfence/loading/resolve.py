@@ -1,19 +1,20 @@
-"""How a run is to be played, and the policy that does."""
+"""A spec is resolved once, to the policy that it names; who plays, evaluates or exports it is given the value."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+from typing import Any
 
 import jax
 
 from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import UserError, unknown, whole_number
-from ringfence.guards import DANGERS, GUARDS, Guarded, GuardOptions
+from ringfence.errors import UserError, unknown
+from ringfence.guards import Guard, Guarded
 from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
+from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.homogeneous import Each
@@ -27,98 +28,86 @@ from ringfence.utils.config import build_config
 from ringfence.world import World
 
 
-def load(run: Run | str, step: int | None = None, planner: str = "plain", **options):
+@dataclasses.dataclass(frozen=True)
+class Resolved:
+    """A spec, and the values that its names stand for."""
+
+    spec: PolicySpec  # without the choices that nothing reads
+    job: Job
+    policy: Policy  # of homogeneous agents, that of each
+    step: int  # of the checkpoint
+
+    @property
+    def team(self) -> Policy:
+        """The policy as the whole team plays it."""
+        return Each(self.policy, self.job.team) if self.job.task.alike else self.policy
+
+    @property
+    def proposal(self) -> Any:
+        """The policy without its guard."""
+        return self.policy.proposal if isinstance(self.policy, Guarded) else self.policy
+
+    @property
+    def plan_options(self) -> PlanOptions | None:
+        """How plans are drawn, by who draws some."""
+        return self.proposal.options if isinstance(self.proposal, Planner) else None
+
+    @property
+    def guard(self) -> Guard | None:
+        return self.policy.guard if isinstance(self.policy, Guarded) else None
+
+    def variant(self, split: str = "test") -> str:
+        """What a result of it is called."""
+        return self.spec.variant(self.job.preset, split)
+
+
+def load(run: Run | str, step: int | None = None, planner: str = "plain", **options: Any) -> tuple[Job, Policy]:
     """(job, policy) of a finished run.
 
-    `planner` is a named set of options of those who draw plans (policies.PLANNERS), `guard` one of guards
-    (guard.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
+    `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards
+    (guards.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
     agent guards its own action by its own view ("own", the only one of agents who are alike), `world` the World it
     reads (default: that of the run's data and seed), `agents` how many play, where they are alike. Other options are
     fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """
-    job, policy, _ = loaded(run, step, asked(planner, **options))
-    return job, of_team(job, policy)
+    found = resolve(PolicySpec.of(run, checkpoint=step, planner=planner, **options))
+    return found.job, found.team
 
 
-def of_team(job: Job, policy: Policy) -> Policy:
-    """A job's policy as its whole team plays it."""
-    return Each(policy, job.team) if job.task.alike else policy
-
-
-@dataclasses.dataclass(frozen=True)
-class Asked:
-    """How a run is to be played."""
-
-    planner: str
-    guard: str
-    danger: str
-    sight: str | None
-    world: World | str | Path | None
-    agents: int | None  # who play, where they are alike; None: as many as in the logs
-    plan: dict  # options of the planner
-    given: dict  # options of the guard
-
-    @property
-    def guarded(self) -> bool:
-        return self.guard != "none" or bool(self.given)
-
-
-def asked(
-    planner: str = "plain",
-    guard: str = "none",
-    danger: str | None = None,
-    sight: str | None = None,
-    world: World | str | Path | None = None,
-    agents: int | None = None,
-    **options,
-) -> Asked:
-    """Names and options sorted to whom they belong; unknown ones are refused."""
-    for kind, name, known in (
-        ("planner", planner, PLANNERS),
-        ("guard", guard, GUARDS),
-        ("sight", sight or "all", ("all", "own")),
-    ):
-        if name not in known:
-            raise unknown(kind, str(name), known)
-    if danger is not None and danger not in DANGERS:
-        raise unknown("danger", str(danger), DANGERS)
-    fields = {f.name for f in dataclasses.fields(GuardOptions)}
-    given = {k: v for k, v in options.items() if k in fields}
-    plan = {k: v for k, v in options.items() if k not in fields}
-    for name in plan:
-        if name not in (names := {f.name for f in dataclasses.fields(PlanOptions)}):
-            raise unknown("option of planner or guard", name, names | fields)
-    if agents is not None:
-        whole_number("agents", agents, 1, 100_000)
-    found = Asked(planner, guard, danger or "learned", sight, world, agents, plan, given)
-    if not found.guarded and (danger is not None or sight == "own" or world is not None):
-        told = next(k for k, v in (("danger", danger), ("sight", sight == "own"), ("world", world)) if v)
-        raise UserError(f"{told} is read by nothing without a guard; name one with guard=, e.g. shield.")
-    return found
-
-
-def loaded(run: Run | str, step: int | None, how: Asked) -> tuple[Job, Policy, int]:
-    """(job, policy, step of the checkpoint); of agents who are alike, the policy of each."""
-    run = Run.of(run)
-    job = load_job(run, how.agents)
+def resolve(spec: PolicySpec) -> Resolved:
+    """The policy that a spec names. Only this may read a World, or make one again from regenerated data."""
+    if spec.run is None:
+        raise UserError("This spec names no run; give one that `ringfence train` made.")
+    run = spec.run
+    job = load_job(run, spec.agents)
     world = run_worlds.of_run(run) if job.reads_world else None
-    told = {} if world is None else {"world": world}
+    step, policy = _trained(run, job, world, spec)
+    plans = isinstance(policy, Planner)
+    if spec.guarded:
+        sight = worlds.sight_of(job.task, spec.sight)
+        world = run_worlds.for_guard(run, sight, spec.world, read=world, quiet=False)
+        usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
+        options = dict(spec.guard_options)
+        policy = build(policy, world, job.hazard.hazard, spec.guard, spec.danger, usual, **options)
+    spec = spec if plans else spec.without_plans()
+    # Homogeneous agents see for themselves anyway.
+    spec = dataclasses.replace(spec, sight=None) if job.task.alike else spec
+    return Resolved(spec, job, policy, step)
+
+
+def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple[int, Policy]:
+    """(step, policy) of the checkpoint, without a guard."""
+    read = {} if world is None else {"world": world}
 
     def blank():
-        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **told)
+        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **read)
         return loop.learned(state)
 
-    at, state = run.load_checkpoint(jax.eval_shape(blank), step)
+    step, state = run.load_checkpoint(jax.eval_shape(blank), spec.checkpoint)
     if world is not None:
         state |= {"world": job.algorithm.of_world(world, job.config)}
-    policy = make_policy(job, state, {**PLANNERS[how.planner], **how.plan})
-    if how.guarded:
-        sight = worlds.sight_of(job.task, how.sight)
-        world = run_worlds.for_guard(run, sight, how.world, read=world, quiet=False)
-        usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
-        policy = build(policy, world, job.hazard.hazard, how.guard, how.danger, usual, **how.given)
-    return job, policy, at
+    return step, make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
 
 
 def load_job(run: Run, agents: int | None = None) -> Job:
@@ -165,26 +154,3 @@ def make_policy(job: Job, state, options: dict) -> Policy:
     """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
     chosen = build_config(PlanOptions, {**plan_defaults(job.config), **options}, "the planner")
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
-
-
-def variant_name(job: Job, policy: Policy, how: Asked, split: str) -> str:
-    """Preset, named planner, guard with its danger and sight, and the values of the options given beside them, e.g.
-    `split+climbing+shield-learned+rows7`. Neither their order nor how their values were spelled makes another name."""
-    inner = policy.proposal if isinstance(policy, Guarded) else policy
-    name, plans = job.preset, isinstance(inner, Planner)
-    if plans and how.planner != "plain":
-        name += f"+{how.planner}"
-    if isinstance(policy, Guarded):
-        own = how.sight == "own" and not job.task.alike
-        name += f"+{how.guard}-{how.danger}" + ("-own" if own else "")
-    for options, given in ((inner.options if plans else None, how.plan), (_guard_of(policy), how.given)):
-        for field in dataclasses.fields(options) if options is not None else ():
-            if field.name in given:
-                value = getattr(options, field.name)
-                name += f"+{field.name}{float(value) if isinstance(field.default, float) else value}"
-    name += "" if how.agents is None else f"+agents{how.agents}"
-    return name if split == "test" else f"{name}@{split}"
-
-
-def _guard_of(policy: Policy) -> GuardOptions | None:
-    return policy.guard.options if isinstance(policy, Guarded) else None

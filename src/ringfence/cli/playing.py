@@ -1,0 +1,90 @@
+"""How a run is to be played, as flags that several commands share."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from ringfence.errors import UserError
+
+# --set a=1 b=2 and --set a=1 --set b=2 mean the same.
+Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
+
+
+@dataclass(frozen=True)
+class Playing:
+    """Choices of evaluation time."""
+
+    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none"
+    """what is done with what the policy proposes: select among several plans, refine them up the value, shield
+    (correct them until danger keeps its distance), adapt the shield's margin to what happens; full does all."""
+    danger: Literal["learned", "formula", "both"] | None = None
+    """how the guard knows it: learned from the logs (default), by the task's formula, or the worse of both."""
+    sight: Literal["all", "own"] | None = None
+    """all: one guard sees the team; own: every agent guards its own action by its own view."""
+    agents: int | None = None
+    """who play, where they are alike (Crossing); as many as in the logs by default."""
+    world: Path | None = None
+    """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
+    planner: Literal["plain", "climbing", "steady"] = "plain"
+    """how diffusion planners draw plans: plain, climbing (value steers them), steady (for robots)."""
+    plans: int | None = None
+    """asked for by the guard."""
+    margin: float | None = None
+    """kept from danger, in units of its source: calibrated margins, or the hazard's safe margin."""
+    rows: int | None = None
+    """foreseen and judged."""
+    steps: int | None = None
+    """of the sampler."""
+    sampler: str | None = None
+    """ddim, ddpm or dpm++."""
+    guidance: float | None = None
+    """ω of classifier-free guidance."""
+    target: float | None = None
+    """return condition, as a normal score."""
+    temperature: float | None = None
+    """scale of the first noise."""
+    replan: int | None = None
+    """steps for which a plan is followed."""
+    execution: str | None = None
+    """centralized or decentralized."""
+    set: Assignments = field(default_factory=list)
+    """any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them."""
+
+    def arguments(self) -> dict[str, Any]:
+        """What was given, as arguments of `PolicySpec.of`; refused before any run is played."""
+        from ringfence.loading.spec import PolicySpec
+
+        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
+        given = {name: value for name, value in given.items() if value is not None}
+        assigned = assignments(self.set)
+        flags = {"episodes", "split", "record", "step", *_FLAGS_ALONE}
+        for name, value in assigned.items():
+            if name in flags:
+                raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
+            if name in given:
+                raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
+        PolicySpec.of(**assigned)  # an unknown name, or a value of another type
+        return given | assigned
+
+
+_FLAGS_ALONE = ("planner", "guard", "danger", "sight", "world", "agents")
+AS_IT_IS = Playing()
+How = tyro.conf.OmitArgPrefixes[Playing]
+
+
+def assignments(given: list[list[str]]) -> dict[str, str]:
+    """Names and values of every --set; each of them takes several."""
+    changes: dict[str, str] = {}
+    for pair in (pair for pairs in given for pair in pairs):
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set steps=8000.")
+        if name in changes:
+            raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
+        changes[name] = value
+    return changes

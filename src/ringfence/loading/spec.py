@@ -1,0 +1,173 @@
+"""Who plays: a run and every choice of how it is played, as one value with a name that can be read back."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ringfence.errors import UserError, unknown, whole_number
+from ringfence.guards import DANGERS, GUARDS, GuardOptions
+from ringfence.proposals.options import PLANNERS, PlanOptions
+from ringfence.training.runs import Run
+from ringfence.utils.config import parse_as
+from ringfence.world import World
+
+SIGHTS = ("all", "own")
+PLAIN = "plain"  # the planner that is not named, and the name of a spec without any choice
+Options = tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True)
+class PolicySpec:
+    """A run, and how it is to be played. `of` makes one from names and options and refuses what cannot be; `name` says
+    it in one word, e.g. `steady+shield-learned+rows7+agents4`, and `parse` reads that back. Neither the order in which
+    options were given nor how their values were spelled makes another spec."""
+
+    run: Run | None = None
+    checkpoint: int | None = None  # the step of the one that is played; None: the last
+    planner: str = PLAIN  # a named set of PlanOptions
+    plan_options: Options = ()  # given beside it, in the order of the fields
+    guard: str = "none"  # a named set of GuardOptions
+    guard_options: Options = ()
+    danger: str = "learned"  # what the guard knows danger by
+    sight: str | None = None  # all: the guard sees the team; own: every agent guards itself; None: as the task
+    world: World | Path | None = field(default=None, compare=False)  # None: that of the run's data and seed
+    agents: int | None = None  # who play, where agents are homogeneous; None: as many as in the logs
+
+    @classmethod
+    def of(
+        cls,
+        run: Run | str | Path | None = None,
+        *,
+        checkpoint: int | None = None,
+        planner: str = PLAIN,
+        guard: str = "none",
+        danger: str | None = None,
+        sight: str | None = None,
+        world: World | str | Path | None = None,
+        agents: int | None = None,
+        **options: Any,
+    ) -> PolicySpec:
+        """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
+        Unknown names are refused, and so is what nothing would read."""
+        _known("planner", planner, PLANNERS)
+        _known("guard", guard, GUARDS)
+        _known("sight", sight or "all", SIGHTS)
+        if danger is not None:
+            _known("danger", danger, DANGERS)
+        guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
+        plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
+        for name in options:
+            if name not in guard_names + plan_names:
+                raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
+        if agents is not None:
+            whole_number("agents", agents, 1, 100_000)
+        spec = cls(
+            run=None if run is None else Run.of(run),
+            checkpoint=checkpoint,
+            planner=planner,
+            plan_options=_options(PlanOptions, {k: v for k, v in options.items() if k not in guard_names}),
+            guard=guard,
+            guard_options=_options(GuardOptions, {k: v for k, v in options.items() if k in guard_names}),
+            danger=danger or "learned",
+            sight=sight,
+            world=world if world is None or isinstance(world, World) else Path(world),
+            agents=agents,
+        )
+        if not spec.guarded:
+            unread = {"danger": danger is not None, "sight": sight == "own", "world": world is not None}
+            for name, given in unread.items():
+                if given:
+                    raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
+        return spec
+
+    @classmethod
+    def parse(cls, name: str, run: Run | str | Path | None = None) -> PolicySpec:
+        """The spec of that `name`."""
+        options: dict[str, Any] = {}
+        for part in name.split("+"):
+            options |= dict(_part(part, name))
+        return cls.of(run, **options)
+
+    @property
+    def guarded(self) -> bool:
+        return self.guard != "none" or bool(self.guard_options)
+
+    @property
+    def name(self) -> str:
+        """Planner, guard with its danger and sight, and the options given beside them; `plain` without any."""
+        parts = [] if self.planner == PLAIN else [self.planner]
+        if self.guarded:
+            parts.append(f"{self.guard}-{self.danger}" + ("-own" if self.sight == "own" else ""))
+        parts += [f"{name}{value}" for name, value in self.plan_options + self.guard_options]
+        if self.agents is not None:
+            parts.append(f"agents{self.agents}")
+        return "+".join(parts) or PLAIN
+
+    def variant(self, preset: str, split: str = "test") -> str:
+        """The name of a result: whose preset it is, how it was played, and what is not as in every table."""
+        name = preset if self.name == PLAIN else f"{preset}+{self.name}"
+        if split != "test":
+            name += f"@{split}"
+        return name if self.checkpoint is None else f"{name}@step{self.checkpoint}"
+
+    def of_run(self, run: Run | str | Path) -> PolicySpec:
+        """The same choices for another run."""
+        return replace(self, run=Run.of(run))
+
+    def without_plans(self) -> PolicySpec:
+        """The same of a policy that draws no plans, which reads no choice of planners."""
+        return replace(self, planner=PLAIN, plan_options=())
+
+
+def _known(kind: str, name: Any, known: Any) -> None:
+    if name not in known:
+        raise unknown(kind, str(name), known)
+
+
+def _options(kind: type, given: Mapping[str, Any]) -> Options:
+    """Options in the order of the fields, each of its field's type; those that cannot be are left for `build_config`
+    to refuse."""
+    fields = [f for f in dataclasses.fields(kind) if f.name in given]
+    return tuple((f.name, _typed(kind, f.name, given[f.name], f.default)) for f in fields)
+
+
+def _typed(kind: type, name: str, value: Any, default: Any) -> Any:
+    if isinstance(value, str):
+        return parse_as(kind, {name: value})[name]
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return value
+    if isinstance(default, float):
+        return float(value)
+    whole = isinstance(value, float) and value.is_integer()
+    return int(value) if whole and not isinstance(default, bool) else value
+
+
+_GUARD = re.compile(rf"({'|'.join(GUARDS)})-({'|'.join(DANGERS)})(-own)?")
+_AGENTS = re.compile(r"agents(\d+)")
+
+
+def _part(part: str, name: str) -> Iterator[tuple[str, Any]]:
+    """What one part of a name says, as arguments of `PolicySpec.of`."""
+    if part in PLANNERS:
+        yield "planner", part
+    elif found := _GUARD.fullmatch(part):
+        yield "guard", found[1]
+        yield "danger", found[2]
+        if found[3]:
+            yield "sight", "own"
+    elif found := _AGENTS.fullmatch(part):
+        yield "agents", int(found[1])
+    else:
+        fields = [f.name for kind in (PlanOptions, GuardOptions) for f in dataclasses.fields(kind)]
+        option = max((f for f in fields if part.startswith(f) and part != f), key=len, default=None)
+        if option is None:
+            raise UserError(f"'{part}' in '{name}' says nothing of planner or guard; name a guard as shield-learned.")
+        yield option, part[len(option) :]
