@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from ringfence.cli.app import main
+from ringfence.datasets.importers.columns import read as read_columns
+from ringfence.datasets.importers.hdf5 import import_hdf5
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.io.columns import read as read_columns
-from ringfence.logs.io.hdf5 import import_hdf5
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop
 from ringfence.utils import arrays

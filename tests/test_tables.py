@@ -8,7 +8,7 @@ import pytest
 import ringfence
 from ringfence.cli import app
 from ringfence.errors import UserError
-from ringfence.logs.io.table import from_layout, from_table, observe
+from ringfence.logs.io.table import observe
 from ringfence.logs.io.tracks import cut, nearest, resample, teams
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import CostColumn, Separation
@@ -37,7 +37,7 @@ def entry(store: EpisodeStore, name: str) -> np.ndarray:
 
 def test_rows_on_one_clock_come_out_as_they_are():
     table = fleet()
-    store = from_table(table, **NAMES, reward="paid", goal=["gx", "gy"])
+    store = EpisodeStore.from_table(table, **NAMES, reward="paid", goal=["gx", "gy"])
     assert (store.episodes, store.steps, store.n_agents) == (6, 66, 3) and store.card["dt"] == 0.1
     grid = {name: x.reshape(6, 12, 3) for name, x in table.items()}
     for name in ("x", "y", "vx", "vy"):
@@ -61,12 +61,12 @@ def test_data_frames_files_and_shuffled_agents_are_the_same(tmp_path):
     frame.to_csv(tmp_path / "fleet.csv", index=False)
     frame.to_parquet(tmp_path / "fleet.parquet")
     by_agent = frame.sort_values(["id", "run", "t"])
-    whole = from_table(table, **NAMES)
+    whole = EpisodeStore.from_table(table, **NAMES)
     for other in (frame, by_agent, tmp_path / "fleet.csv", str(tmp_path / "fleet.parquet")):
         assert EpisodeStore.from_table(other, **NAMES).content == whole.content
     import pyarrow
 
-    assert from_table(pyarrow.table(table), **NAMES).content == whole.content
+    assert EpisodeStore.from_table(pyarrow.table(table), **NAMES).content == whole.content
 
 
 def test_uneven_times_are_put_on_one_clock():
@@ -159,7 +159,7 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
     """The whole way: a policy of one agent, its World from the distances, played by seven."""
     told = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
     table = fleet(agents=5, steps=20) | {"gx": np.full(600, 1.5), "gy": np.full(600, -0.5)}
-    store = from_table(table, **told, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
+    store = EpisodeStore.from_table(table, **told, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
     assert store.n_agents == 1 and store.card["alike"] and store.costs.any() and (store.lengths <= 10).all()
     far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
     seen = entry(store, "other0.seen") > 0
@@ -180,7 +180,7 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
 
 def test_velocities_and_accelerations_that_nobody_logged():
     table = fleet()
-    store = from_table(table, **NAMES | dict(state=["x", "y"], action=()))
+    store = EpisodeStore.from_table(table, **NAMES | dict(state=["x", "y"], action=()))
     x = table["x"].reshape(6, 12, 3)
     v = np.diff(x, axis=1) / 0.1
     np.testing.assert_allclose(entry(store, "own.vx").reshape(6, 12, 3)[:, 1:], v, atol=1e-4)
@@ -191,7 +191,7 @@ def test_velocities_and_accelerations_that_nobody_logged():
 def test_costs_of_distances_and_of_the_team():
     table = fleet(agents=2)
     apart = np.hypot(*(np.diff(table[c].reshape(6, 12, 2))[..., 0] for c in "xy"))
-    store = from_table(table, **NAMES | dict(cost=None), danger=Separation(2.0))
+    store = EpisodeStore.from_table(table, **NAMES | dict(cost=None), danger=Separation(2.0))
     np.testing.assert_array_equal(store.costs.reshape(6, 11) > 0, apart[:, 1:] < 2.0)
     assert any("taken for the team's" in note for note in store.card["warnings"])
 
@@ -202,7 +202,7 @@ def test_published_layouts_read_as_they_are(tmp_path):
     lines = [f"{f},1,{10 + f * 1.2:.3f},4.0,4.0,2.0,30.0,0.0,0.1,0.0,0,2" for f in range(1, 40)]
     lines += [f"{f},2,{90 - f * 1.0:.3f},8.0,6.0,2.0,-25.0,0.0,0.0,0.2,0,5" for f in range(11, 60)]
     (tmp_path / "01_tracks.csv").write_text("\n".join([head, *lines]) + "\n")
-    store = from_layout(tmp_path / "01_tracks.csv", "highd", neighbours=1, danger=Separation(5.0))
+    store = EpisodeStore.from_layout(tmp_path / "01_tracks.csv", "highd", neighbours=1, danger=Separation(5.0))
     assert store.episodes == 2 and store.card["dt"] == 0.04 and store.actions.shape[2] == 2
     both = entry(store, "other0.seen")[:, 0] > 0
     assert both[10:39].all() and not both[:10].any()
@@ -212,11 +212,11 @@ def test_published_layouts_read_as_they_are(tmp_path):
     head = "track_id,frame_id,timestamp_ms,agent_type,x,y,vx,vy,psi_rad,length,width"
     lines = [f"{i},{f},{f * 100},car,{f * 0.5 + i},{i},5.0,0.0,0.0,4.1,1.8" for i in (1, 2) for f in range(1, 20)]
     (tmp_path / "vehicle_tracks_000.csv").write_text("\n".join([head, *lines]) + "\n")
-    store = from_layout(tmp_path / "vehicle_tracks_000.csv", "interaction")
+    store = EpisodeStore.from_layout(tmp_path / "vehicle_tracks_000.csv", "interaction")
     assert (store.episodes, store.steps, store.n_agents) == (1, 18, 2) and store.card["dt"] == 0.1
     np.testing.assert_allclose(entry(store, "own.x")[:, 0], np.arange(1, 20) * 0.5 + 1, atol=1e-5)
     with pytest.raises(UserError, match="No layout.*'hiway'|layout 'hiway'"):
-        from_layout(tmp_path / "01_tracks.csv", "hiway")
+        EpisodeStore.from_layout(tmp_path / "01_tracks.csv", "hiway")
 
 
 def broken(**columns):
@@ -263,7 +263,7 @@ def broken(**columns):
 )
 def test_tables_that_cannot_be_are_refused(table, options, said):
     with pytest.raises(UserError, match=said):
-        from_table(table, **NAMES | options)
+        EpisodeStore.from_table(table, **NAMES | options)
 
 
 def test_files_that_are_no_tables_are_refused(tmp_path):
@@ -273,16 +273,18 @@ def test_files_that_are_no_tables_are_refused(tmp_path):
         with pytest.raises(
             UserError, match="no table that can be read|ends in|column of the table|twice, or no header"
         ):
-            from_table(tmp_path / name, **NAMES)
+            EpisodeStore.from_table(tmp_path / name, **NAMES)
 
 
 def test_units_that_disagree_are_noted():
     table = fleet()
-    assert not any("times what" in note for note in from_table(table, **NAMES).card["warnings"])
+    assert not any("times what" in note for note in EpisodeStore.from_table(table, **NAMES).card["warnings"])
     table |= {"vx": table["vx"] * 3.6, "vy": table["vy"] * 3.6}
-    assert any("vx is 3.6 times what x changes by" in note for note in from_table(table, **NAMES).card["warnings"])
+    assert any(
+        "vx is 3.6 times what x changes by" in note for note in EpisodeStore.from_table(table, **NAMES).card["warnings"]
+    )
     swapped = fleet() | {"vx": fleet()["vy"], "vy": -fleet()["vx"]}
-    notes = from_table(swapped, **NAMES).card["warnings"]
+    notes = EpisodeStore.from_table(swapped, **NAMES).card["warnings"]
     assert sum("times what" in note for note in notes) == 2
 
 
@@ -291,7 +293,7 @@ def test_clocks_that_jitter_change_nothing_that_was_told():
     table = fleet(steps=30)
     chance = np.random.default_rng(5)
     late = table | {"t": table["t"] + chance.uniform(-0.02, 0.02, len(table["t"]))}
-    exact, got = from_table(table, **NAMES), from_table(late, **NAMES, dt=0.1)
+    exact, got = EpisodeStore.from_table(table, **NAMES), EpisodeStore.from_table(late, **NAMES, dt=0.1)
     assert got.steps >= 0.9 * exact.steps
     for store in (exact, got):
         near = np.abs(store.actions[:, :, 0][:, :, None] - table["ax"][None, None]) < 1e-6
@@ -305,13 +307,17 @@ def test_clocks_that_jitter_change_nothing_that_was_told():
         told = grid["hit"][run, shifts[0] + 1 : shifts[0] + 1 + steps]
         np.testing.assert_array_equal(got.costs[mine], told)
         begin, held, cost = begin + steps, held + 1, cost + told.sum()
-    assert held == 6 and cost > 0 and any("off the clock" in n for n in from_table(late, **NAMES).card["warnings"])
+    assert (
+        held == 6
+        and cost > 0
+        and any("off the clock" in n for n in EpisodeStore.from_table(late, **NAMES).card["warnings"])
+    )
 
 
 @pytest.mark.parametrize("how", [{}, {"neighbours": 2, "sight": 2.5}])
 def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
     table = fleet(agents=3)
-    store = from_table(table, **NAMES, goal=["gx", "gy"], **how)
+    store = EpisodeStore.from_table(table, **NAMES, goal=["gx", "gy"], **how)
     now = {c: table[c].reshape(6, 12, 3)[2, 5] for c in ("x", "y", "vx", "vy", "gx", "gy")}
     seen = observe(store.card, {c: now[c] for c in ("x", "y", "vx", "vy")}, {"x": now["gx"], "y": now["gy"]})
     logged = (
@@ -335,7 +341,7 @@ def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
         + ["--state", "x", "y", "vx", "vy", "--action", "ax", "ay", "--cost", "hit", "--out", str(tmp_path / "f.h5")]
     )
     assert "6 episodes, 66 steps" in capsys.readouterr().out
-    assert EpisodeStore.load(tmp_path / "f.h5").content == from_table(fleet(), **NAMES).content
+    assert EpisodeStore.load(tmp_path / "f.h5").content == EpisodeStore.from_table(fleet(), **NAMES).content
     app.main(["data", "info", str(tmp_path / "f.h5")])
     with pytest.raises(SystemExit):
         app.main(["data", "import-table", str(tmp_path / "fleet.csv"), "--state", "x", "--out", str(tmp_path / "g.h5")])
@@ -378,7 +384,7 @@ def test_files_with_flipped_and_missing_bytes_are_refused_in_a_sentence_or_read(
             damaged = tmp_path / f"b{file.suffix}"
             damaged.write_bytes(data[: rng.integers(len(data))] if k % 3 == 0 else data)
             try:
-                from_table(damaged, **NAMES)
+                EpisodeStore.from_table(damaged, **NAMES)
             except UserError:
                 refused += 1
         assert refused > 20

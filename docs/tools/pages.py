@@ -25,7 +25,7 @@ REFERENCE = {
     "Importers": (
         "ringfence.logs.io.table",
         "ringfence.logs.io.rosbag",
-        "ringfence.logs.io.hdf5",
+        "ringfence.datasets.importers.hdf5",
         "ringfence.datasets.importers.omar",
         "ringfence.datasets.importers.ogmarl",
     ),

@@ -92,7 +92,7 @@ def import_table(
         fastest: m/s that nothing there can do.
         task: a name for the data; that of the store's file by default.
     """
-    from ringfence.logs.io.table import from_layout, from_table
+    from ringfence.logs.store import EpisodeStore
     from ringfence.problem.constraints import Separation
 
     kept = writable(out_file)
@@ -109,9 +109,9 @@ def import_table(
     if layout is not None:
         if state or action or reward or goal or episode:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
-        return imported(from_layout(file, layout, **told), kept)
+        return imported(EpisodeStore.from_layout(file, layout, **told), kept)
     columns = dict(state=state, action=action, reward=reward, goal=goal, episode=episode)
-    imported(from_table(file, time=time, agent=agent, **columns, **told), kept)
+    imported(EpisodeStore.from_table(file, time=time, agent=agent, **columns, **told), kept)
 
 
 def import_bag(
@@ -157,12 +157,12 @@ def import_bag(
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.rosbag import read_bag
-    from ringfence.logs.io.table import from_table
+    from ringfence.logs.store import EpisodeStore
     from ringfence.problem.constraints import Separation
 
     kept = writable(out_file)
     bag = read_bag(file, agents, odom=odom, cmd=cmd, joints=joints, cost=cost, stamps=stamps, twist=twist)
-    store = from_table(
+    store = EpisodeStore.from_table(
         bag.columns,
         time="time",
         agent="agent",
@@ -269,7 +269,7 @@ def import_hdf5(
         action_low: bound of every action entry; Minari's action space tells it by default, else -1.
         action_high: likewise, else 1.
     """
-    from ringfence.logs.io.hdf5 import import_hdf5
+    from ringfence.datasets.importers.hdf5 import import_hdf5
 
     target = writable(out_file)
     if target.exists() and Path(file).exists() and target.samefile(file):

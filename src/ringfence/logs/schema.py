@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -11,11 +11,27 @@ from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
 from ringfence.utils import schemas
 
-if TYPE_CHECKING:
-    from ringfence.logs.store import EpisodeStore
-
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed", "constraints")
+
+
+class Arrays(Protocol):
+    """What a store shows to its rules; the axes are those of `store.py`."""
+
+    observations: np.ndarray
+    actions: np.ndarray
+    rewards: np.ndarray
+    costs: np.ndarray
+    terminated: np.ndarray
+    truncated: np.ndarray
+    episode_ends: np.ndarray
+    state: np.ndarray | None
+    speed: np.ndarray | None
+    constraints: np.ndarray | None
+    card: dict[str, Any]
+
+    @property
+    def limits(self) -> dict[str, float]: ...
 
 
 def complete_card(card: dict) -> dict:
@@ -130,7 +146,7 @@ def _check_name(task) -> None:
         )
 
 
-def validate(store: EpisodeStore) -> None:
+def validate(store: Arrays) -> None:
     """Raise `StoreError` naming the array, the rule it breaks and the remedy."""
     s = store
 

@@ -20,6 +20,7 @@ import functools
 import hashlib
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ import h5py
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
+from ringfence.logs.io.table import Table, read_layout, read_table
 from ringfence.logs.schema import ARRAYS, OPTIONAL, complete_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
@@ -349,12 +351,15 @@ class EpisodeStore:
         )
 
     @classmethod
-    def from_table(cls, table, *, time: str, agent: str, state, **options):
+    def from_table(cls, table: Table, *, time: str, agent: str, state: Sequence[str], **options: Any) -> EpisodeStore:
         """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
-        Parquet file; options as of `ringfence.logs.io.table.from_table`."""
-        from ringfence.logs.io.table import from_table
+        Parquet file; options as of `ringfence.logs.io.table.read_table`."""
+        return cls.from_steps(**read_table(table, time=time, agent=agent, state=state, **options))
 
-        return from_table(table, time=time, agent=agent, state=state, **options)
+    @classmethod
+    def from_layout(cls, table: Table, layout: str, **options: Any) -> EpisodeStore:
+        """A table in a published format, `highd` or `interaction`; options as of `from_table`."""
+        return cls.from_steps(**read_layout(table, layout, **options))
 
     # --- disk ---
     def save(self, path: str | os.PathLike) -> Path:

@@ -1,1 +1,1 @@
-"""Public data sets, in their own layouts."""
+"""Stores of files in other layouts: public data sets, and HDF5 of the kinds that the field shares."""

@@ -1,1 +1,1 @@
-"""Files of other formats, read as logs."""
+"""Tables and bags, read as plain columns and arrays; `EpisodeStore` makes a store of them."""

@@ -18,7 +18,6 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown, whole_number
 from ringfence.logs.io.tracks import Tracks, cut, nearest, resample, teams
-from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import CostColumn, Hazard, Separation
 from ringfence.problem.features import others
 
@@ -53,7 +52,7 @@ LAYOUTS = {
 }
 
 
-def from_table(
+def read_table(
     table: Table,
     *,
     time: str,
@@ -75,8 +74,9 @@ def from_table(
     danger: Hazard | None = None,
     notes: Sequence[str] = (),
     card: dict | None = None,
-) -> EpisodeStore:
-    """The store of a table with a row per agent and time, in any order of agents; each agent's times increase.
+) -> dict[str, Any]:
+    """What `EpisodeStore.from_steps` takes, of a table with a row per agent and time, in any order of agents; each
+    agent's times increase.
 
     `state`: columns of an agent's state, in SI units. Those named x, y, z are where it is and vx, vy, vz how fast it
     moves in the same axes; velocities that are not there are the differences of positions. `action`: what it was told
@@ -176,11 +176,11 @@ def from_table(
     how = dict(size=team) if neighbours is None else dict(k=neighbours, sight=sight or np.inf)
     arrays = build(made, danger, bool(cost), shortest, longest, **how)
     acts = arrays.pop("held") if action else made.accelerations(arrays["rows"])
-    return _store(made, arrays, acts, bool(reward), cost, danger, neighbours is not None, card or {})
+    return _steps(made, arrays, acts, bool(reward), cost, danger, neighbours is not None, card or {})
 
 
-def from_layout(table: Table, layout: str, **options) -> EpisodeStore:
-    """The store of a table in a published format (`LAYOUTS`); options as of `from_table`."""
+def read_layout(table: Table, layout: str, **options) -> dict[str, Any]:
+    """The same of a table in a published format (`LAYOUTS`); options as of `read_table`."""
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
     of, cost = LAYOUTS[layout], options.get("cost") or ()
@@ -191,7 +191,7 @@ def from_layout(table: Table, layout: str, **options) -> EpisodeStore:
     columns["time"] = _numbers(read, theirs["time"]) * of.time_unit
     for c, side in zip("xy", of.corner or ()):
         columns[c] = _numbers(columns, c) + _numbers(read, side) / 2
-    return from_table(columns, time="time", agent="agent", state=of.state, action=of.action, **options)
+    return read_table(columns, time="time", agent="agent", state=of.state, action=of.action, **options)
 
 
 def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
@@ -578,9 +578,9 @@ def _own(made: _Made, moving: np.ndarray, with_place: bool) -> tuple[list[str], 
     return names, parts
 
 
-def _store(
+def _steps(
     made: _Made, arrays: dict, acts: np.ndarray, earned: bool, named: Sequence[str], danger, alike: bool, card: dict
-) -> EpisodeStore:
+) -> dict[str, Any]:
     t, rows, many = made.tracks, arrays["rows"], arrays["many"]
     last = np.cumsum(many) - 1
     steps = np.ones(len(rows), bool)
@@ -612,12 +612,12 @@ def _store(
         "action_high": bound,
     }
     told |= {"alike": True, "sight": arrays["sight"]} if alike else {}
-    return EpisodeStore.from_steps(
-        arrays["seen"][steps],
-        acts,
-        reward[arrived],
-        costs=cost,
-        episode_ends=np.cumsum(many - 1),
-        final_observations=arrays["seen"][last],
-        card=told | card,
-    )
+    return {
+        "observations": arrays["seen"][steps],
+        "actions": acts,
+        "rewards": reward[arrived],
+        "costs": cost,
+        "episode_ends": np.cumsum(many - 1),
+        "final_observations": arrays["seen"][last],
+        "card": told | card,
+    }

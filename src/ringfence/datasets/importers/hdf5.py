@@ -31,8 +31,8 @@ import h5py
 import numpy as np
 
 from ringfence.datasets import registry
+from ringfence.datasets.importers import columns, common, minari
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.io import columns, common, minari
 from ringfence.logs.schema import complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils import arrays, schemas

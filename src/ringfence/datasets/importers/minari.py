@@ -20,8 +20,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from ringfence.datasets.importers import columns, common
 from ringfence.errors import StoreError
-from ringfence.logs.io import columns, common
 from ringfence.utils import arrays, schemas
 
 NAMES = ("observations", "actions", "rewards", "terminations", "truncations")

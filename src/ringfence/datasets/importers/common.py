@@ -10,8 +10,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from ringfence.datasets.importers import columns
 from ringfence.errors import StoreError
-from ringfence.logs.io import columns
 from ringfence.logs.schema import complete_card
 
 PACKED = 100  # times its size that a compressed file may unpack to; columns of zeros pack well
