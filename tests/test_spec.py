@@ -3,6 +3,7 @@
 import pytest
 
 from ringfence.bench.suites import SUITES
+from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError
 from ringfence.loading.spec import PolicySpec
 
@@ -31,6 +32,28 @@ def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
     )
     assert first == other == PolicySpec.parse(wanted) and first.name == wanted
     assert hash(first) == hash(other)
+
+
+def test_names_of_results_are_understood():
+    spec = PolicySpec.of(
+        planner="low_temperature", guard="shield", barrier="analytic", execution="decentralized", horizon=7,
+        trust_radius=2.0, target_return=1.0,
+    )  # fmt: skip
+    assert spec == PolicySpec.of(
+        planner="steady", guard="shield", danger="formula", sight="own", rows=7, reach=2.0, target=1.0
+    )
+    assert PolicySpec.of(execution="decentralized").plan_options == (("execution", "decentralized"),)
+    for twice in ({"horizon": 7, "rows": 7}, {"barrier": "learned", "danger": "learned"}):
+        with pytest.raises(UserError, match="two names of one choice"):
+            PolicySpec.of(guard="shield", **twice)
+
+
+def test_commands_of_before_are_rewritten(capsys):
+    old = ["eval", "run", "--guard", "shield", "--danger", "formula", "--sight=own", "--planner", "steady"]
+    new = ["eval", "run", "--guard", "shield", "--barrier", "analytic", "--execution=decentralized", "--planner"]
+    assert rewritten(old) == [*new, "low_temperature"]
+    assert "'--danger' is called '--barrier' now" in capsys.readouterr().err
+    assert rewritten(["fit", "data.h5", "--sight", "own"]) == ["fit", "data.h5", "--sight", "own"]
 
 
 def test_what_a_result_is_called():

@@ -307,7 +307,7 @@ def judge(
     guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
     danger: Literal["learned", "formula", "both"] | None = None,
     world: Path | None = None,
-    planner: Literal["plain", "climbing", "steady"] = "plain",
+    planner: Literal["default", "value_guided", "low_temperature"] = "default",
     states: int = 3000,
     transitions: int = 20_000,
     updates: int = 3000,

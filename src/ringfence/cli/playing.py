@@ -22,16 +22,17 @@ class Playing:
     guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none"
     """what is done with what the policy proposes: select among several plans, refine them up the value, shield
     (correct them until danger keeps its distance), adapt the shield's margin to what happens; full does all."""
-    danger: Literal["learned", "formula", "both"] | None = None
-    """how the guard knows it: learned from the logs (default), by the task's formula, or the worse of both."""
-    sight: Literal["all", "own"] | None = None
-    """all: one guard sees the team; own: every agent guards its own action by its own view."""
+    barrier: Literal["learned", "analytic", "both"] | None = None
+    """how the guard knows danger: learned from the logs (default), by the task's formula, or the worse of both."""
+    execution: Literal["centralized", "decentralized"] | None = None
+    """centralized: one guard sees the team; decentralized: every agent guards its own action by its own view. Without
+    a guard: how a planner plans."""
     agents: int | None = None
     """who play, where they are alike (Crossing); as many as in the logs by default."""
     world: Path | None = None
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
-    planner: Literal["plain", "climbing", "steady"] = "plain"
-    """how diffusion planners draw plans: plain, climbing (value steers them), steady (for robots)."""
+    planner: Literal["default", "value_guided", "low_temperature"] = "default"
+    """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots."""
     plans: int | None = None
     """asked for by the guard."""
     margin: float | None = None
@@ -50,8 +51,6 @@ class Playing:
     """scale of the first noise."""
     replan: int | None = None
     """steps for which a plan is followed."""
-    execution: str | None = None
-    """centralized or decentralized."""
     set: Assignments = field(default_factory=list)
     """any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them."""
 
@@ -72,7 +71,7 @@ class Playing:
         return given | assigned
 
 
-_FLAGS_ALONE = ("planner", "guard", "danger", "sight", "world", "agents")
+_FLAGS_ALONE = ("planner", "guard", "barrier", "execution", "world", "agents")
 AS_IT_IS = Playing()
 How = tyro.conf.OmitArgPrefixes[Playing]
 

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import sys
 
+from ringfence.utils import stored
+
 # Of `ringfence data X` the command is "data X", of `ringfence bench X` it is "bench X".
 OLD_COMMANDS: dict[str, str] = {}
-OLD_FLAGS: dict[str, dict[str, str]] = {}  # by today's command; "" holds flags of every command
-OLD_VALUES: dict[str, dict[str, str]] = {}  # by today's flag
+# By today's command; "" holds flags of every command.
+OLD_FLAGS: dict[str, dict[str, str]] = {
+    command: {"--danger": "--barrier", "--sight": "--execution"} for command in ("eval", "play", "export")
+}
+# By today's flag.
+OLD_VALUES: dict[str, dict[str, str]] = {
+    "--barrier": stored.BARRIERS,
+    "--execution": stored.EXECUTIONS,
+    "--planner": stored.PLANNERS,
+}
 
 
 def rewritten(arguments: list[str]) -> list[str]:

@@ -15,6 +15,7 @@ from ringfence.errors import UserError, unknown, whole_number
 from ringfence.guards import DANGERS, GUARDS, GuardOptions
 from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.training.runs import Run
+from ringfence.utils import stored
 from ringfence.utils.config import parse_as
 from ringfence.world import World
 
@@ -55,7 +56,20 @@ class PolicySpec:
         **options: Any,
     ) -> PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
-        Unknown names are refused, and so is what nothing would read."""
+        Unknown names are refused, and so is what nothing would read.
+
+        The names under which results are read (utils/stored.py) are understood, too: `barrier` (learned, analytic,
+        both) for `danger`, `execution` (centralized, decentralized) of a guard for `sight`, planners and options."""
+        planner = _TO_PLANNER.get(planner, planner)
+        options = {_TO_OPTION.get(name, name): value for name, value in _once(options).items()}
+        barrier = options.pop("barrier", None)
+        if barrier is not None:
+            _apart("barrier", "danger", danger)
+            danger = _TO_BARRIER.get(barrier, barrier)
+        guards = guard != "none" or any(f.name in options for f in dataclasses.fields(GuardOptions))
+        if guards and options.get("execution") in _TO_SIGHT:
+            _apart("execution", "sight", sight)
+            sight = _TO_SIGHT[options.pop("execution")]
         _known("planner", planner, PLANNERS)
         _known("guard", guard, GUARDS)
         _known("sight", sight or "all", SIGHTS)
@@ -124,6 +138,26 @@ class PolicySpec:
     def without_plans(self) -> PolicySpec:
         """The same of a policy that draws no plans, which reads no choice of planners."""
         return replace(self, planner=PLAIN, plan_options=())
+
+
+# From today's names of results to those of the fields here.
+_TO_PLANNER = {new: old for old, new in stored.PLANNERS.items()}
+_TO_BARRIER = {new: old for old, new in stored.BARRIERS.items()}
+_TO_SIGHT = {new: old for old, new in stored.EXECUTIONS.items()}
+_TO_OPTION = {new: old for names in (stored.PLANNER_OPTIONS, stored.GUARD_OPTIONS) for old, new in names.items()}
+
+
+def _once(options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Options without two names of one."""
+    for new, old in _TO_OPTION.items():
+        if new in options:
+            _apart(new, old, options.get(old))
+    return options
+
+
+def _apart(new: str, old: str, given: Any) -> None:
+    if given is not None:
+        raise UserError(f"{new} and {old} are two names of one choice; give {new} alone.")
 
 
 def _known(kind: str, name: Any, known: Any) -> None:
