@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -30,32 +30,6 @@ class Transition(NamedTuple):
     def team_cost(self) -> Array:
         """(B,): of agents with costs of their own, the largest one."""
         return self.cost if self.cost.ndim == 1 else self.cost.max(-1)
-
-
-@runtime_checkable
-class Env(Protocol):
-    """A batched simulator. States are pytrees with a leading B axis; all methods are pure and may be jitted."""
-
-    n_agents: int
-    action_dim: int
-    observation_dim: int
-    episode_length: int  # the time limit
-    terminates: bool  # whether the task itself may end an episode before
-    state_names: tuple[str, ...]  # entries of the global state
-
-    def reset(self, key: Key, batch: int) -> PyTree: ...
-
-    def step(self, state: PyTree, action: Array) -> tuple[PyTree, Transition]:
-        """Advance by one step; `action` is (B, N, A) in the bounds of the task and is clipped to them."""
-        ...
-
-    def observe(self, state: PyTree) -> Array:
-        """(B, N, O) local observations."""
-        ...
-
-    def global_state(self, state: PyTree) -> Array:
-        """(B, S) what a centralised planner may see."""
-        ...
 
 
 @dataclass(frozen=True)

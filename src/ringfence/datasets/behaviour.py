@@ -27,14 +27,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from ringfence.datasets import matd3
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
+from ringfence.envs.base import Env
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError, unknown
-from ringfence.types import Array, Env, Key, PyTree
+from ringfence.types import Array, Key, PyTree
 
 POLICIES = Path(__file__).parent / "policies"
 COMMAND = "python -m ringfence.datasets.behaviour"
@@ -86,22 +88,23 @@ def train_behaviour(
     `progress(transitions_seen, mean_return)` is called after every snapshot. Memory grows with the run: about 200
     bytes per transition for three agents.
     """
-    length, envs = env.episode_length, config.envs
-    rounds = -(-transitions // (length * envs))
+    per_round = env.episode_length * config.envs
+    rounds = -(-transitions // per_round)
     if rounds < 1:
         raise UserError(f"A behaviour run of {transitions} transitions is empty; ask for at least one.")
-    key, k_init = jax.random.split(key)
-    learner = _init_learner(env, config, k_init)
-    memory = _empty_memory(env, rounds * envs)
+    key, key_init = jax.random.split(key)
+    learner = _init_learner(env, config, key_init)
+    memory = _empty_memory(env, rounds * config.envs)
     snapshots, seen, returns = [], [], []
     done = 0
     while done < rounds:
         count = min(config.snapshot_every, rounds - done)
-        keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(done, done + count))
-        learner, memory, scores = _train_rounds(env, config, learner, memory, jnp.arange(done, done + count), keys)
+        numbers = jnp.arange(done, done + count)
+        keys = jax.vmap(partial(jax.random.fold_in, key))(numbers)
+        learner, memory, scores = _train_rounds(env, config, learner, memory, numbers, keys)
         done += count
         snapshots.append(jax.tree.map(np.asarray, learner.actors))
-        seen.append(done * envs * length)
+        seen.append(done * per_round)
         returns.append(float(scores.mean()))
         if progress is not None:
             progress(seen[-1], returns[-1])
@@ -119,7 +122,7 @@ def snapshot(run: BehaviourRun, k: int, noise: float) -> BehaviourPolicy:
     return BehaviourPolicy(jax.tree.map(lambda x: jnp.asarray(x[k]), run.actors), noise)
 
 
-def save_behaviour(policy: BehaviourPolicy, path: str | Path, dtype: type = np.float32) -> None:
+def save_behaviour(policy: BehaviourPolicy, path: str | Path, dtype: DTypeLike = np.float32) -> None:
     """Write the policy as safetensors; the file appears whole or not at all."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -160,8 +163,8 @@ def load_behaviour(path: str | Path) -> BehaviourPolicy:
     return BehaviourPolicy(actors, noise, card)
 
 
-def shipped_policy(level: Literal["medium", "expert"], task: str = "simple_spread") -> BehaviourPolicy:
-    """The behaviour policy of a tier, for three agents, from the files that ship with the package."""
+def shipped_policy(level: str, task: str = "simple_spread") -> BehaviourPolicy:
+    """The behaviour policy of a tier, `medium` or `expert`, for three agents, from the files that ship."""
     if level not in ("medium", "expert"):
         raise unknown("behaviour level", level, ("medium", "expert"))
     return load_behaviour(POLICIES / f"{task}-{level}.safetensors")
@@ -175,10 +178,15 @@ def collect(
     Returns float32 arrays in rollout order: observations (E, L+1, N, O), state (E, L+1, S), actions (E, L, N, A) as
     executed, rewards (E, L, N), costs (E, L). Row t+1 is the state after action t; costs are of that state.
     """
-    if policy != "random" and not isinstance(policy, BehaviourPolicy):
+    if isinstance(policy, BehaviourPolicy):
+        actors = policy.actors
+        noise = policy.noise
+        _check_actors(env, actors)
+    elif policy == "random":
+        actors = None
+        noise = 0.0
+    else:
         raise UserError(f"Cannot collect with policy {policy!r}; pass 'random' or a BehaviourPolicy.")
-    actors, noise = (None, 0.0) if policy == "random" else (policy.actors, policy.noise)
-    _check_actors(env, actors)
     batch = min(batch, episodes)
 
     def chunk(k: int) -> dict[str, Array]:
@@ -224,7 +232,8 @@ def replay_episodes(
     else:
         teacher = replace(env, reward="omar")
         run = train_behaviour(teacher, MATD3Config(), jax.random.key(seed), REPLAY_TRANSITIONS, progress)
-        initial, actions = run.initial, run.actions
+        initial = run.initial
+        actions = run.actions
     rows = np.linspace(0, total - 1, episodes).round().astype(int)
     return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
 
@@ -237,8 +246,9 @@ def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
     """
     positions = data["state"][:, 0, : 2 * data["actions"].shape[2]].reshape(len(data["state"]), -1, 2)
     gaps = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
-    apart = (gaps + 10.0 * np.eye(gaps.shape[-1]) >= 0.3).all((1, 2))
-    returns, cost = data["rewards"].mean(-1).sum(-1), data["costs"].sum(-1)
+    separate = np.all(gaps + 10.0 * np.eye(gaps.shape[-1]) >= 0.3, axis=(1, 2))
+    returns = data["rewards"].mean(-1).sum(-1)
+    cost = data["costs"].sum(-1)
     return {
         "episodes": len(returns),
         "return_mean": float(returns.mean()),
@@ -246,8 +256,8 @@ def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "cost": float(cost.mean()),
-        "avoidable_cost": float(cost[apart].mean()) if apart.any() else 0.0,
-        "contact_starts": float(1.0 - apart.mean()),
+        "avoidable_cost": float(cost[separate].mean()) if separate.any() else 0.0,
+        "contact_starts": float(1.0 - separate.mean()),
     }
 
 
@@ -266,8 +276,9 @@ def train_tier_policies(
     Of its snapshots, `medium` and `expert` are those whose return, with noise `TIER_NOISE`, is nearest to the public
     sets' over 20 000 episodes. Returns the statistics of each tier. About four minutes on two cores.
     """
-    env, config, folder = SimpleSpread(), MATD3Config(), Path(folder)
-    run = train_behaviour(env, config, jax.random.key(0), LINEAGE, progress)
+    env = SimpleSpread()
+    folder = Path(folder)
+    run = train_behaviour(env, MATD3Config(), jax.random.key(0), LINEAGE, progress)
     policies = [snapshot(run, k, TIER_NOISE) for k in range(len(run.seen))]
 
     def score(k: int, episodes: int) -> dict[str, float]:
@@ -288,7 +299,8 @@ def train_tier_policies(
         }
         save_behaviour(replace(policies[best], info=card), folder / f"simple_spread-{level}.safetensors")
     episodes = REPLAY_TRANSITIONS // env.episode_length
-    initial, actions = jax.tree.map(lambda x: x[:episodes], run.initial), run.actions[:episodes]
+    initial = jax.tree.map(lambda x: x[:episodes], run.initial)
+    actions = run.actions[:episodes]
     _save_replay(initial, actions, folder / "simple_spread-medium-replay.npz")
     tiers["medium-replay"] = statistics(resimulate(env, initial, actions))
     return tiers
@@ -317,14 +329,14 @@ def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
 
 @partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
 def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
-    state = jax.eval_shape(partial(env.reset, batch=1), key)
-    n_obs = jax.eval_shape(env.observe, state).shape[-1]
     n = env.n_agents
-    return matd3.init(config, key, n, n_obs, n * n_obs, env.action_dim)
+    width = env.observation_dim
+    return matd3.init(config, key, n, width, n * width, env.action_dim)
 
 
 def _empty_memory(env: Env, episodes: int) -> _Memory:
-    length, n = env.episode_length, env.n_agents
+    length = env.episode_length
+    n = env.n_agents
     state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
     return _Memory(
         states=jax.tree.map(lambda s: jnp.zeros((episodes, length + 1, *s.shape[1:]), s.dtype), state),
@@ -343,8 +355,8 @@ def _train_rounds(
     def one_round(carry, xs):
         learner, memory = carry
         number, key = xs
-        k_collect, k_update = jax.random.split(key)
-        fresh = _explore(env, config, learner.actors, number < config.random_rounds, k_collect)
+        key_collect, key_update = jax.random.split(key)
+        fresh = _explore(env, config, learner.actors, number < config.random_rounds, key_collect)
         memory = jax.tree.map(
             lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, number * config.envs, 0), memory, fresh
         )
@@ -355,7 +367,7 @@ def _train_rounds(
             return _update(env, config, learner, memory, stored, index % config.delay == 0, key), None
 
         # The random rounds only fill the buffer; the learner starts with the first round of its own.
-        steps = jnp.arange(config.updates), jax.random.split(k_update, config.updates)
+        steps = (jnp.arange(config.updates), jax.random.split(key_update, config.updates))
         learner = jax.lax.cond(
             number + 1 >= config.random_rounds,
             lambda learner: jax.lax.scan(one_update, learner, steps)[0],
@@ -370,13 +382,13 @@ def _train_rounds(
 
 def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
     """One episode in each of the config's environments, laid out as the buffer's rows."""
-    k_reset, key = jax.random.split(key)
-    first = env.reset(k_reset, config.envs)
+    key_reset, key = jax.random.split(key)
+    first = env.reset(key_reset, config.envs)
 
     def step(state, key):
-        k_noise, k_uniform = jax.random.split(key)
-        action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, k_noise)
-        action = jnp.where(uniform, jax.random.uniform(k_uniform, action.shape, minval=-1.0, maxval=1.0), action)
+        key_noise, key_uniform = jax.random.split(key)
+        action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, key_noise)
+        action = jnp.where(uniform, jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0), action)
         # Executed at half precision, so that a replay file of half the size repeats the run exactly.
         action = action.astype(jnp.float16).astype(jnp.float32)
         after, transition = env.step(state, action)
@@ -391,15 +403,21 @@ def _update(
     env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
 ) -> Learner:
     """One critic update and, if `act`, one update of actors and targets."""
-    k_rows, k_noise = jax.random.split(key)
-    e, t = jnp.divmod(jax.random.randint(k_rows, (config.batch,), 0, stored * env.episode_length), env.episode_length)
-    before = jax.tree.map(lambda x: x[e, t], memory.states)
-    after = jax.tree.map(lambda x: x[e, t + 1], memory.states)
-    actions, rewards, terminated = memory.actions[e, t], memory.rewards[e, t], memory.terminated[e, t]
-    observations, next_observations = env.observe(before), env.observe(after)
-    joint = (x.reshape(config.batch, -1) for x in (observations, next_observations))
-    batch = Transitions(observations, next(joint), actions, rewards, terminated, next_observations, next(joint))
-    return matd3.update(config, learner, batch, act, k_noise)
+    key_rows, key_noise = jax.random.split(key)
+    drawn = jax.random.randint(key_rows, (config.batch,), 0, stored * env.episode_length)
+    episode, step = jnp.divmod(drawn, env.episode_length)
+    observations = env.observe(jax.tree.map(lambda x: x[episode, step], memory.states))
+    next_observations = env.observe(jax.tree.map(lambda x: x[episode, step + 1], memory.states))
+    batch = Transitions(
+        observations=observations,
+        seen=observations.reshape(config.batch, -1),
+        actions=memory.actions[episode, step],
+        rewards=memory.rewards[episode, step],
+        terminated=memory.terminated[episode, step],
+        next_observations=next_observations,
+        next_seen=next_observations.reshape(config.batch, -1),
+    )
+    return matd3.update(config, learner, batch, act, key_noise)
 
 
 # ------------------------------------------------------------------------------------------------------- rollouts
@@ -407,14 +425,14 @@ def _update(
 
 @partial(jax.jit, static_argnums=(0, 4))
 def _rollout_policy(env: Env, actors: Mlp | None, noise: Array, key: Key, batch: int) -> dict[str, Array]:
-    k_reset, key = jax.random.split(key)
+    key_reset, key = jax.random.split(key)
 
     def choose(state, key):
         if actors is None:
             return jax.random.uniform(key, (batch, env.n_agents, env.action_dim), minval=-1.0, maxval=1.0)
         return matd3.noisy(matd3.act(actors, env.observe(state)), noise, key)
 
-    return rollout(env, env.reset(k_reset, batch), choose, jax.random.split(key, env.episode_length))
+    return rollout(env, env.reset(key_reset, batch), choose, jax.random.split(key, env.episode_length))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -457,11 +475,8 @@ def gather(chunk: Callable[[int], dict[str, Array]], episodes: int, batch: int) 
     return out
 
 
-def _check_actors(env: Env, actors: Mlp | None) -> None:
-    if actors is None:
-        return
-    state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
-    wanted = (env.n_agents, jax.eval_shape(env.observe, state).shape[-1], env.action_dim)
+def _check_actors(env: Env, actors: Mlp) -> None:
+    wanted = (env.n_agents, env.observation_dim, env.action_dim)
     found = (*actors.weights[0].shape[:2], actors.weights[-1].shape[-1])
     if found != wanted:
         raise UserError(

@@ -3,42 +3,55 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypedDict
 
 from ringfence.datasets.recipes import crossing, robots, spread, spread_alike
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike
+from ringfence.envs.base import Env, NativeEnv
 from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import Parts
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.types import Env
+
+
+class Constants(TypedDict):
+    """What a family of tasks is normalised by."""
+
+    return_min: float
+    return_max: float
+    cost_limit: float
+
 
 # OMAR's constants (Pan et al. 2022, as printed by MADIFF): a random and an expert policy's return.
-_SPREAD = dict(hazard=constraints.Separation(0.30), return_min=159.8, return_max=516.8, cost_limit=1.0)
+_SPREAD_HAZARD = constraints.Separation(0.30)
+_SPREAD: Constants = {"return_min": 159.8, "return_max": 516.8, "cost_limit": 1.0}
 
 
 def _spread(tier: str, mean: float, deviation: float, transitions: int = 1_000_000) -> Task:
     return Task(
         f"simple_spread-{tier}",
         SimpleSpread(),
+        _SPREAD_HAZARD,
         tier=tier,
         presets=(tier,),
         published_return=(mean, deviation),
         transitions=transitions,
-        recipe=spread,
+        recipe=spread.RECIPE,
         **_SPREAD,
     )
 
 
 def _spread_alike(tier: str) -> Task:
-    """A million agent-steps, told in the views of each agent."""
+    """A million agent-steps, in the views of each agent."""
     return Task(
         f"spread_alike-{tier}",
         SpreadAlike(),
+        _SPREAD_HAZARD,
         tier=tier,
         transitions=333_350,
-        recipe=spread_alike,
+        recipe=spread_alike.RECIPE,
         alike=True,
         **_SPREAD,
     )
@@ -46,10 +59,10 @@ def _spread_alike(tier: str) -> Task:
 
 ROBOT_COST_LIMIT = 25.0  # steps above the speed limit per episode, Safety-Gymnasium's
 # OG-MARL's constants (Formanek et al. 2023): a random and the best policy's return.
-_ROBOTS: dict[Parts, dict[str, float]] = {
-    "2x3": dict(return_min=-280.18, return_max=9132.25, cost_limit=ROBOT_COST_LIMIT),
-    "2x4": dict(return_min=-325.6, return_max=3362.44, cost_limit=ROBOT_COST_LIMIT),
-    "4x2": dict(return_min=-325.6, return_max=3224.91, cost_limit=ROBOT_COST_LIMIT),
+_ROBOTS: dict[Parts, Constants] = {
+    "2x3": {"return_min": -280.18, "return_max": 9132.25, "cost_limit": ROBOT_COST_LIMIT},
+    "2x4": {"return_min": -325.6, "return_max": 3362.44, "cost_limit": ROBOT_COST_LIMIT},
+    "4x2": {"return_min": -325.6, "return_max": 3224.91, "cost_limit": ROBOT_COST_LIMIT},
 }
 # m/s: the 60th percentile of the step speed in a tier's own data, as regenerated in full with seed 0.
 QUANTILE_LIMITS = {
@@ -75,14 +88,14 @@ def _robot(parts: Parts, tier: str, mean: float, deviation: float | None = None,
     name = f"{SafeMuJoCo(parts).name}-{tier}"
     env = SafeMuJoCo(parts, QUANTILE_LIMITS[name] if quantile else None)
     return Task(
-        name + "-quantile" * quantile,
+        f"{name}-quantile" if quantile else name,
         env,
         constraints.SpeedLimit(env.limit, _velocity(env)),
         tier=tier,
         presets=("mujoco",),
         published_return=(mean, deviation),
         protocol="quantile" if quantile else "native",
-        recipe=robots,
+        recipe=robots.RECIPE,
         **_ROBOTS[parts],
     )
 
@@ -114,7 +127,7 @@ def _crossing(tier: str, body: Body = "disc") -> Task:
         tier=tier,
         return_max=_CERTIFIED[body],
         transitions=125_000,
-        recipe=crossing,
+        recipe=crossing.RECIPE,
         alike=True,
     )
 
@@ -198,18 +211,19 @@ def _danger(hazard: constraints.Hazard) -> constraints.Hazard:
 
 def from_store(store: EpisodeStore) -> Task:
     """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
-    name, card = store.card["task"], store.card
+    card = store.card
+    name = card["task"]
     task = simulated(name, store.hazard)
     if task is not None:
-        wrong = _misfit(store, task.env)
+        wrong = _misfit(store, task.simulator)
         if name in TASKS and wrong:
             raise StoreError(
                 f"The data is called '{name}', but {wrong}; bring it into that layout, or give it a name of its own."
             )
         if name in TASKS or (not wrong and card["state_names"]):
             return task
-    returns = store.returns
-    low, high = float(returns.min()), float(returns.max())
+    low = float(store.returns.min())
+    high = float(store.returns.max())
     robot = any(name.startswith(f"{SafeMuJoCo(parts).name}-") for parts in _ROBOTS)
     return Task(
         name,
@@ -226,18 +240,19 @@ def from_store(store: EpisodeStore) -> Task:
     )
 
 
-def _misfit(store: EpisodeStore, env: Env) -> str:
+def _misfit(store: EpisodeStore, env: Env | NativeEnv) -> str:
     """Where a store's arrays are not those of the simulator, in words; empty where they are."""
-    width = 0 if store.state is None else store.state.shape[1]
-    for what, here, there in (
+    sizes = (
         ("agents", store.n_agents, env.n_agents),
         ("action entries", store.actions.shape[2], env.action_dim),
         ("observation entries", store.observations.shape[2], env.observation_dim),
-        ("state entries", width, len(env.state_names)),
-    ):
+        ("state entries", 0 if store.state is None else store.state.shape[1], len(env.state_names)),
+    )
+    for what, here, there in sizes:
         if here != there:
             return f"has {here} {what}, its simulator {there}"
-    low, high = store.card["action_low"], store.card["action_high"]
+    low = store.card["action_low"]
+    high = store.card["action_high"]
     if (low, high) != (-1.0, 1.0):
         return f"has actions from {low:g} to {high:g}, its simulator from -1 to 1"
     names = store.card["state_names"]

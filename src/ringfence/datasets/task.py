@@ -2,15 +2,50 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import ModuleType
+from typing import Any
 
 import numpy as np
 
+from ringfence.envs.base import Env, NativeEnv
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
-from ringfence.types import Env, Spec
+from ringfence.types import Policy, Spec
+
+Card = dict[str, Any]
+
+
+def whole_episodes(task: Task, transitions: int) -> int:
+    """The size rounded up to whole episodes, where all have one length."""
+    length = task.simulator.episode_length
+    return -(-transitions // length) * length
+
+
+def _no_references(task: Task) -> dict[str, Policy]:
+    return {}
+
+
+def _not_relabelled(task: Task, store: EpisodeStore) -> tuple[np.ndarray, Card] | None:
+    return None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How a task's data sets are regenerated: plain functions."""
+
+    # task -> what the card says of the simulator; data of another one are made again
+    about: Callable[[Task], Card]
+    # (task, transitions, seed, card) -> a store whose card is `card` and more
+    collect: Callable[[Task, int, int, Card], EpisodeStore]
+    # (task, transitions) -> the size that is made where so many steps are asked for
+    whole: Callable[[Task, int], int] = whole_episodes
+    # task -> policies for rows beside the table: who collected the data, if that was one, and what is known to be good
+    references: Callable[[Task], dict[str, Policy]] = _no_references
+    # (task, store) -> costs (T,) of kept steps under this task's danger and what the card says then; None where the
+    # steps do not tell, or there is one definition of danger
+    relabelled: Callable[[Task, EpisodeStore], tuple[np.ndarray, Card] | None] = _not_relabelled
 
 
 @dataclass(frozen=True)
@@ -19,7 +54,7 @@ class Task:
     (c + cost_offset)/(cost_limit + cost_offset), both per episode."""
 
     name: str
-    env: Env | None  # None: a task that exists only as data
+    env: Env | NativeEnv | None  # None: a task that exists only as data
     hazard: constraints.Hazard
     tier: str = ""
     return_min: float = 0.0
@@ -28,28 +63,37 @@ class Task:
     cost_offset: float = 0.0  # k
     published_return: tuple[float, float | None] | None = None  # mean and deviation (if known) of the public data set
     transitions: int = 1_000_000  # of the full data set
-    presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take unless told otherwise
+    presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take by default
     protocol: str = ""  # where a task exists with several limits: which one this is
     action_low: float = -1.0
     action_high: float = 1.0
-    recipe: ModuleType | None = None  # how its data sets are regenerated (data/recipes); None: they cannot be
-    alike: bool = False  # its agents are alike and see for themselves (each.py)
+    recipe: Recipe | None = None  # how its data sets are regenerated; None: they cannot be
+    alike: bool = False  # its agents are alike and see for themselves (problem/homogeneous.py)
 
     @property
-    def world(self) -> dict:
+    def simulator(self) -> Env | NativeEnv:
+        """Its simulator; `UserError` where the task exists only as data."""
+        if self.env is None:
+            raise UserError(f"Task '{self.name}' exists only as data, so it has no simulator; play in one of your own.")
+        return self.env
+
+    @property
+    def world(self) -> dict[str, Any]:
         """What settings of a World its simulator asks for."""
-        return dict(getattr(self.env, "world", {}))
+        return {} if self.env is None else dict(self.env.world)
 
     @property
-    def guard(self) -> dict[str, dict]:
+    def guard(self) -> dict[str, Mapping[str, Any]]:
         """Options of named guards that its simulator asks for."""
-        return dict(getattr(self.env, "guard", {}))
+        return {} if self.env is None else dict(self.env.guard)
 
-    def normalised_return(self, r):
-        return (r - self.return_min) / (self.return_max - self.return_min)
+    def normalised_return(self, value):
+        """Of a return or of an array of them."""
+        return (value - self.return_min) / (self.return_max - self.return_min)
 
-    def normalised_cost(self, c):
-        return (c + self.cost_offset) / (self.cost_limit + self.cost_offset)
+    def normalised_cost(self, value):
+        """Of a cost or of an array of them."""
+        return (value + self.cost_offset) / (self.cost_limit + self.cost_offset)
 
     def logs(self, store: EpisodeStore) -> EpisodeStore:
         """What is learned from: the store, or every agent's own part of it."""
@@ -57,27 +101,52 @@ class Task:
 
     def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
         """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
-        if hasattr(self.env, "feature_map"):
+        if self.env is not None:
             return self.env.feature_map(view)
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
         width = 0 if store.state is None else store.state.shape[1]
         names = store.card["observation_names"] or [f"obs{d}" for d in range(store.observations.shape[2])]
         state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
-        firsts = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
-        keep = constraints.reads(self.hazard, store.n_agents, tuple(names))
-        told = store.observations, store.state, tuple(names), tuple(state_names), firsts, keep
-        return features.from_data(view, *told, alike=self.alike, dt=store.card.get("dt"))
+        return features.from_data(
+            view,
+            store.observations,
+            store.state,
+            tuple(names),
+            tuple(state_names),
+            first_rows=first_rows(store),
+            keep=constraints.reads(self.hazard, store.n_agents, tuple(names)),
+            alike=self.alike,
+            dt=store.card.get("dt"),
+        )
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
-        env = self.env
-        if env is not None:
-            n, a, length = env.n_agents, env.action_dim, env.episode_length
+        """What an algorithm must know of this task; one that exists only as data needs the store."""
+        if self.env is not None:
+            agents = self.env.n_agents
+            action_dim = self.env.action_dim
+            episode_length = self.env.episode_length
+            action_sizes = None
         elif store is not None:
-            n, a, length = store.n_agents, store.actions.shape[2], int(store.lengths.max())
+            agents = store.n_agents
+            action_dim = store.actions.shape[2]
+            episode_length = int(store.lengths.max())
+            action_sizes = store.card.get("action_sizes")
         else:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
-        n = 1 if self.alike else n
-        sizes = None if env is not None else store.card.get("action_sizes")
-        names, bounds = feature_map.names, (self.action_low, self.action_high)
-        return Spec(self.name, n, a, names, *bounds, length, self.alike, sizes and tuple(sizes))
+        return Spec(
+            task=self.name,
+            n_agents=1 if self.alike else agents,
+            action_dim=action_dim,
+            feature_names=feature_map.names,
+            action_low=self.action_low,
+            action_high=self.action_high,
+            episode_length=episode_length,
+            alike=self.alike,
+            action_sizes=tuple(action_sizes) if action_sizes else None,
+        )
+
+
+def first_rows(store: EpisodeStore) -> np.ndarray:
+    """(E,) rows of `observations` that episodes begin with."""
+    return np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)

@@ -10,17 +10,23 @@ entries for any number of agents; the room grows with them, as crowded as before
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs import discs
+from ringfence.envs.base import Defaults
+from ringfence.envs.sight import approaches
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap, solitary
 from ringfence.types import Array, Key, Transition
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 DT = 0.1  # s
 RADIUS = 0.15  # m
@@ -50,7 +56,7 @@ class CrossingState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Crossing:
+class Crossing(Defaults):
     """The room, in pure JAX; see the module's docstring.
 
     body: `disc` is pushed along x and y, `unicycle` along its heading, and turns. goals: `random` in the room, `across`
@@ -65,29 +71,42 @@ class Crossing:
     neighbours: int = 6  # that are seen
     episode_length: int = 100
     spacing: float = SPACING
-    action_dim: ClassVar[int] = 2  # push along x and y; of a unicycle push along its heading, and turn
-    terminates: ClassVar[bool] = False
     dt: ClassVar[float] = DT
     radius: ClassVar[float] = RADIUS
-    world: ClassVar[dict] = {"dynamics_width": 32}  # all that a push moves is one's own velocity
-    # Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row. Who climbs
-    # drives as nobody in the logs does, all the more the farther, and others no longer go on as the World foresees.
-    guard: ClassVar[dict] = {name: {"rows": 3, "future": True} for name in ("shield", "adapt")}
-    guard["full"] = guard["shield"] | {"reach": 0.5, "margin": 1.5}
+    film_shows: ClassVar[str] = "Lines lead to goals, red touches."
+    opengl: ClassVar[bool] = False
 
     def __post_init__(self):
-        for field, options in (("body", ("disc", "unicycle")), ("goals", ("random", "across"))):
+        for field, options in (("body", get_args(Body)), ("goals", get_args(Goals))):
             if getattr(self, field) not in options:
                 raise UserError(
                     f"Crossing {field}='{getattr(self, field)}' does not exist; choose one of {', '.join(options)}."
                 )
-        for field, bound in (("n_agents", 1), ("neighbours", 1), ("episode_length", 1), ("obstacles", 0)):
-            if getattr(self, field) < bound:
-                raise UserError(f"Crossing {field}={getattr(self, field)} must be at least {bound}.")
+        for field, least in (("n_agents", 1), ("neighbours", 1), ("episode_length", 1), ("obstacles", 0)):
+            if getattr(self, field) < least:
+                raise UserError(f"Crossing {field}={getattr(self, field)} must be at least {least}.")
         if not self.spacing >= 4 * RADIUS:
             raise UserError(
                 f"Crossing spacing={self.spacing} leaves no way between discs; give {4 * RADIUS:g} m or more."
             )
+
+    @property
+    def action_dim(self) -> int:
+        """A push along x and y; of a unicycle a push along its heading, and a turn."""
+        return 2
+
+    @property
+    def world(self) -> dict[str, Any]:
+        """All that a push moves is one's own velocity."""
+        return {"dynamics_width": 32}
+
+    @property
+    def guard(self) -> dict[str, dict[str, Any]]:
+        """Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row. Who
+        climbs drives as nobody in the logs does, all the more the farther, and others no longer go on as the World
+        predicts."""
+        shield = {"rows": 3, "future": True}
+        return {"shield": shield, "adapt": shield, "full": shield | {"reach": 0.5, "margin": 1.5}}
 
     @property
     def side(self) -> float:
@@ -96,7 +115,10 @@ class Crossing:
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        names = ["own.vx", "own.vy"] + ["own.cos", "own.sin"] * (self.body == "unicycle") + ["goal.dx", "goal.dy"]
+        names = ["own.vx", "own.vy"]
+        if self.body == "unicycle":
+            names += ["own.cos", "own.sin"]
+        names += ["goal.dx", "goal.dy"]
         for j in range(self.neighbours):
             names += [f"other{j}.{x}" for x in ("dx", "dy", "dvx", "dvy", "seen")]
         for j in range(min(2, self.obstacles)):
@@ -120,32 +142,35 @@ class Crossing:
         """s̃_i: what the agent sees. There is no other view, or work would grow with the square of the team."""
         return solitary(view, self.observation_names, DT)
 
-    film_shows: ClassVar[str] = "Lines lead to goals, red touches."
-
-    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
+    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
         """Pictures of an episode (discs.py)."""
         return discs.frames(self, states, moments)
 
     def reset(self, key: Key, batch: int) -> CrossingState:
         """At rest, each in a cell of a grid of its own, so that nobody touches anything and everybody can stay away;
         obstacles take cells, too."""
-        kp, kj, kd, kh, kr = jax.random.split(key, 5)
-        n, m = self.n_agents, self.obstacles
-        across = int(np.ceil(np.sqrt(n + m)))
+        key_cells, key_place, key_draw, key_heading, key_radius = jax.random.split(key, 5)
+        n = self.n_agents
+        bodies = n + self.obstacles
+        across = int(np.ceil(np.sqrt(bodies)))
         cell = self.side / across
-        index = jax.random.permutation(kp, jnp.tile(jnp.arange(across**2), (batch, 1)), axis=1, independent=True)
-        corner = jnp.stack(jnp.divmod(index[:, : n + m], across), -1) * cell - self.side / 2
-        radius = jnp.full((batch, n + m), RADIUS)
-        radius = radius.at[:, n:].set(
-            jax.random.uniform(kr, (batch, m), minval=OBSTACLE[0], maxval=min(OBSTACLE[1], cell / 2 - 0.1))
+        cells = jnp.tile(jnp.arange(across**2), (batch, 1))
+        index = jax.random.permutation(key_cells, cells, axis=1, independent=True)
+        corner = jnp.stack(jnp.divmod(index[:, :bodies], across), -1) * cell - self.side / 2
+        smallest, largest = OBSTACLE
+        drawn = jax.random.uniform(
+            key_radius, (batch, self.obstacles), minval=smallest, maxval=min(largest, cell / 2 - 0.1)
         )
+        radius = jnp.full((batch, bodies), RADIUS).at[:, n:].set(drawn)
         room = jnp.maximum(cell / 2 - radius - 0.05, 0.0)[..., None]
-        place = corner + cell / 2 + room * jax.random.uniform(kj, (batch, n + m, 2), minval=-1.0, maxval=1.0)
-        draw = jax.random.randint(kd, (batch, n), 0, DRAWS).astype(jnp.float32)
-        heading = jax.random.uniform(kh, (batch, n), minval=-jnp.pi, maxval=jnp.pi)
-        position, obstacle = place[:, :n], jnp.concatenate([place[:, n:], radius[:, n:, None]], -1)
+        place = corner + cell / 2 + room * jax.random.uniform(key_place, (batch, bodies, 2), minval=-1.0, maxval=1.0)
+        draw = jax.random.randint(key_draw, (batch, n), 0, DRAWS).astype(jnp.float32)
+        position = place[:, :n]
+        obstacle = jnp.concatenate([place[:, n:], radius[:, n:, None]], -1)
         goal, draw = self._next_goal(position, draw, obstacle)
-        heading = heading if self.body == "unicycle" else jnp.zeros_like(heading)
+        heading = jnp.zeros((batch, n))
+        if self.body == "unicycle":
+            heading = jax.random.uniform(key_heading, (batch, n), minval=-jnp.pi, maxval=jnp.pi)
         return CrossingState(position, jnp.zeros_like(position), heading, goal, draw, obstacle)
 
     def step(self, state: CrossingState, action: Array) -> tuple[CrossingState, Transition]:
@@ -158,11 +183,13 @@ class Crossing:
             end = self.side / 2 - RADIUS
             velocity = jnp.where(jnp.abs(position) > end, 0.0, velocity)
             position = jnp.clip(position, -end, end)
-        before, after = (length(p - state.goal) for p in (state.position, position))
+        before = length(state.position - state.goal)
+        after = length(position - state.goal)
         effort = (action**2).sum(-1) if self.body == "disc" else action[..., 0] ** 2
         there = after < REACHED
         goal, draw = self._next_goal(position, state.draw, state.obstacle)
-        goal, draw = jnp.where(there[..., None], goal, state.goal), jnp.where(there, draw, state.draw)
+        goal = jnp.where(there[..., None], goal, state.goal)
+        draw = jnp.where(there, draw, state.draw)
         now = CrossingState(position, velocity, heading, goal, draw, state.obstacle)
         touching = self.clearance(now) < 0
         over = jnp.zeros(position.shape[:-2], bool)
@@ -170,12 +197,14 @@ class Crossing:
 
     def clearance(self, state: CrossingState) -> Array:
         """(B, N) m from an agent's rim to the nearest thing that it must not touch; negative in contact."""
-        p, least = state.position, jnp.full(state.position.shape[:-1], jnp.inf)
+        p = state.position
+        least = jnp.full(p.shape[:-1], jnp.inf)
         if self.n_agents > 1:
-            apart = length(p[..., None, :, :] - p[..., :, None, :]) + 1e9 * jnp.eye(self.n_agents)
-            least = jnp.minimum(least, apart.min(-1) - 2 * RADIUS)
+            distance = length(p[..., None, :, :] - p[..., :, None, :]) + 1e9 * jnp.eye(self.n_agents)
+            least = jnp.minimum(least, distance.min(-1) - 2 * RADIUS)
         if self.obstacles:
-            centre, radius = state.obstacle[..., None, :, :2], state.obstacle[..., None, :, 2]
+            centre = state.obstacle[..., None, :, :2]
+            radius = state.obstacle[..., None, :, 2]
             least = jnp.minimum(least, (length(centre - p[..., :, None, :]) - radius).min(-1) - RADIUS)
         if self.walls:  # a disc at the end of its way touches
             least = jnp.minimum(least, (self.side / 2 - 1e-4 - jnp.abs(p)).min(-1) - RADIUS)
@@ -185,52 +214,62 @@ class Crossing:
         """Offsets and relative velocities (B, N, k, 2) of the k = min(neighbours, N - 1) others who come nearest within
         `SOON` if everybody goes on as now, in that order; those in sight first. Who is nearest now would hide, in a
         crowd, who comes at full speed."""
-        p, v, n = state.position, state.velocity, self.n_agents
-        offset = p[..., None, :, :] - p[..., :, None, :]  # (B, N, N, 2)
-        speed = v[..., None, :, :] - v[..., :, None, :]
-        when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, SOON)
-        least = ((offset + when[..., None] * speed) ** 2).sum(-1)
-        least = jnp.where((offset**2).sum(-1) < SIGHT**2, least, 1e6) + 1e9 * jnp.eye(n)
-        _, who = jax.lax.top_k(-least, min(self.neighbours, n - 1))
-        return tuple(jnp.take_along_axis(x, who[..., None], -2) for x in (offset, speed))
+        n = self.n_agents
+        offset, speed, squared = approaches(state.position, state.velocity, SIGHT, SOON)
+        _, who = jax.lax.top_k(-squared, min(self.neighbours, n - 1))
+        return jnp.take_along_axis(offset, who[..., None], -2), jnp.take_along_axis(speed, who[..., None], -2)
 
     def observe(self, state: CrossingState) -> Array:
         """(B, N, O) as `observation_names` says. Others that are not seen stand at the end of sight, `seen` = 0."""
-        p, v, n = state.position, state.velocity, self.n_agents
-        parts = [v]
+        parts = [state.velocity]
         if self.body == "unicycle":
-            parts.append(jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)], -1))
-        parts.append(state.goal - p)
-        many = min(self.neighbours, n - 1)
-        if many:
-            offset, theirs = self.nearest(state)
-            seen = (offset**2).sum(-1, keepdims=True) < SIGHT**2
-            told = jnp.concatenate([offset, theirs, jnp.ones_like(offset[..., :1])], -1)
-            told = jnp.where(seen, told, jnp.asarray(_UNSEEN))
-        else:
-            told = jnp.zeros((*p.shape[:-1], 0, 5))
-        if many < self.neighbours:
-            rest = jnp.broadcast_to(jnp.asarray(_UNSEEN), (*p.shape[:-1], self.neighbours - many, 5))
-            told = jnp.concatenate([told, rest], -2)
-        parts.append(told.reshape(*p.shape[:-1], -1))
+            parts.append(_ahead(state.heading))
+        parts.append(state.goal - state.position)
+        parts.append(self._others_seen(state))
         if self.obstacles:
-            offset = state.obstacle[..., None, :, :2] - p[..., :, None, :]
-            radius = jnp.broadcast_to(state.obstacle[..., None, :, 2], offset.shape[:-1])
-            _, which = jax.lax.top_k(radius - length(offset), min(2, self.obstacles))
-            told = jnp.concatenate([offset, radius[..., None]], -1)
-            parts.append(jnp.take_along_axis(told, which[..., None], -2).reshape(*p.shape[:-1], -1))
+            parts.append(self._obstacles_seen(state))
         if self.walls:
-            end, zero = self.side / 2, jnp.zeros_like(p[..., 0])
-            x, y = p[..., 0], p[..., 1]
-            parts.append(jnp.stack([end - x, zero, -end - x, zero, zero, end - y, zero, -end - y], -1))
+            parts.append(self._walls_seen(state))
         return jnp.concatenate(parts, -1)
+
+    def _others_seen(self, state: CrossingState) -> Array:
+        """(B, N, 5 neighbours)"""
+        lead = state.position.shape[:-1]
+        count = min(self.neighbours, self.n_agents - 1)
+        if count:
+            offset, speed = self.nearest(state)
+            seen = (offset**2).sum(-1, keepdims=True) < SIGHT**2
+            rows = jnp.concatenate([offset, speed, jnp.ones_like(offset[..., :1])], -1)
+            rows = jnp.where(seen, rows, jnp.asarray(_UNSEEN))
+        else:
+            rows = jnp.zeros((*lead, 0, 5))
+        if count < self.neighbours:
+            missing = jnp.broadcast_to(jnp.asarray(_UNSEEN), (*lead, self.neighbours - count, 5))
+            rows = jnp.concatenate([rows, missing], -2)
+        return rows.reshape(*lead, -1)
+
+    def _obstacles_seen(self, state: CrossingState) -> Array:
+        """(B, N, 3) or (B, N, 6): of the nearest one or two."""
+        offset = state.obstacle[..., None, :, :2] - state.position[..., :, None, :]
+        radius = jnp.broadcast_to(state.obstacle[..., None, :, 2], offset.shape[:-1])
+        _, which = jax.lax.top_k(radius - length(offset), min(2, self.obstacles))
+        rows = jnp.concatenate([offset, radius[..., None]], -1)
+        return jnp.take_along_axis(rows, which[..., None], -2).reshape(*state.position.shape[:-1], -1)
+
+    def _walls_seen(self, state: CrossingState) -> Array:
+        """(B, N, 8): offsets to the four walls."""
+        end = self.side / 2
+        x = state.position[..., 0]
+        y = state.position[..., 1]
+        zero = jnp.zeros_like(x)
+        return jnp.stack([end - x, zero, -end - x, zero, zero, end - y, zero, -end - y], -1)
 
     def global_state(self, state: CrossingState) -> Array:
         """(B, 8N + 3M), as `state_names` says."""
         agents = [state.position, state.velocity, state.heading[..., None], state.goal, state.draw[..., None]]
         flat = jnp.concatenate(agents, -1)
-        parts = (x.reshape(*x.shape[:-2], -1) for x in (flat, state.obstacle))
-        return jnp.concatenate(list(parts), -1)
+        parts = [x.reshape(*x.shape[:-2], -1) for x in (flat, state.obstacle)]
+        return jnp.concatenate(parts, -1)
 
     def from_global_state(self, flat: Array) -> CrossingState:
         """Inverse of `global_state`."""
@@ -246,11 +285,11 @@ class Crossing:
             push = action * PUSH / jnp.maximum(length(action), 1.0)[..., None]
             velocity = state.velocity + DT * push
             return velocity * (SPEED / jnp.maximum(length(velocity), SPEED))[..., None], state.heading
-        ahead = jnp.stack([jnp.cos(state.heading), jnp.sin(state.heading)], -1)
+        ahead = _ahead(state.heading)
         speed = jnp.clip((state.velocity * ahead).sum(-1) + DT * PUSH * action[..., 0], 0.0, SPEED)
         heading = state.heading + DT * TURN * action[..., 1]
         heading = (heading + jnp.pi) % (2 * jnp.pi) - jnp.pi
-        return speed[..., None] * jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1), heading
+        return speed[..., None] * _ahead(heading), heading
 
     def _next_goal(self, position: Array, draw: Array, obstacle: Array) -> tuple[Array, Array]:
         """(goals (B, N, 2), what the ones after are drawn by): of some that are drawn, the first that is far enough
@@ -267,7 +306,8 @@ class Crossing:
         if self.obstacles:
             gap = length(drawn[..., None, :] - obstacle[..., None, None, :, :2]) - obstacle[..., None, None, :, 2]
             free = (gap > 3 * RADIUS).all(-1)
-            fine, away = fine & free, jnp.where(free, away, -1.0)
+            fine = fine & free
+            away = jnp.where(free, away, -1.0)
         which = jnp.where(fine.any(-1), fine.argmax(-1), away.argmax(-1))
         goal = jnp.take_along_axis(drawn, which[..., None, None], -2)[..., 0, :]
         return goal, _mixed(number[..., 0] + jnp.uint32(77)).astype(jnp.float32)
@@ -279,6 +319,11 @@ _UNSEEN = np.array([SIGHT, 0.0, 0.0, 0.0, 0.0], np.float32)
 def length(x: Array) -> Array:
     """Euclidean, with a slope at 0."""
     return jnp.sqrt((x**2).sum(-1) + 1e-12)
+
+
+def _ahead(heading: Array) -> Array:
+    """(..., 2) the direction of a heading (...) in rad."""
+    return jnp.stack([jnp.cos(heading), jnp.sin(heading)], -1)
 
 
 def _mixed(x: Array) -> Array:

@@ -54,10 +54,12 @@ class Spread(_Parallel):
 
     def state(self) -> np.ndarray:
         world = self.theirs.unwrapped.world
-        bodies = [a.state.p_pos for a in world.agents], [a.state.p_vel for a in world.agents]
-        return np.concatenate([*bodies[0], *bodies[1], *(m.state.p_pos for m in world.landmarks)]).astype(np.float32)
+        positions = [agent.state.p_pos for agent in world.agents]
+        velocities = [agent.state.p_vel for agent in world.agents]
+        landmarks = [landmark.state.p_pos for landmark in world.landmarks]
+        return np.concatenate([*positions, *velocities, *landmarks]).astype(np.float32)
 
     def _touching(self) -> bool:
-        place = np.stack([a.state.p_pos for a in self.theirs.unwrapped.world.agents])
+        place = np.stack([agent.state.p_pos for agent in self.theirs.unwrapped.world.agents])
         gap = np.linalg.norm(place[:, None] - place, axis=-1) + 9.0 * np.eye(len(place))
         return bool((gap < CONTACT_DISTANCE).any())

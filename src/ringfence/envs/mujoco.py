@@ -16,21 +16,26 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs import film
+from ringfence.envs.base import Outcome
 from ringfence.errors import UserError, unknown
-from ringfence.problem.features import VIEWS, FeatureMap, others
+from ringfence.problem.features import VIEWS, FeatureMap, Source, others
 from ringfence.types import Array
 from ringfence.utils import interrupts
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 FRAME_SKIP = 5  # substeps of an environment step
 DT = 0.05  # s of an environment step
@@ -39,18 +44,10 @@ HEALTHY_Z = (0.2, 1.0)  # m, the Ant's torso; outside the episode ends
 MARGIN = 0.01  # m, contact margin of the Ant's geoms in Gymnasium's file
 LIMITS = {"2x3": 3.227, "2x4": 2.522, "4x2": 2.418}  # m/s, safety-gymnasium's
 CREEPING = 0.6  # m/s: below that limit a guard pushes an Ant less
-ROBOTS = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
 
 Parts = Literal["2x3", "2x4", "4x2"]
-
-
-class Outcome(NamedTuple):
-    """What a step gives, for a batch of robots; what is not running has zeros."""
-
-    reward: np.ndarray  # (B,) shared
-    cost: np.ndarray  # (B,) shared: 1 where the speed exceeds the limit
-    terminated: np.ndarray  # (B,) bool: fallen
-    speed: np.ndarray  # (B,) m/s, mean over the step; for HalfCheetah its absolute value along x
+Seed = int | Sequence[int]
+ROBOTS: dict[Parts, str] = {"2x3": "half_cheetah", "2x4": "ant", "4x2": "ant"}
 
 
 @dataclass(frozen=True)
@@ -61,15 +58,8 @@ class SafeMuJoCo:
     speed_limit: float | None = None  # m/s; None: safety-gymnasium's
     episode_length: int = 1000
     dt: ClassVar[float] = DT
-    # Settings of its World: contacts are hard to foresee, a speed limit to the tenth of a m/s is to tell; 25 steps of
-    # 1000 above it are allowed; and ten steps before its fall an Ant runs fastest, so values look farther than that.
-    world: ClassVar[dict] = {
-        "discount": 0.97,
-        "dynamics_updates": 40_000,
-        "barrier_width": 128,
-        "barrier_updates": 20_000,
-        "missed": 0.02,
-    }
+    film_shows: ClassVar[str] = "The bar is the speed, the stroke its limit, red is above it."
+    opengl: ClassVar[bool] = True
 
     def __post_init__(self):
         if self.parts not in ROBOTS:
@@ -98,8 +88,20 @@ class SafeMuJoCo:
         return self.ant
 
     @property
-    def guard(self) -> dict[str, dict]:
-        """What named guards do otherwise (guards.options_of). Three steps ahead foresight errs by a tenth of what
+    def world(self) -> dict[str, Any]:
+        """Contacts are hard to predict, and a speed limit is to be told to a tenth of a m/s; 25 steps of 1000 above it
+        are allowed. Ten steps before its fall an Ant runs fastest, so values look farther than that."""
+        return {
+            "discount": 0.97,
+            "dynamics_updates": 40_000,
+            "barrier_width": 128,
+            "barrier_updates": 20_000,
+            "missed": 0.02,
+        }
+
+    @property
+    def guard(self) -> dict[str, dict[str, Any]]:
+        """What named guards do otherwise (guards.options_of). Three steps ahead predictions err by a tenth of what
         changes. An Ant that is pushed or climbs far from where the logs were falls; where it is to creep, the
         margin is missing most of the time, so that it is always pushed, and less will do."""
         climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
@@ -115,11 +117,11 @@ class SafeMuJoCo:
         """No episode with at most `cost_limit` steps above the limit, none of them faster than `fastest` (m/s), can
         earn more: the reward of a step is at most the forward speed, and for the Ant 1 more."""
         over = min(cost_limit, self.episode_length)
-        return (
-            (self.episode_length - over) * self.limit + over * max(fastest, self.limit) + self.ant * self.episode_length
-        )
+        running = (self.episode_length - over) * self.limit + over * max(fastest, self.limit)
+        standing = self.episode_length if self.ant else 0
+        return running + standing
 
-    def describe(self, speed: np.ndarray, cost_limit: float) -> dict:
+    def describe(self, speed: np.ndarray, cost_limit: float) -> dict[str, Any]:
         """What a data card says of the limits: `speed` (T,) m/s of all steps, `cost_limit` steps above per episode."""
         return {
             "speed_limit": self.limit,
@@ -153,14 +155,18 @@ class SafeMuJoCo:
         """(N, A) index in `ctrl` of every action entry. The Ant's motors begin with its fourth leg."""
         return (self.own_joints + 2) % 8 if self.ant else self.own_joints
 
-    @cached_property
+    @property
     def state_names(self) -> tuple[str, ...]:
         """Entries of the global state: all of qpos but the planar position, then qvel."""
-        torso, moving = ("z", "pitch"), ("vx", "vz", "vpitch")
-        if self.ant:
-            torso, moving = ("z", "qw", "qx", "qy", "qz"), ("vx", "vy", "vz", "wx", "wy", "wz")
-        names = [f"torso.{c}" for c in torso] + [f"{j}.q" for j in self.joints]
-        return tuple(names + [f"torso.{c}" for c in moving] + [f"{j}.v" for j in self.joints])
+        return self._state_names
+
+    @cached_property
+    def _state_names(self) -> tuple[str, ...]:
+        pose = ("z", "qw", "qx", "qy", "qz") if self.ant else ("z", "pitch")
+        velocity = ("vx", "vy", "vz", "wx", "wy", "wz") if self.ant else ("vx", "vz", "vpitch")
+        positions = [*(f"torso.{c}" for c in pose), *(f"{joint}.q" for joint in self.joints)]
+        velocities = [*(f"torso.{c}" for c in velocity), *(f"{joint}.v" for joint in self.joints)]
+        return tuple(positions + velocities)
 
     @property
     def observation_dim(self) -> int:
@@ -171,18 +177,19 @@ class SafeMuJoCo:
         """(N, O) entries of the global state in every agent's observation: own joints by name (position, velocity),
         positions of the neighbouring joints, the torso."""
         at = {name: k for k, name in enumerate(self.state_names)}
+        torso = [k for name, k in at.items() if name.startswith("torso.")]
         rows = []
-        for mine in self.own_joints:
-            own = sorted((self.joints[j] for j in mine), key=lambda name: (name.rstrip("0123456789"), name))
-            rows.append([at[f"{j}.{c}"] for j in own for c in "qv"])
-            rows[-1] += [at[f"{j}.q"] for j in self._neighbours(mine)]
-            rows[-1] += [k for name, k in at.items() if name.startswith("torso.")]
+        for joints in self.own_joints:
+            own = sorted((self.joints[j] for j in joints), key=lambda name: (name.rstrip("0123456789"), name))
+            moving = [at[f"{joint}.{c}"] for joint in own for c in "qv"]
+            near = [at[f"{joint}.q"] for joint in self._neighbours(joints)]
+            rows.append(moving + near + torso)
         return np.array(rows)
 
-    def _neighbours(self, mine: np.ndarray) -> list[str]:
+    def _neighbours(self, own: np.ndarray) -> list[str]:
         """Joints next to those of an agent: the other legs' hips, or the other half's thigh."""
-        others = [j for k, j in enumerate(self.joints) if k not in mine]
-        return [j for j in others if j.startswith("hip") or j.endswith("thigh")]
+        rest = [joint for k, joint in enumerate(self.joints) if k not in own]
+        return [joint for joint in rest if joint.startswith("hip") or joint.endswith("thigh")]
 
     @cached_property
     def observation_names(self) -> tuple[str, ...]:
@@ -193,25 +200,23 @@ class SafeMuJoCo:
         """s̃_i in a view (features.py)."""
         return views(view, self)
 
-    opengl: ClassVar[bool] = True  # its films need it
-    film_shows: ClassVar[str] = "The bar is the speed, the stroke its limit, red is above it."
-
-    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]):
+    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
         """Pictures of an episode (film.py)."""
         return film.frames(self, states, moments)
 
-    def model(self):
+    def model(self) -> Any:
         """The MuJoCo model; the Ant's is refused on versions whose physics differs."""
         import gymnasium
-        import mujoco
 
+        mujoco = _mujoco()
         version = tuple(int(x) for x in re.findall(r"\d+", mujoco.__version__)[:2])
         if self.ant and version >= (4, 0):
             raise UserError(
                 f"MuJoCo {mujoco.__version__} integrates free joints differently, so its Ant is another robot; "
                 "install 'mujoco>=3.3,<4'."
             )
-        text = (Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / f"{self.robot}.xml").read_text()
+        assets = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets"
+        text = (assets / f"{self.robot}.xml").read_text()
         # Newer versions warn of this attribute in a log file in the working directory.
         model = mujoco.MjModel.from_xml_string(re.sub(r'\s+settotalmass="[^"]*"', "", text))
         if self.ant and not np.allclose(model.geom_margin[1:], MARGIN):
@@ -221,8 +226,8 @@ class SafeMuJoCo:
             )
         if self.ant and version >= (3, 5):
             model.geom_margin *= 0.5
-        if hasattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND"):  # one robot is one island: the same bits, 5 % faster
-            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_ISLAND)
+        # One robot is one island: the same bits, 5 % faster. Older versions do not look for islands.
+        model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, "mjDSBL_ISLAND", 0))
         if not self.ant:
             mujoco.mj_setTotalmass(model, 14.0)
             mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -239,31 +244,31 @@ class Simulation:
     def __init__(self, env: SafeMuJoCo, batch: int, threads: int | None = None):
         if batch < 1:
             raise UserError(f"batch={batch} must be at least 1.")
-        self.env, self.batch, self._threads = env, batch, threads
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        threads = max(1, min(threads or cores, batch))
+        self.env = env
+        self.batch = batch
+        self._threads = threads
         model = env.model()
+        workers = max(1, min(threads or _cores(), batch))
         try:
-            self._robots = _Batch(model, batch, threads)
+            self._robots = _Batch(model, batch, workers)
         except ImportError:  # before MuJoCo 3.17
-            self._robots = _Loop(model, batch, threads)
+            self._robots = _Loop(model, batch, workers)
         self._rest = model.qpos0.copy()
         self._ctrl = np.zeros((batch, model.nu))
         self._place = np.zeros((batch, 2 if env.ant else 1))  # where speeds are measured from
         self.running = np.zeros(batch, bool)
 
-    def reset(self, seeds: Sequence[int | Sequence[int]], ids: Sequence[int] | None = None) -> None:
+    def reset(self, seeds: Sequence[Seed], ids: Sequence[int] | np.ndarray | None = None) -> None:
         """Start an episode of every robot, or of those in `ids`; a seed fixes its start, whatever the batch."""
-        ids = np.arange(self.batch) if ids is None else np.asarray(ids)
-        if len(seeds) != len(ids):
-            raise UserError(f"reset() got {len(seeds)} seeds for {len(ids)} robots; pass one for each.")
-        draws = [np.random.Generator(np.random.PCG64(np.random.SeedSequence(s))) for s in seeds]
-        nq, nv = self._rest.size, self._robots.qvel.shape[1]
-        qpos = np.stack([self._rest + d.uniform(-RESET_SPREAD, RESET_SPREAD, nq) for d in draws])
-        qvel = np.stack([RESET_SPREAD * d.standard_normal(nv) for d in draws])
+        robots = self._ids(ids)
+        if len(seeds) != len(robots):
+            raise UserError(f"reset() got {len(seeds)} seeds for {len(robots)} robots; pass one for each.")
+        draws = [np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed))) for seed in seeds]
+        qpos = np.stack([self._rest + draw.uniform(-RESET_SPREAD, RESET_SPREAD, self._rest.size) for draw in draws])
+        qvel = np.stack([RESET_SPREAD * draw.standard_normal(self._robots.qvel.shape[1]) for draw in draws])
         if self.env.ant:
             qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
-        self.restore(qpos, qvel, ids=ids)
+        self.restore(qpos, qvel, ids=robots)
 
     def restore(
         self,
@@ -271,26 +276,33 @@ class Simulation:
         qvel: np.ndarray,
         warmstart: np.ndarray | None = None,
         place: np.ndarray | None = None,
-        ids: Sequence[int] | None = None,
+        ids: Sequence[int] | np.ndarray | None = None,
     ) -> None:
         """Put robots (those in `ids`, or all) into states. `place` (B, 2): the Ant's lagged position, if it is not that
         of `qpos`."""
-        ids = np.arange(self.batch) if ids is None else np.asarray(ids)
-        self._robots.place(ids, qpos, qvel, np.zeros_like(qvel) if warmstart is None else warmstart)
-        self._place[ids] = self._measured()[ids] if place is None else place
-        self.running[ids] = True
+        robots = self._ids(ids)
+        self._robots.place(robots, qpos, qvel, np.zeros_like(qvel) if warmstart is None else warmstart)
+        self._place[robots] = self._measured()[robots] if place is None else place
+        self.running[robots] = True
 
-    def __getstate__(self) -> dict:
+    def _ids(self, ids: Sequence[int] | np.ndarray | None) -> np.ndarray:
+        """Robots that are named, or all."""
+        return np.arange(self.batch) if ids is None else np.asarray(ids)
+
+    def __getstate__(self) -> dict[str, Any]:
         """What a copy or another process needs to go on from here; the simulator itself is made again there."""
         robots = self._robots
-        kept = {"qpos": robots.qpos, "qvel": robots.qvel, "warmstart": robots.warmstart, "place": self._place}
-        made = self.env, self.batch, self._threads
-        return {"made": made, "kept": {k: v.copy() for k, v in kept.items()}, "running": self.running.copy()}
+        arrays = {"qpos": robots.qpos, "qvel": robots.qvel, "warmstart": robots.warmstart, "place": self._place}
+        return {
+            "made": (self.env, self.batch, self._threads),
+            "kept": {name: array.copy() for name, array in arrays.items()},
+            "running": self.running.copy(),
+        }
 
-    def __setstate__(self, told: dict) -> None:
-        self.__init__(*told["made"])
-        self.restore(**told["kept"])
-        self.running[:] = told["running"]
+    def __setstate__(self, pickled: dict[str, Any]) -> None:
+        self.__init__(*pickled["made"])
+        self.restore(**pickled["kept"])
+        self.running[:] = pickled["running"]
 
     def _measured(self) -> np.ndarray:
         """(B, 1 or 2) positions whose displacement is the speed."""
@@ -317,32 +329,60 @@ class Simulation:
         live = np.flatnonzero(self.running)
         self._robots.advance(self._ctrl, live)
         place = self._measured()
-        velocity, self._place = (place - self._place) / DT, place
+        velocity = (place - self._place) / DT
+        self._place = place
         speed = np.linalg.norm(velocity, axis=1)
         effort = (action**2).sum((1, 2))
         if self.env.ant:
             reward = velocity[:, 0] + 1.0 - 0.5 * effort
-            z = self._robots.qpos[:, 2]
-            sound = np.isfinite(self.state()).all(1) & (z >= HEALTHY_Z[0]) & (z <= HEALTHY_Z[1])
         else:
             reward = velocity[:, 0] - 0.1 * effort
-            sound = np.ones(self.batch, bool)
         on = self.running.copy()
+        sound = self._sound()
         self.running &= sound
         cost = (speed > self.env.limit).astype(np.float64)
-        return Outcome(*(np.where(on, x, 0.0) for x in (reward, cost)), on & ~sound, np.where(on, speed, 0.0))
+        return Outcome(
+            reward=np.where(on, reward, 0.0),
+            cost=np.where(on, cost, 0.0),
+            terminated=on & ~sound,
+            speed=np.where(on, speed, 0.0),
+        )
+
+    def _sound(self) -> np.ndarray:
+        """(B,) bool: not fallen."""
+        if not self.env.ant:
+            return np.ones(self.batch, bool)
+        height = self._robots.qpos[:, 2]
+        lowest, highest = HEALTHY_Z
+        return np.isfinite(self.state()).all(1) & (height >= lowest) & (height <= highest)
+
+
+def _mujoco() -> Any:
+    """MuJoCo, whose stubs lack what its extension defines."""
+    import mujoco
+
+    return mujoco
+
+
+def _cores() -> int:
+    """Those that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 class _Batch:
     """MuJoCo's own batched stepping (3.17 and later)."""
 
-    def __init__(self, model, batch: int, threads: int):
+    def __init__(self, model: Any, batch: int, threads: int):
         from mujoco.batch import Batch
 
-        self._batch = Batch(model, batch, threads)
-        bind = self._batch.bind
-        self.qpos, self.qvel, self._ctrl, self.warmstart = (bind(x) for x in ("qpos", "qvel", "ctrl", "qacc_warmstart"))
-        self._xpos = bind("xpos")
+        self._batch: Any = Batch(model, batch, threads)
+        self.qpos: np.ndarray = self._batch.bind("qpos")
+        self.qvel: np.ndarray = self._batch.bind("qvel")
+        self.warmstart: np.ndarray = self._batch.bind("qacc_warmstart")
+        self._ctrl: np.ndarray = self._batch.bind("ctrl")
+        self._xpos: np.ndarray = self._batch.bind("xpos")
 
     @property
     def torso(self) -> np.ndarray:
@@ -350,7 +390,8 @@ class _Batch:
 
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         self._batch.reset(ids=ids, stage=0)
-        self.qpos[ids], self.qvel[ids] = qpos, qvel
+        self.qpos[ids] = qpos
+        self.qvel[ids] = qvel
         with interrupts.held():
             self._batch.forward(ids=ids)
         self.warmstart[ids] = warmstart
@@ -365,26 +406,28 @@ class _Batch:
 class _Loop:
     """One MjData per robot, stepped by a pool of threads; MuJoCo releases the interpreter while it works."""
 
-    def __init__(self, model, batch: int, threads: int):
-        import mujoco
-
-        self._mujoco, self._model = mujoco, model
-        self._data = [mujoco.MjData(model) for _ in range(batch)]
-        self._threads, self._pool = threads, ThreadPoolExecutor(threads) if threads > 1 else None
-        self.qpos, self.qvel = np.zeros((batch, model.nq)), np.zeros((batch, model.nv))
+    def __init__(self, model: Any, batch: int, threads: int):
+        self._mujoco = _mujoco()
+        self._model = model
+        self._data = [self._mujoco.MjData(model) for _ in range(batch)]
+        self._threads = threads
+        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
+        self.qpos = np.zeros((batch, model.nq))
+        self.qvel = np.zeros((batch, model.nv))
         self.torso = np.zeros((batch, 2))
 
     @property
     def warmstart(self) -> np.ndarray:
-        return np.stack([d.qacc_warmstart for d in self._data])
+        return np.stack([data.qacc_warmstart for data in self._data])
 
     def place(self, ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, warmstart: np.ndarray) -> None:
         for row, k in enumerate(ids):
-            d = self._data[k]
-            self._mujoco.mj_resetData(self._model, d)
-            d.qpos[:], d.qvel[:] = qpos[row], qvel[row]
-            self._mujoco.mj_forward(self._model, d)
-            d.qacc_warmstart[:] = warmstart[row]
+            data = self._data[k]
+            self._mujoco.mj_resetData(self._model, data)
+            data.qpos[:] = qpos[row]
+            data.qvel[:] = qvel[row]
+            self._mujoco.mj_forward(self._model, data)
+            data.qacc_warmstart[:] = warmstart[row]
             self._read(k)
 
     def advance(self, ctrl: np.ndarray, live: np.ndarray) -> None:
@@ -401,41 +444,56 @@ class _Loop:
                 list(self._pool.map(run, np.array_split(live, self._threads)))
 
     def _read(self, k: int) -> None:
-        d = self._data[k]
-        self.qpos[k], self.qvel[k], self.torso[k] = d.qpos, d.qvel, d.xpos[1, :2]
+        data = self._data[k]
+        self.qpos[k] = data.qpos
+        self.qvel[k] = data.qvel
+        self.torso[k] = data.xpos[1, :2]
 
 
 def views(view: str, env: SafeMuJoCo) -> FeatureMap:
     """The views of one robot whose joints are shared out: torso, own joints, others' joints."""
-    state_names, joints, own_joints, observed = env.state_names, env.joints, env.own_joints, env.observed
-    n, a = own_joints.shape
-    torso = [name for name in state_names if name.startswith("torso.")]
     if view == "centralized":
-        table = np.tile(np.arange(len(state_names)), (n, 1))
-        less = np.full_like(table, -1)
-        return FeatureMap(view, tuple(state_names), "state", table, less, body=True, joint=True, origin=table)
+        table = np.tile(np.arange(len(env.state_names)), (env.n_agents, 1))
+        return _body(view, env.state_names, "state", table, origin=table)
     if view == "decentralized":
-        own = {f"{joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(own_joints[0]) for c in "qv"}
-        seen = [state_names[k] for k in observed[0]]
-        near = {name: f"near{m}.q" for m, name in enumerate(x for x in seen if x not in own and x not in torso)}
-        table = np.tile(np.arange(len(seen)), (n, 1))
-        names = tuple((own | near).get(x, x) for x in seen)
-        less = np.full_like(table, -1)
-        return FeatureMap(view, names, "observations", table, less, body=True, joint=True, origin=observed)
-    if view != "pruned":
-        raise unknown("view", view, VIEWS)
-    at = {name: k for k, name in enumerate(state_names)}
+        names = _observed_names(env)
+        table = np.tile(np.arange(len(names)), (env.n_agents, 1))
+        return _body(view, names, "observations", table, origin=env.observed)
+    if view == "pruned":
+        return _pruned(env)
+    raise unknown("view", view, VIEWS)
+
+
+def _body(view: str, names: tuple[str, ...], source: Source, table: np.ndarray, origin: np.ndarray) -> FeatureMap:
+    """A map of agents that are limbs of one body, whose entries are those of the source as they are."""
+    minus = np.full_like(table, -1)
+    return FeatureMap(view, names, source, table, minus, body=True, joint=True, origin=origin)
+
+
+def _observed_names(env: SafeMuJoCo) -> tuple[str, ...]:
+    """Entries of an agent's observation, as any of the agents names them."""
+    seen = env.observation_names
+    own = {f"{env.joints[k]}.{c}": f"own.joint{p}.{c}" for p, k in enumerate(env.own_joints[0]) for c in "qv"}
+    neighbours = [name for name in seen if name not in own and not name.startswith("torso.")]
+    near = {name: f"near{k}.q" for k, name in enumerate(neighbours)}
+    return tuple((own | near).get(name, name) for name in seen)
+
+
+def _pruned(env: SafeMuJoCo) -> FeatureMap:
+    """Torso, own joints, others' joints, which are where their owners plan to have them."""
+    n, joints = env.own_joints.shape
+    at = {name: k for k, name in enumerate(env.state_names)}
+    torso = [name for name in env.state_names if name.startswith("torso.")]
     whose = ["own", *(f"other{j}" for j in range(n - 1))]
-    names = [*torso, *(f"{w}.joint{k}.{c}" for w in whose for k in range(a) for c in "qv")]
+    names = [*torso, *(f"{who}.joint{k}.{c}" for who in whose for k in range(joints) for c in "qv")]
     rows = []
-    for i in range(n):
-        order = [i, *(j for j in range(n) if j != i)]
-        rows.append([at[f"{joints[k]}.{c}"] for j in order for k in own_joints[j] for c in "qv"])
-    table = np.array([[at[t] for t in torso] + row for row in rows])
-    own = tuple(range(len(torso) + 2 * a))
-    agree = _reconcile_shared(len(torso), 2 * a, n)
-    less = np.full_like(table, -1)
-    return FeatureMap(view, tuple(names), "state", table, less, own, agree, body=True, joint=True, origin=table)
+    for i, others_of in enumerate(others(n)):
+        moved = [env.joints[k] for agent in (i, *others_of) for k in env.own_joints[agent]]
+        rows.append([at[name] for name in torso] + [at[f"{joint}.{c}"] for joint in moved for c in "qv"])
+    table = np.array(rows)
+    own = tuple(range(len(torso) + 2 * joints))
+    plain = _body("pruned", tuple(names), "state", table, origin=table)
+    return replace(plain, own=own, reconcile=_reconcile_shared(len(torso), 2 * joints, n))
 
 
 def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:

@@ -22,7 +22,10 @@ from ringfence.errors import UserError
 LANDMARK_RADIUS = 0.05
 FRAME_SIZE = 480  # pixels, both sides
 
-Dicts = tuple[dict[str, Any], ...]
+Reset = tuple[dict[str, np.ndarray], dict[str, dict[str, float]]]  # observations, infos
+Step = tuple[  # observations, rewards, terminations, truncations, infos
+    dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
+]
 
 
 def parallel_env(render_mode: str | None = None, **options: Any) -> SimpleSpreadParallel:
@@ -34,17 +37,18 @@ class _Parallel(ParallelEnv):
     """Agents `agent_0` .. `agent_{N-1}` and their spaces."""
 
     def __init__(self, agents: int, observation: int, action: int, state: int, kind: type):
-        self.possible_agents = names = [f"agent_{i}" for i in range(agents)]
+        names = [f"agent_{i}" for i in range(agents)]
+        self.possible_agents = names
         self.agents: list[str] = []
         # One object per agent, made once: the API demands identity, so that seeding a space lasts.
-        self.observation_spaces = {a: spaces.Box(-np.inf, np.inf, (observation,), kind) for a in names}
-        self.action_spaces = {a: spaces.Box(-1.0, 1.0, (action,), np.float32) for a in names}
+        self.observation_spaces = {agent: spaces.Box(-np.inf, np.inf, (observation,), kind) for agent in names}
+        self.action_spaces = {agent: spaces.Box(-1.0, 1.0, (action,), np.float32) for agent in names}
         self.state_space = spaces.Box(-np.inf, np.inf, (state,), kind)
 
-    def observation_space(self, agent: str) -> spaces.Box:
+    def observation_space(self, agent: str) -> spaces.Space:
         return self.observation_spaces[agent]
 
-    def action_space(self, agent: str) -> spaces.Box:
+    def action_space(self, agent: str) -> spaces.Space:
         return self.action_spaces[agent]
 
     def close(self) -> None:
@@ -71,28 +75,31 @@ class _Plane(_Parallel):
         self._step = jax.jit(core.step)
         self._observe = jax.jit(core.observe)
 
-    def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Reset:
         """Start an episode; a seed fixes this and all later episodes. `options` is accepted and ignored."""
         if seed is not None or self._key is None:
             # Without a seed the first episode is drawn from the system's entropy, as Gymnasium's environments do.
             entropy = np.random.SeedSequence().generate_state(1)[0] if seed is None else seed
             self._key = jax.random.key(int(entropy))
         self._key, key = jax.random.split(self._key)
-        self._state, self._steps, self.agents = self._reset(key), 0, self.possible_agents[:]
+        self._state = self._reset(key)
+        self._steps = 0
+        self.agents = self.possible_agents[:]
         return self._observations(), self._infos(np.zeros(1))
 
-    def step(self, actions: dict[str, Any]) -> Dicts:
+    def step(self, actions: dict[str, Any]) -> Step:
         """Advance by 0.1 s with one action (2,) per agent."""
         joint = _joint(self.agents, actions)
         if joint.shape[2:] != (2,) or not np.isfinite(joint).all():
             raise UserError(f"step() got actions {dict(actions)}; give every agent two finite numbers, its push.")
         self._state, transition = self._step(self._state, joint)
         self._steps += 1
-        agents, over = self.agents, self._steps >= self.core.episode_length
+        agents = self.agents
+        over = bool(self._steps >= self.core.episode_length)
         reward = np.asarray(transition.reward)[0]
         result = (
             self._observations(),
-            {a: float(r) for a, r in zip(agents, reward)},
+            {agent: float(r) for agent, r in zip(agents, reward)},
             dict.fromkeys(agents, False),
             dict.fromkeys(agents, over),
             self._infos(np.asarray(transition.cost[0])),
@@ -114,8 +121,8 @@ class _Plane(_Parallel):
     def _infos(self, cost: np.ndarray) -> dict[str, dict[str, float]]:
         """Costs () of the team, or (N,) of each agent."""
         costs = np.broadcast_to(cost, len(self.possible_agents))
-        told = zip(self.possible_agents, costs, self._clearance())
-        return {a: {"cost": float(k), "clearance": float(c)} for a, k, c in told}
+        facts = zip(self.possible_agents, costs, self._clearance())
+        return {agent: {"cost": float(cost), "clearance": float(clearance)} for agent, cost, clearance in facts}
 
     def _clearance(self) -> np.ndarray:
         """(N,) m to what an agent must not touch."""
@@ -136,12 +143,14 @@ class SimpleSpreadParallel(_Plane):
         """(480, 480, 3) uint8 for render_mode "rgb_array": agents blue, in contact red, landmarks grey."""
         if self.render_mode is None or self._state is None:
             return None
-        position, landmarks = np.asarray(self._state.position[0]), np.asarray(self._state.landmarks[0])
+        position = np.asarray(self._state.position[0])
+        landmarks = np.asarray(self._state.landmarks[0])
         touching = self._clearance() < 0
         # Zoom out rather than lose an agent that leaves the arena.
         extent = max(1.15 * self.core.half_width, float(np.abs(position).max()) + 2 * AGENT_RADIUS)
         axis = (np.arange(FRAME_SIZE) + 0.5) / FRAME_SIZE * 2 * extent - extent
-        x, y = axis[None, :], -axis[:, None]  # y points up
+        x = axis[None, :]
+        y = -axis[:, None]  # it points up
         frame = np.full((FRAME_SIZE, FRAME_SIZE, 3), 255, np.uint8)
         for place in landmarks:
             frame[(x - place[0]) ** 2 + (y - place[1]) ** 2 < LANDMARK_RADIUS**2] = (90, 90, 90)
@@ -160,7 +169,7 @@ class SimpleSpreadParallel(_Plane):
 
 
 class SpreadAlikeParallel(SimpleSpreadParallel):
-    """The same in views that any number of agents have alike; `cost` is each agent's own."""
+    """The same in views of homogeneous agents, any number of them; `cost` is each agent's own."""
 
     metadata = {**_Plane.metadata, "name": "ringfence_spread_alike"}
     simulator = SpreadAlike
@@ -200,39 +209,45 @@ class SafeMuJoCoParallel(_Parallel):
             raise UserError(f"There is no render_mode='{render_mode}' of robots; `ringfence eval --video` films them.")
         self.render_mode = None
         self.core = SafeMuJoCo(**options)
-        sizes = self.core.n_agents, self.core.observation_dim, self.core.action_dim, len(self.core.state_names)
-        super().__init__(*sizes, np.float64)
+        super().__init__(
+            self.core.n_agents,
+            self.core.observation_dim,
+            self.core.action_dim,
+            len(self.core.state_names),
+            np.float64,
+        )
         self._sim = self.core.simulate(1, threads=1)
         self._seeds: np.random.SeedSequence | None = None
         self._steps = 0
 
-    def reset(self, seed: int | None = None, options: dict | None = None) -> Dicts:
+    def reset(self, seed: int | None = None, options: dict | None = None) -> Reset:
         """Start an episode; a seed fixes this one, as in safety-gymnasium, and all later ones."""
         if seed is not None and seed < 0:
             raise UserError(f"reset() got seed={seed}; pass one of 0 or more, or None.")
         if seed is not None or self._seeds is None:
             self._seeds = np.random.SeedSequence(seed)
             start = self._seeds.entropy
+            assert start is not None, "NumPy draws it where no seed is given"
         else:
             start = self._seeds.spawn(1)[0].generate_state(4).tolist()
         self._sim.reset([start])
-        self._steps, self.agents = 0, self.possible_agents[:]
-        return self._observations(), {a: {"cost": 0.0, "speed": 0.0, "clearance": self.core.limit} for a in self.agents}
+        self._steps = 0
+        self.agents = self.possible_agents[:]
+        return self._observations(), self._infos(cost=0.0, speed=0.0)
 
-    def step(self, actions: dict[str, Any]) -> Dicts:
+    def step(self, actions: dict[str, Any]) -> Step:
         """Advance by 0.05 s with one action (A,) per agent."""
         out = self._sim.step(_joint(self.agents, actions))
         self._steps += 1
-        agents, fallen = self.agents, bool(out.terminated[0])
+        agents = self.agents
+        fallen = bool(out.terminated[0])
         over = self._steps >= self.core.episode_length
-        speed = float(out.speed[0])
-        told = {"cost": float(out.cost[0]), "speed": speed, "clearance": self.core.limit - speed}
         result = (
             self._observations(),
             dict.fromkeys(agents, float(out.reward[0])),
             dict.fromkeys(agents, fallen),
             dict.fromkeys(agents, over),
-            {a: dict(told) for a in agents},
+            self._infos(cost=float(out.cost[0]), speed=float(out.speed[0])),
         )
         if over or fallen:
             self.agents = []
@@ -250,15 +265,23 @@ class SafeMuJoCoParallel(_Parallel):
     def _observations(self) -> dict[str, np.ndarray]:
         return dict(zip(self.possible_agents, self._sim.observe()[0]))
 
+    def _infos(self, cost: float, speed: float) -> dict[str, dict[str, float]]:
+        """What one body did, for every agent."""
+        return {
+            agent: {"cost": cost, "speed": speed, "clearance": self.core.limit - speed}
+            for agent in self.possible_agents
+        }
+
 
 def _joint(agents: list[str], actions: dict[str, Any]) -> np.ndarray:
     """(1, N, A) from one action per live agent."""
     if not agents:
         raise UserError("The episode is over or was never started; call reset() before step().")
-    missing = [a for a in agents if a not in actions]
+    missing = [agent for agent in agents if agent not in actions]
     if missing:
         raise UserError(f"step() got no action for {', '.join(missing)}; pass one entry per live agent.")
-    given = [np.asarray(actions[a], np.float32) for a in agents]
-    if len({a.shape for a in given}) > 1:
-        raise UserError(f"step() got actions of several shapes, {', '.join(str(a.shape) for a in given)}; give one.")
+    given = [np.asarray(actions[agent], np.float32) for agent in agents]
+    shapes = [action.shape for action in given]
+    if len(set(shapes)) > 1:
+        raise UserError(f"step() got actions of several shapes, {', '.join(map(str, shapes))}; give one.")
     return np.stack(given)[None]

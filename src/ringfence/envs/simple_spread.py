@@ -12,14 +12,15 @@ Two integrators exist in the world and differ in substance:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.envs.base import Defaults
 from ringfence.errors import UserError, unknown
-from ringfence.problem.features import VIEWS, FeatureMap, derived, following
+from ringfence.problem.features import VIEWS, FeatureMap, derived, following, others
 from ringfence.types import Array, Key, Transition
 
 DT = 0.1  # s
@@ -42,7 +43,7 @@ class SpreadState(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SimpleSpread:
+class SimpleSpread(Defaults):
     """Simple Spread for any number of agents, in pure JAX; see the module's docstring for the integrators."""
 
     n_agents: int = 3
@@ -52,14 +53,10 @@ class SimpleSpread:
     episode_length: int = 25
     arena: float | None = None  # half-width of the square of resets; None: 1 up to 3 agents, 2 above (as OMAR's)
     action_dim: int = 2  # force direction, each entry in [-1, 1]
-    terminates: ClassVar[bool] = False  # nothing but the time limit ends an episode
 
     def __post_init__(self):
-        for field, options in (
-            ("integrator", ("velocity_first", "position_first")),
-            ("reward", ("omar", "pettingzoo", "coverage")),
-            ("cost", ("any", "pairs", "per_agent")),
-        ):
+        choices = (("integrator", Integrator), ("reward", RewardName), ("cost", CostName))
+        for field, options in ((field, get_args(kind)) for field, kind in choices):
             if getattr(self, field) not in options:
                 raise UserError(
                     f"SimpleSpread {field}='{getattr(self, field)}' does not exist; choose one of {', '.join(options)}."
@@ -69,7 +66,10 @@ class SimpleSpread:
 
     @property
     def half_width(self) -> float:
-        return self.arena if self.arena is not None else (1.0 if self.n_agents <= 3 else 2.0)
+        """m, half of the arena's side."""
+        if self.arena is not None:
+            return self.arena
+        return 1.0 if self.n_agents <= 3 else 2.0
 
     @property
     def observation_dim(self) -> int:
@@ -91,10 +91,11 @@ class SimpleSpread:
 
     def reset(self, key: Key, batch: int) -> SpreadState:
         """Positions and landmarks uniform in the arena, at rest; starts in contact are part of the task."""
-        kp, kl = jax.random.split(key)
-        shape, w = (batch, self.n_agents, 2), self.half_width
-        position = jax.random.uniform(kp, shape, minval=-w, maxval=w)
-        landmarks = jax.random.uniform(kl, shape, minval=-w, maxval=w)
+        key_position, key_landmarks = jax.random.split(key)
+        shape = (batch, self.n_agents, 2)
+        width = self.half_width
+        position = jax.random.uniform(key_position, shape, minval=-width, maxval=width)
+        landmarks = jax.random.uniform(key_landmarks, shape, minval=-width, maxval=width)
         return SpreadState(position, jnp.zeros(shape), landmarks)
 
     def step(self, state: SpreadState, action: Array) -> tuple[SpreadState, Transition]:
@@ -108,8 +109,10 @@ class SimpleSpread:
         after_vx = (1.0 - DAMPING) * vx + DT * (SENSITIVITY * ux + push_x)
         after_vy = (1.0 - DAMPING) * vy + DT * (SENSITIVITY * uy + push_y)
         if self.integrator == "velocity_first":
-            vx, vy = after_vx, after_vy
-        x, y = x + DT * vx, y + DT * vy
+            vx = after_vx
+            vy = after_vy
+        x = x + DT * vx
+        y = y + DT * vy
         touching = _touching(x, y)
         after = SpreadState(_joined(x, y), _joined(after_vx, after_vy), state.landmarks)
         return after, Transition(
@@ -123,14 +126,14 @@ class SimpleSpread:
         n = self.n_agents
         batch = state.position.shape[:-2]
         landmarks = state.landmarks[..., None, :, :] - state.position[..., :, None, :]
-        others = _others(state.position[..., None, :, :] - state.position[..., :, None, :])
+        offsets = _without_diagonal(state.position[..., None, :, :] - state.position[..., :, None, :])
         silence = jnp.zeros((*batch, n, 2 * (n - 1)), state.position.dtype)
         return jnp.concatenate(
             [
                 state.velocity,
                 state.position,
                 landmarks.reshape(*batch, n, 2 * n),
-                others.reshape(*batch, n, 2 * (n - 1)),
+                offsets.reshape(*batch, n, 2 * (n - 1)),
                 silence,
             ],
             axis=-1,
@@ -156,7 +159,8 @@ class SimpleSpread:
 
     def _reward(self, x: Array, y: Array, landmark_x: Array, landmark_y: Array, touching: Array) -> Array:
         """(N, B) from coordinates (N, B) and contacts (N, N, B)."""
-        dx, dy = x[:, None] - landmark_x, y[:, None] - landmark_y  # (agents, landmarks, B)
+        dx = x[:, None] - landmark_x  # (agents, landmarks, B)
+        dy = y[:, None] - landmark_y
         nearest = jnp.sqrt((dx**2 + dy**2).min(0))  # (landmarks, B)
         hits = touching.sum(0).astype(nearest.dtype)
         if self.reward == "omar":
@@ -197,14 +201,15 @@ def _joined(x: Array, y: Array) -> Array:
 def _repulsion(x: Array, y: Array) -> tuple[Array, Array]:
     """Contact force on every agent, x and y, each (N, ...). All N^2 ordered pairs: half of them are redundant, but
     the whole fuses into one compact loop for any N."""
-    dx, dy = x[:, None] - x, y[:, None] - y  # [i, j] points from j to i
+    dx = x[:, None] - x  # [i, j] points from j to i
+    dy = y[:, None] - y
     squared = dx**2 + dy**2
-    apart = squared > 0  # an agent and itself, or two agents at the very same point, have no direction to push in
-    distance = jnp.sqrt(jnp.where(apart, squared, 1.0))
+    separate = squared > 0  # an agent and itself, or two agents at the very same point, have no direction to push in
+    distance = jnp.sqrt(jnp.where(separate, squared, 1.0))
     depth = (CONTACT_DISTANCE - distance) / CONTACT_MARGIN
     # softplus in the form that cannot overflow, without the NaN handling of logaddexp
     overlap = CONTACT_MARGIN * (jnp.maximum(depth, 0.0) + jnp.log1p(jnp.exp(-jnp.abs(depth))))
-    push = jnp.where(apart, CONTACT_FORCE * overlap / distance, 0.0)
+    push = jnp.where(separate, CONTACT_FORCE * overlap / distance, 0.0)
     return (push * dx).sum(1), (push * dy).sum(1)
 
 
@@ -216,7 +221,7 @@ def _touching(x: Array, y: Array) -> Array:
     return (distance < CONTACT_DISTANCE) & ~itself
 
 
-def _others(pairs: Array) -> Array:
+def _without_diagonal(pairs: Array) -> Array:
     """(..., N, N, F) -> (..., N, N-1, F): drop the diagonal, keeping the order of the others."""
     n = pairs.shape[-2]
     rows, columns = np.nonzero(~np.eye(n, dtype=bool))
@@ -225,40 +230,60 @@ def _others(pairs: Array) -> Array:
 
 def views(view: str, n_agents: int) -> FeatureMap:
     """The views of Simple Spread; state as in `SimpleSpread.global_state`, lengths in m, velocities in m/s."""
-    n = n_agents
-    if view == "decentralized":
-        names = ["own.vx", "own.vy", "own.x", "own.y"]
-        names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
-        names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]  # the communication channel is always 0
-        table = np.tile(np.arange(len(names)), (n, 1))
-        plain = FeatureMap(
-            view, tuple(names), "observations", table, np.full_like(table, -1), critic_weight=_worth(names)
-        )
-        return following(plain, derived(plain.names, n))
-    position = np.arange(2 * n).reshape(n, 2)
-    velocity, landmark = position + 2 * n, position + 4 * n
     if view == "centralized":
-        names = [f"agent{i}.{c}" for i in range(n) for c in "xy"] + [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
-        names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
-        table = np.tile(np.arange(6 * n), (n, 1))
-        return FeatureMap(view, tuple(names), "state", table, np.full_like(table, -1), critic_weight=_worth(names))
-    if view != "pruned":
-        raise unknown("view", view, VIEWS)
-    names, plus, minus = ["own.vx", "own.vy", "own.x", "own.y"], [], []
-    names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
-    names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]
-    names += [f"other{j}.dv{c}" for j in range(n - 1) for c in "xy"]  # makes the hazard's dynamics Markov
-    for i in range(n):
-        others = [j for j in range(n) if j != i]
-        p = [*velocity[i], *position[i], *landmark.ravel(), *position[others].ravel(), *velocity[others].ravel()]
-        m = [-1] * 4 + list(position[i]) * n + list(position[i]) * (n - 1) + list(velocity[i]) * (n - 1)
-        plus.append(p)
-        minus.append(m)
-    plain = FeatureMap(view, tuple(names), "state", np.array(plus), np.array(minus), critic_weight=_worth(names))
+        return _centralized(n_agents)
+    if view == "decentralized":
+        return _decentralized(n_agents)
+    if view == "pruned":
+        return _pruned(n_agents)
+    raise unknown("view", view, VIEWS)
+
+
+def _centralized(n: int) -> FeatureMap:
+    names = [f"agent{i}.{c}" for i in range(n) for c in "xy"]
+    names += [f"agent{i}.v{c}" for i in range(n) for c in "xy"]
+    names += [f"landmark{i}.{c}" for i in range(n) for c in "xy"]
+    table = np.tile(np.arange(6 * n), (n, 1))
+    weight = _critic_weight(names)
+    return FeatureMap("centralized", tuple(names), "state", table, np.full_like(table, -1), critic_weight=weight)
+
+
+def _decentralized(n: int) -> FeatureMap:
+    names = _relative_names(n)  # the communication channel is always 0
+    table = np.tile(np.arange(len(names)), (n, 1))
+    weight = _critic_weight(names)
+    plain = FeatureMap(
+        "decentralized", tuple(names), "observations", table, np.full_like(table, -1), critic_weight=weight
+    )
     return following(plain, derived(plain.names, n))
 
 
-def _worth(names: list[str]) -> tuple[float, ...]:
+def _pruned(n: int) -> FeatureMap:
+    names = _relative_names(n)
+    names += [f"other{j}.dv{c}" for j in range(n - 1) for c in "xy"]  # makes the hazard's dynamics Markov
+    position = np.arange(2 * n).reshape(n, 2)
+    velocity = position + 2 * n
+    landmark = position + 4 * n
+    plus, minus = [], []
+    for i, others_of in enumerate(others(n)):
+        theirs = [*position[others_of].ravel(), *velocity[others_of].ravel()]
+        plus.append([*velocity[i], *position[i], *landmark.ravel(), *theirs])
+        minus.append([-1] * 4 + [*position[i]] * (2 * n - 1) + [*velocity[i]] * (n - 1))
+    weight = _critic_weight(names)
+    plain = FeatureMap("pruned", tuple(names), "state", np.array(plus), np.array(minus), critic_weight=weight)
+    return following(plain, derived(plain.names, n))
+
+
+def _relative_names(n: int) -> list[str]:
+    """Oneself, and where landmarks and others are from there."""
+    names = ["own.vx", "own.vy", "own.x", "own.y"]
+    names += [f"landmark{j}.d{c}" for j in range(n) for c in "xy"]
+    names += [f"other{j}.d{c}" for j in range(n - 1) for c in "xy"]
+    return names
+
+
+def _critic_weight(names: list[str]) -> tuple[float, ...]:
     """A quarter for velocities. The reward is about positions, but a plan's velocities vary more than its positions
-    do, in deviations: a critic that hears both alike steers plans to speeds that their positions do not follow."""
-    return tuple(0.25 if name.split(".")[1].lstrip("d")[0] == "v" else 1.0 for name in names)
+    do, in deviations. A critic that weighs both the same steers plans to speeds that their positions do not follow."""
+    kinds = [name.split(".")[1].lstrip("d")[0] for name in names]
+    return tuple(0.25 if kind == "v" else 1.0 for kind in kinds)

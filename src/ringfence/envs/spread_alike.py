@@ -9,12 +9,13 @@ who come nearest, as far as `SIGHT`. Nobody knows where in the room it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.envs.base import Defaults
+from ringfence.envs.sight import approaches
 from ringfence.envs.simple_spread import DT, SimpleSpread, SpreadState, in_contact
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap, solitary
@@ -26,18 +27,21 @@ LANDMARKS, OTHERS = 3, 2  # that are seen
 
 
 @dataclass(frozen=True)
-class SpreadAlike:
+class SpreadAlike(Defaults):
     """The room, in pure JAX: Simple Spread's movement and reward, seen and paid by each agent for itself."""
 
     n_agents: int = 3
     episode_length: int = 25
-    action_dim: ClassVar[int] = 2
-    terminates: ClassVar[bool] = False
 
     def __post_init__(self):
         for field in ("n_agents", "episode_length"):
             if getattr(self, field) < 1:
                 raise UserError(f"SpreadAlike {field}={getattr(self, field)} must be at least 1.")
+
+    @property
+    def action_dim(self) -> int:
+        """A force's direction."""
+        return 2
 
     @property
     def whole(self) -> SimpleSpread:
@@ -80,17 +84,13 @@ class SpreadAlike:
 
     def observe(self, state: SpreadState) -> Array:
         """(B, N, O) as `observation_names` says. What is not seen stands at the end of sight, `seen` = 0."""
-        p, v, n = state.position, state.velocity, self.n_agents
-        landmarks = state.landmarks[..., None, :, :] - p[..., :, None, :]  # (B, N, N, 2)
-        offset = p[..., None, :, :] - p[..., :, None, :]
-        speed = v[..., None, :, :] - v[..., :, None, :]
-        when = jnp.clip(-(offset * speed).sum(-1) / ((speed**2).sum(-1) + 1e-9), 0.0, SOON)
-        nearest = ((offset + when[..., None] * speed) ** 2).sum(-1)
-        nearest = jnp.where((offset**2).sum(-1) < SIGHT**2, nearest, 1e6) + 1e9 * jnp.eye(n)
+        n = self.n_agents
+        landmarks = state.landmarks[..., None, :, :] - state.position[..., :, None, :]  # (B, N, N, 2)
+        offset, speed, approach = approaches(state.position, state.velocity, SIGHT, SOON)
         parts = [
-            v,
+            state.velocity,
             _seen(landmarks, landmarks, (landmarks**2).sum(-1), LANDMARKS, n),
-            _seen(offset, jnp.concatenate([offset, speed], -1), nearest, OTHERS, n - 1),
+            _seen(offset, jnp.concatenate([offset, speed], -1), approach, OTHERS, n - 1),
         ]
         return jnp.concatenate(parts, -1)
 
@@ -108,15 +108,15 @@ def touching(state: SpreadState) -> Array:
     return in_contact(state.position).any(-1).astype(jnp.float32)
 
 
-def _seen(offset: Array, told: Array, order: Array, many: int, there: int) -> Array:
-    """(..., N, many (F + 1)) of the things at `offset` (..., N, M, 2) what is `told` (..., N, M, F) of the first ones
-    by `order` (..., N, M), `there` of which are things, and whether they are in sight."""
-    unseen = jnp.zeros(told.shape[-1] + 1).at[0].set(SIGHT)
-    took = min(many, there)
-    _, which = jax.lax.top_k(-order, took)
-    told = jnp.concatenate([told, jnp.ones_like(told[..., :1])], -1)
-    told = jnp.where((offset**2).sum(-1, keepdims=True) < SIGHT**2, told, unseen)
-    told = jnp.take_along_axis(told, which[..., None], -2)
-    rest = jnp.broadcast_to(unseen, (*told.shape[:-2], many - took, unseen.shape[0]))
-    told = jnp.concatenate([told, rest], -2)
-    return told.reshape(*told.shape[:-2], -1)
+def _seen(offset: Array, features: Array, order: Array, shown: int, things: int) -> Array:
+    """(..., N, shown (F + 1)): the `features` (..., N, M, F) of the first of the things at `offset` (..., N, M, 2) by
+    `order` (..., N, M), and whether they are in sight. Only `things` of the M are things."""
+    unseen = jnp.zeros(features.shape[-1] + 1).at[0].set(SIGHT)
+    count = min(shown, things)
+    _, which = jax.lax.top_k(-order, count)
+    rows = jnp.concatenate([features, jnp.ones_like(features[..., :1])], -1)
+    rows = jnp.where((offset**2).sum(-1, keepdims=True) < SIGHT**2, rows, unseen)
+    rows = jnp.take_along_axis(rows, which[..., None], -2)
+    missing = jnp.broadcast_to(unseen, (*rows.shape[:-2], shown - count, unseen.shape[0]))
+    rows = jnp.concatenate([rows, missing], -2)
+    return rows.reshape(*rows.shape[:-2], -1)

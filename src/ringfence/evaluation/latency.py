@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
+from ringfence.envs.base import NativeEnv
 from ringfence.types import Array, Policy
 
 
 def _first(env) -> tuple[Array, Array]:
     """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
-    if hasattr(env, "simulate"):
+    if isinstance(env, NativeEnv):
         sim = env.simulate(1)
         sim.reset([0])
         return jnp.asarray(sim.observe(), jnp.float32), jnp.asarray(sim.state(), jnp.float32)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError
 from ringfence.proposals.base import act_with, heard
 from ringfence.types import Key, Policy
@@ -37,7 +38,7 @@ def rollout(
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     reset_root, act_root = jax.random.key(RESETS[split]), jax.random.fold_in(jax.random.key(RESETS[split] + 1), seed)
-    if hasattr(env, "simulate"):
+    if isinstance(env, NativeEnv):
         return _rollout_native(policy, env, episodes, RESETS[split], act_root, record, label, quiet)
 
     def play(policy, index, batch, keep):

@@ -22,6 +22,7 @@ from ringfence.errors import UserError, unknown
 from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
+Source = Literal["state", "observations"]
 VIEWS = ("pruned", "centralized", "decentralized")
 
 
@@ -31,7 +32,7 @@ class FeatureMap:
 
     view: str
     names: tuple[str, ...]  # D
-    source: Literal["state", "observations"]
+    source: Source
     plus: np.ndarray  # (N, D) int
     minus: np.ndarray  # (N, D) int
     own: tuple[int, ...] | None = None  # entries that only the agent itself can change; the rest follows from them

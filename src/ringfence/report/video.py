@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.datasets.task import Task
+from ringfence.envs.base import Filmed
 from ringfence.envs.film import DRAWN
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
@@ -55,7 +56,7 @@ def check(task: Task) -> None:
 
 def _filmed(task: Task) -> Any:
     """A task's simulator, which draws its episodes."""
-    if not hasattr(task.env, "frames"):
+    if not isinstance(task.env, Filmed):
         raise UserError(f"The simulator of '{task.name}' draws no films; `ringfence report` animates its episodes.")
     return task.env
 

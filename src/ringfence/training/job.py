@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ringfence import algos
-from ringfence.datasets.audit import APART, disagreement
+from ringfence.datasets.audit import DISAGREE, disagreement
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
 from ringfence.logs.store import EpisodeStore
@@ -132,7 +132,7 @@ def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: 
     if reads in ("labels", "world"):  # a World's barrier learns from the formula then
         return
     unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
-    if unsafe > (APART if isinstance(task.hazard, constraints.SpeedLimit) else 0.0):
+    if unsafe > (DISAGREE if isinstance(task.hazard, constraints.SpeedLimit) else 0.0):
         raise UserError(
             f"{algorithm} knows danger by costs alone, which in '{task.name}' are 0 everywhere, but the hazard calls "
             f"{100 * unsafe:.3g} % of its states unsafe; give costs to EpisodeStore, e.g. 1 where the hazard's labels "

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax
@@ -16,13 +15,11 @@ import jax.numpy as jnp
 from ringfence import __version__
 from ringfence.datasets.behaviour import gather, rollout
 from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.task import Card, Recipe, Task
 from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, TURN, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
-from ringfence.types import Array, Key, PolicyStep, PyTree
-
-if TYPE_CHECKING:
-    from ringfence.datasets.task import Task
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 
 BATCH = 500  # episodes that are played at once
 ROUNDS = 15  # of Hildreth's method on the programme of a step
@@ -49,18 +46,13 @@ STEADY = Driver(1.0, 0.9, 0.1, 2.0, 0.0)
 TIERS = ("careful", "hasty", "mixed", "random")
 
 
-def about(task: Task) -> dict:
+def about(task: Task) -> Card:
     """The simulator, for the card."""
-    env = task.env
+    env = _env(task)
     room = f"{env.body}, goals {env.goals}, {env.spacing:g} m apart"
     return {
         "simulator": f"ringfence {__version__} crossing, {room}, {env.neighbours} seen who come nearest in {SOON:g} s"
     }
-
-
-def whole(task: Task, transitions: int) -> int:
-    """Whole episodes, all of one length."""
-    return -(-transitions // task.env.episode_length) * task.env.episode_length
 
 
 class Driven(eqx.Module):
@@ -78,63 +70,97 @@ class Driven(eqx.Module):
         return memory, PolicyStep(drive(self.env, now, driver, key), {})
 
 
-def references(task: Task) -> dict[str, Driven]:
+def references(task: Task) -> dict[str, Policy]:
     """The tier's driver, and the certificates at their best: full speed, with the brakes that there are."""
-    known = {"behaviour policy": DRIVERS[task.tier]} if task.tier in DRIVERS else {}
-    return {name: Driven(task.env, driver) for name, driver in (known | {"certificates": STEADY}).items()}
+    env = _env(task)
+    policies: dict[str, Policy] = {}
+    if task.tier in DRIVERS:
+        policies["behaviour policy"] = Driven(env, DRIVERS[task.tier])
+    policies["certificates"] = Driven(env, STEADY)
+    return policies
 
 
-def relabelled(task: Task, store: EpisodeStore) -> None:
-    """There is one definition of danger."""
-
-
-def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
     """The data set of a tier."""
-    env, tier = task.env, task.tier
+    env = _env(task)
     if env.obstacles or env.walls:
         raise UserError(f"'{task.name}' has obstacles or walls that the drivers do not know; log it otherwise.")
-    episodes = transitions // env.episode_length
     key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
-    made = gather(lambda k: _played(env, tier, jax.random.fold_in(key, k * BATCH), BATCH), episodes, BATCH)
-    how = {
-        "random": "pushes that change ten times an episode",
-        "mixed": "a driver for each agent and episode, between careful and hasty",
-    }.get(tier, f"safety barrier certificates, {DRIVERS.get(tier)}")
-    names = list(env.observation_names)
-    card = card | {"transitions": transitions, "collected": how, "observation_names": names}
-    arrays = (made[x] for x in ("observations", "actions", "rewards", "costs"))
-    return EpisodeStore.from_episodes(*arrays, state=made["state"], card=card)
+
+    def chunk(number: int) -> dict[str, Array]:
+        return _played(env, task.tier, jax.random.fold_in(key, number * BATCH), BATCH)
+
+    episodes = gather(chunk, transitions // env.episode_length, BATCH)
+    return EpisodeStore.from_episodes(
+        episodes["observations"],
+        episodes["actions"],
+        episodes["rewards"],
+        episodes["costs"],
+        state=episodes["state"],
+        card=card
+        | {
+            "transitions": transitions,
+            "collected": _how(task.tier),
+            "observation_names": list(env.observation_names),
+        },
+    )
+
+
+def _how(tier: str) -> str:
+    """Who drove, for the card."""
+    if tier == "random":
+        return "pushes that change ten times an episode"
+    if tier == "mixed":
+        return "a driver for each agent and episode, between careful and hasty"
+    return f"safety barrier certificates, {DRIVERS.get(tier)}"
+
+
+def _env(task: Task) -> Crossing:
+    assert isinstance(task.env, Crossing), "only tasks of Crossing name this recipe"
+    return task.env
 
 
 @partial(jax.jit, static_argnums=(0, 1, 3))
 def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
-    kr, kd, ka = jax.random.split(key, 3)
-    some, other = (jnp.array(astuple(DRIVERS[x])) for x in ("careful", "hasty"))
-    share = jax.random.uniform(kd, (batch, env.n_agents, 1))
-    fixed = jnp.array(astuple(DRIVERS.get(tier, DRIVERS["hasty"])))
-    driver = some + share * (other - some) if tier == "mixed" else jnp.broadcast_to(fixed, (batch, env.n_agents, 5))
-    steps = env.episode_length
-    held = jax.random.uniform(kd, (steps // 10 + 1, batch, env.n_agents, 2), minval=-1.0, maxval=1.0)
+    """Arrays (B, L, ...) of a batch of a tier's episodes."""
+    key_reset, key_driver, key_action = jax.random.split(key, 3)
+    first = env.reset(key_reset, batch)
+    steps = jnp.arange(env.episode_length)
+    if tier == "random":
+        shape = (len(steps) // 10 + 1, batch, env.n_agents, 2)
+        held = jax.random.uniform(key_driver, shape, minval=-1.0, maxval=1.0)
+        return rollout(env, first, lambda state, step: held[step // 10], steps)
+    driver = _drivers(tier, key_driver, batch, env.n_agents)
 
-    def choose(state: CrossingState, t: Array) -> Array:
-        return held[t // 10] if tier == "random" else drive(env, state, driver, jax.random.fold_in(ka, t))
+    def choose(state: CrossingState, step: Array) -> Array:
+        return drive(env, state, driver, jax.random.fold_in(key_action, step))
 
-    return rollout(env, env.reset(kr, batch), choose, jnp.arange(steps))
+    return rollout(env, first, choose, steps)
+
+
+def _drivers(tier: str, key: Key, batch: int, agents: int) -> Array:
+    """(B, N, 5) a driver for each agent and episode."""
+    if tier != "mixed":
+        return jnp.broadcast_to(jnp.array(astuple(DRIVERS[tier])), (batch, agents, 5))
+    careful = jnp.array(astuple(DRIVERS["careful"]))
+    hasty = jnp.array(astuple(DRIVERS["hasty"]))
+    share = jax.random.uniform(key, (batch, agents, 1))
+    return careful + share * (hasty - careful)
 
 
 def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
     """Actions (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
     speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
-    kw, kn = jax.random.split(key)
+    key_push, key_hand = jax.random.split(key)
     ahead = state.goal - state.position
     far = length(ahead)
     wanted = ahead / far[..., None] * jnp.minimum(speed, jnp.sqrt(1.6 * far))[..., None]
     push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
-    push = push + STUBBORN * jax.random.normal(kw, push.shape)
+    push = push + STUBBORN * jax.random.normal(key_push, push.shape)
     push = certified(env, state, push, brake[..., None], room[..., None], haste[..., None])
     if env.body == "unicycle":
         push = steered(state, push)
-    return jnp.clip(push + unsteady[..., None] * jax.random.normal(kn, push.shape), -1.0, 1.0)
+    return jnp.clip(push + unsteady[..., None] * jax.random.normal(key_hand, push.shape), -1.0, 1.0)
 
 
 def steered(state: CrossingState, push: Array) -> Array:
@@ -176,3 +202,6 @@ def certified(env: Crossing, state: CrossingState, push: Array, brake: Array, ro
 
 def _bounded(push: Array) -> Array:
     return push / jnp.maximum(length(push), 1.0)[..., None]
+
+
+RECIPE = Recipe(about=about, collect=collect, references=references)

@@ -7,48 +7,41 @@ count.
 from __future__ import annotations
 
 from importlib import metadata
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ringfence import __version__
 from ringfence.datasets import robots as policies
 from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 
-if TYPE_CHECKING:
-    from ringfence.datasets.task import Task
 
-
-def about(task: Task) -> dict:
+def about(task: Task) -> Card:
     """The simulator, for the card."""
-    env = task.env
+    env = _env(task)
     if getattr(task.hazard, "limit", None) != env.limit:
         raise UserError(f"Task '{task.name}' has the danger {task.hazard}, its simulator counts above {env.limit} m/s.")
     return {"simulator": f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}"}
 
 
-def whole(task: Task, transitions: int) -> int:
-    """As asked for; how many steps whole episodes have is known when they are played."""
+def as_asked(task: Task, transitions: int) -> int:
+    """How many steps whole episodes have is known when they are played."""
     return transitions
 
 
-def references(task: Task) -> dict:
-    """None: every tier mixes several policies."""
-    return {}
-
-
-def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
     """The data set of a tier."""
-    env, tier = task.env, task.tier
-    chosen = policies.shipped_policies(env, tier)
+    env = _env(task)
+    chosen = policies.shipped_policies(env, task.tier)
     played = policies.collect(env, chosen, transitions, COLLECTION + seed)
     card = card | {
         "protocol": task.protocol,
         "size": transitions,  # asked for; episodes are whole
         "transitions": len(played["rewards"]),
-        "collected": f"{len(chosen)} MATD3 policies of the level {tier}, Gaussian action noise "
+        "collected": f"{len(chosen)} MATD3 policies of the level {task.tier}, Gaussian action noise "
         f"{chosen[0].noise:g}, as many steps of each",
         "policies": chosen[0].info["policies"],
         "episodes_of_policy": np.bincount(played["policy"], minlength=len(chosen)).tolist(),
@@ -70,9 +63,20 @@ def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore
     )
 
 
-def relabelled(task: Task, store: EpisodeStore) -> tuple[np.ndarray, dict] | None:
+def relabelled(task: Task, store: EpisodeStore) -> tuple[np.ndarray, Card] | None:
     """(costs (T,), entries of the card) of kept steps under this task's limit; None where no speeds were kept."""
     if store.speed is None:
         return None
-    told = {"protocol": task.protocol, **task.env.describe(store.speed, task.cost_limit)}
-    return (store.speed > task.env.limit).astype(np.float32), told
+    env = _env(task)
+    costs = (store.speed > env.limit).astype(np.float32)
+    return costs, {"protocol": task.protocol, **env.describe(store.speed, task.cost_limit)}
+
+
+def _env(task: Task) -> SafeMuJoCo:
+    assert isinstance(task.env, SafeMuJoCo), "only tasks of robots name this recipe"
+    return task.env
+
+
+RECIPE = Recipe(
+    about=about, collect=collect, whole=as_asked, relabelled=relabelled
+)  # every tier mixes several policies

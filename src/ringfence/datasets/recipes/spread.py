@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import equinox as eqx
 import jax
 import numpy as np
@@ -11,23 +9,20 @@ import numpy as np
 from ringfence import __version__
 from ringfence.datasets import behaviour as policies
 from ringfence.datasets.recipes import COLLECTION
+from ringfence.datasets.task import Card, Recipe, Task
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.logs.store import EpisodeStore
-from ringfence.types import Array, Key, PolicyStep, PyTree
-
-if TYPE_CHECKING:
-    from ringfence.datasets.task import Task
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 
 
-def about(task: Task) -> dict:
+def about(task: Task) -> Card:
     """The simulator, for the card."""
-    told = {"integrator": task.env.integrator, "reward": task.env.reward}
-    return {"simulator": f"ringfence {__version__} simple_spread", **told}
-
-
-def whole(task: Task, transitions: int) -> int:
-    """Whole episodes, all of one length."""
-    return -(-transitions // task.env.episode_length) * task.env.episode_length
+    env = _env(task)
+    return {
+        "simulator": f"ringfence {__version__} simple_spread",
+        "integrator": env.integrator,
+        "reward": env.reward,
+    }
 
 
 class Behaviour(eqx.Module):
@@ -42,21 +37,25 @@ class Behaviour(eqx.Module):
         return memory, PolicyStep(self.policy.act(observations, key), {})
 
 
-def references(task: Task) -> dict[str, Behaviour]:
+def references(task: Task) -> dict[str, Policy]:
     """The policy of `medium` and `expert`."""
-    return {"behaviour policy": Behaviour(policies.shipped_policy(task.tier))} if task.tier in policies.TARGETS else {}
+    if task.tier not in policies.TARGETS:
+        return {}
+    return {"behaviour policy": Behaviour(policies.shipped_policy(task.tier))}
 
 
-def relabelled(task: Task, store: EpisodeStore) -> None:
-    """There is one definition of danger."""
-
-
-def collect(task: Task, transitions: int, seed: int, card: dict) -> EpisodeStore:
+def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
     """The data set of a tier."""
-    made, how = played(task.env, task.tier, transitions // task.env.episode_length, seed)
-    arrays = (made[k] for k in ("observations", "actions", "rewards", "costs"))
-    card = card | {"transitions": transitions, "collected": how}
-    return EpisodeStore.from_episodes(*arrays, state=made["state"], card=card)
+    env = _env(task)
+    episodes, how = played(env, task.tier, transitions // env.episode_length, seed)
+    return EpisodeStore.from_episodes(
+        episodes["observations"],
+        episodes["actions"],
+        episodes["rewards"],
+        episodes["costs"],
+        state=episodes["state"],
+        card=card | {"transitions": transitions, "collected": how},
+    )
 
 
 def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
@@ -64,6 +63,17 @@ def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
     if tier == "medium-replay":
         how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
         return policies.replay_episodes(env, episodes, seed), how
-    policy = policies.shipped_policy(tier) if tier in policies.TARGETS else "random"
-    how = "uniform actions" if policy == "random" else f"MATD3 policy, Gaussian action noise {policy.noise:g}"
-    return policies.collect(env, policy, episodes, jax.random.fold_in(jax.random.key(COLLECTION), seed)), how
+    key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
+    if tier in policies.TARGETS:
+        policy = policies.shipped_policy(tier)
+        how = f"MATD3 policy, Gaussian action noise {policy.noise:g}"
+        return policies.collect(env, policy, episodes, key), how
+    return policies.collect(env, "random", episodes, key), "uniform actions"
+
+
+def _env(task: Task) -> SimpleSpread:
+    assert isinstance(task.env, SimpleSpread), "only tasks of Simple Spread name this recipe"
+    return task.env
+
+
+RECIPE = Recipe(about=about, collect=collect, references=references)

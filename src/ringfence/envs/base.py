@@ -1,0 +1,159 @@
+"""What a simulator is: pure JAX (`Env`), or one that steps outside JAX (`NativeEnv`).
+
+Tasks, data sets, evaluation and films ask nothing else of a simulator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+
+from ringfence.problem.features import FeatureMap
+from ringfence.types import Array, Key, PyTree, Transition
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+class Simulator(Protocol):
+    """What every simulator says of itself. It is a frozen dataclass: it can be compared, hashed, written down, and
+    copied with another number of agents."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def n_agents(self) -> int: ...
+
+    @property
+    def action_dim(self) -> int: ...
+
+    @property
+    def observation_dim(self) -> int: ...
+
+    @property
+    def episode_length(self) -> int:
+        """The time limit, in steps."""
+        ...
+
+    @property
+    def terminates(self) -> bool:
+        """Whether the task itself may end an episode before the time limit."""
+        ...
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """S entries of the global state."""
+        ...
+
+    @property
+    def world(self) -> Mapping[str, Any]:
+        """Settings that its World needs, where they differ from the defaults."""
+        ...
+
+    @property
+    def guard(self) -> Mapping[str, Mapping[str, Any]]:
+        """Options of named guards, where they differ from the defaults."""
+        ...
+
+    def feature_map(self, view: str) -> FeatureMap:
+        """s̃_i in a view (problem/features.py)."""
+        ...
+
+
+class Defaults:
+    """What most simulators say of themselves."""
+
+    @property
+    def terminates(self) -> bool:
+        """Nothing but the time limit ends an episode."""
+        return False
+
+    @property
+    def world(self) -> Mapping[str, Any]:
+        """Its World needs no settings of its own."""
+        return {}
+
+    @property
+    def guard(self) -> Mapping[str, Mapping[str, Any]]:
+        """Named guards are as everywhere."""
+        return {}
+
+
+class Env(Simulator, Protocol):
+    """A batched simulator. States are pytrees with a leading B axis; all methods are pure and may be jitted."""
+
+    def reset(self, key: Key, batch: int) -> PyTree: ...
+
+    def step(self, state: PyTree, action: Array) -> tuple[PyTree, Transition]:
+        """Advance by one step; `action` is (B, N, A) in the bounds of the task and is clipped to them."""
+        ...
+
+    def observe(self, state: PyTree) -> Array:
+        """(B, N, O) local observations."""
+        ...
+
+    def global_state(self, state: PyTree) -> Array:
+        """(B, S) what a centralised planner may see."""
+        ...
+
+    def from_global_state(self, flat: Array) -> PyTree:
+        """Inverse of `global_state`."""
+        ...
+
+
+class Outcome(NamedTuple):
+    """What a step gives, for a batch of native simulations; what is not running has zeros."""
+
+    reward: np.ndarray  # (B,) shared
+    cost: np.ndarray  # (B,) shared
+    terminated: np.ndarray  # (B,) bool: the task itself ended
+    speed: np.ndarray  # (B,) m/s, what the cost is counted by
+
+
+class Simulation(Protocol):
+    """A batch of native simulations under way. Not pure: `reset` and `step` change it."""
+
+    batch: int
+    running: np.ndarray  # (B,) bool
+
+    def reset(self, seeds: Sequence[int | Sequence[int]], ids: Sequence[int] | np.ndarray | None = None) -> None: ...
+
+    def step(self, action: np.ndarray) -> Outcome: ...
+
+    def state(self) -> np.ndarray:
+        """(B, S) float64 global states."""
+        ...
+
+    def observe(self, state: np.ndarray | None = None) -> np.ndarray:
+        """(B, N, O) local observations, of the present or of given global states."""
+        ...
+
+
+@runtime_checkable
+class NativeEnv(Simulator, Protocol):
+    """A simulator that steps outside JAX."""
+
+    def simulate(self, batch: int, threads: int | None = None) -> Simulation:
+        """`batch` episodes side by side."""
+        ...
+
+
+@runtime_checkable
+class Filmed(Protocol):
+    """A simulator that draws its episodes."""
+
+    @property
+    def film_shows(self) -> str:
+        """What a film's colours and lines mean, in a sentence."""
+        ...
+
+    @property
+    def opengl(self) -> bool:
+        """Whether drawing needs OpenGL."""
+        ...
+
+    def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
+        """Pictures of an episode, states (T+1, S), at `moments`: (step, whether there was a cost since the last)."""
+        ...
