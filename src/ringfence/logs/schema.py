@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -13,43 +14,77 @@ from ringfence.utils import schemas
 
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed", "constraints")
+LISTS_OF_NAMES = ("observation_names", "state_names")
+DEFAULTS: dict[str, Any] = {
+    "task": "custom",
+    "simulator": None,
+    "provenance": "user data",
+    "action_low": -1.0,
+    "action_high": 1.0,
+    "observation_names": None,
+    "state_names": None,
+    "hazard": {"kind": "CostColumn"},
+}
 
 
 class Arrays(Protocol):
     """What a store shows to its rules; the axes are those of `store.py`."""
 
-    observations: np.ndarray
-    actions: np.ndarray
-    rewards: np.ndarray
-    costs: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    episode_ends: np.ndarray
-    state: np.ndarray | None
-    speed: np.ndarray | None
-    constraints: np.ndarray | None
-    card: dict[str, Any]
-
+    @property
+    def observations(self) -> np.ndarray: ...
+    @property
+    def actions(self) -> np.ndarray: ...
+    @property
+    def rewards(self) -> np.ndarray: ...
+    @property
+    def costs(self) -> np.ndarray: ...
+    @property
+    def terminated(self) -> np.ndarray: ...
+    @property
+    def truncated(self) -> np.ndarray: ...
+    @property
+    def episode_ends(self) -> np.ndarray: ...
+    @property
+    def state(self) -> np.ndarray | None: ...
+    @property
+    def speed(self) -> np.ndarray | None: ...
+    @property
+    def constraints(self) -> np.ndarray | None: ...
+    @property
+    def card(self) -> dict[str, Any]: ...
     @property
     def limits(self) -> dict[str, float]: ...
 
 
 def complete_card(card: dict) -> dict:
     """A card with every field present; unknown fields are kept, for provenance of any kind."""
-    base = {
-        "task": "custom",
-        "simulator": None,
-        "provenance": "user data",
-        "action_low": -1.0,
-        "action_high": 1.0,
-        "observation_names": None,
-        "state_names": None,
-        "hazard": {"kind": "CostColumn"},
-    }
     if not isinstance(card, dict):
         raise StoreError(f"The card is a {type(card).__name__}; it must be a dictionary of fields.")
-    card = {**base, **card}
-    _check_name(card["task"])
+    card = {**DEFAULTS, **card}
+    for rule in CARD_RULES:
+        rule(card)
+    try:
+        return json.loads(json.dumps(card, default=lambda x: x.tolist()))  # NumPy's arrays and numbers become plain
+    except (AttributeError, TypeError, ValueError) as error:
+        raise StoreError(f"The card cannot be kept as JSON ({error}); use words, numbers, lists and dicts.") from None
+
+
+def validate(store: Arrays) -> None:
+    """Raise `StoreError` naming the array, the rule it breaks and the remedy."""
+    for rule in STORE_RULES:
+        rule(store)
+
+
+# --- rules of a card, which they also bring into its stored form ---
+def _task_is_a_name(card: dict) -> None:
+    if not _is_name(card["task"]):
+        raise StoreError(
+            f"The card has task={repr(card['task'])[:200]}; it must be a name without slashes, line breaks or a "
+            "leading dot or dash, of at most 120 letters, since folders of runs are called so."
+        )
+
+
+def _action_bounds(card: dict) -> None:
     for name in ("action_low", "action_high"):
         if not _is_number(card[name]):
             raise StoreError(f"The card has {name}={card[name]!r}; it must be one number, the bound of every entry.")
@@ -59,36 +94,58 @@ def complete_card(card: dict) -> dict:
             f"The card has action_low={card['action_low']:g} and action_high={card['action_high']:g}; the first must "
             "be the smaller one."
         )
+
+
+def _cost_limit(card: dict) -> None:
     if "cost_limit" in card and not (_is_number(card["cost_limit"]) and card["cost_limit"] >= 0):
         raise StoreError(f"The card has cost_limit={card['cost_limit']!r}; it must be one number, 0 or more.")
+
+
+def _constraint_limits(card: dict) -> None:
     limits = card.get("constraints")
-    if limits is not None:
-        try:
-            limits = card["constraints"] = {k: _plain(v) for k, v in limits.items()}
-            schemas.check(limits, schemas.Limits)
-        except (AttributeError, ValueError):
-            raise StoreError(
-                f"The card has constraints={repr(limits)[:200]}; it must give each constraint's name a limit, the cost "
-                "of an episode that is not to be passed, 0 or more."
-            ) from None
-        card["cost_limit"] = card.get("cost_limit", float(sum(limits.values())))
-    for name in ("observation_names", "state_names", "warnings"):
+    if limits is None:
+        return
+    try:
+        limits = {name: _plain(limit) for name, limit in limits.items()}
+        schemas.check(limits, schemas.Limits)
+    except (AttributeError, ValueError):
+        raise StoreError(
+            f"The card has constraints={repr(limits)[:200]}; it must give each constraint's name a limit, the cost "
+            "of an episode that is not to be passed, 0 or more."
+        ) from None
+    card["constraints"] = limits
+    card.setdefault("cost_limit", float(sum(limits.values())))
+
+
+def _lists_of_words(card: dict) -> None:
+    for name in (*LISTS_OF_NAMES, "warnings"):
         words = card.get(name)
         words = words.tolist() if isinstance(words, np.ndarray) else words
         if words is not None and not (isinstance(words, list | tuple) and all(isinstance(w, str) for w in words)):
             raise StoreError(f"The card has {name}={words!r}; it must be a list of words, or be left out.")
         if name in card:
             card[name] = words if words is None else list(words)
-        told = card[name] if name != "warnings" and card.get(name) else ()
-        twice = [w for k, w in enumerate(told) if w in told[:k] or not w.isprintable()]
-        if twice:
-            raise StoreError(
-                f"The card has {name} with {twice[0]!r} twice or unprintable; give every entry its own name."
-            )
+        if words and name in LISTS_OF_NAMES:
+            _names_differ(name, list(words))
+
+
+def _names_differ(field: str, names: list[str]) -> None:
+    wrong = [name for k, name in enumerate(names) if name in names[:k] or not name.isprintable()]
+    if wrong:
+        raise StoreError(f"The card has {field} with {wrong[0]!r} twice or unprintable; give every entry its own name.")
+
+
+def _seconds_of_a_step(card: dict) -> None:
     if "dt" in card and not (_is_number(card["dt"]) and card["dt"] > 0):
         raise StoreError(f"The card has dt={card['dt']!r}; it must be the seconds of a step, a number above 0.")
+
+
+def _homogeneous(card: dict) -> None:
     if not isinstance(card.get("alike", False), bool):
         raise StoreError(f"The card has alike={card['alike']!r}; it must be true or false.")
+
+
+def _hazard(card: dict) -> None:
     if isinstance(card["hazard"], constraints.Hazard):
         card["hazard"] = constraints.to_dict(card["hazard"])
     elif not isinstance(card["hazard"], dict):
@@ -97,18 +154,27 @@ def complete_card(card: dict) -> dict:
             "dangers go into the costs, with CostColumn)."
         )
     try:
-        told = constraints.from_dict(card["hazard"])
-        sound = all(_is_sound(h) for h in getattr(told, "hazards", (told,)))
+        hazard = constraints.from_dict(card["hazard"])
+        parts = hazard.hazards if isinstance(hazard, constraints.All) else (hazard,)
+        sound = all(_is_sound(part) for part in parts)
     except UserError:
         raise
     except (TypeError, ValueError):  # a field of a kind that no hazard has
         sound = False
     if not sound:
         raise StoreError(f"The card has hazard={card['hazard']!r}, which is none; see docs/data.md.")
-    try:
-        return json.loads(json.dumps(card, default=lambda x: x.tolist()))  # NumPy's arrays and numbers become plain
-    except (AttributeError, TypeError, ValueError) as error:
-        raise StoreError(f"The card cannot be kept as JSON ({error}); use words, numbers, lists and dicts.") from None
+
+
+CARD_RULES: tuple[Callable[[dict], None], ...] = (
+    _task_is_a_name,
+    _action_bounds,
+    _cost_limit,
+    _constraint_limits,
+    _lists_of_words,
+    _seconds_of_a_step,
+    _homogeneous,
+    _hazard,
+)
 
 
 def _is_number(x) -> bool:
@@ -122,11 +188,15 @@ def _plain(x):
 
 def _is_sound(hazard: constraints.Hazard) -> bool:
     """Whether a hazard has the sizes that define it, and names its features with words."""
-    features = getattr(hazard, "features", ())
-    sizes = ("radius", "safe_margin") if isinstance(hazard, constraints.Separation) else ("limit",)
-    sized = all(getattr(hazard, name, 0.0) is not None for name in sizes)
-    named = isinstance(features, tuple) and all(isinstance(name, str) for name in features)
-    return sized and named and (bool(features) or not isinstance(hazard, constraints.SpeedLimit))
+    match hazard:
+        case constraints.Separation():
+            return hazard.radius is not None and hazard.safe_margin is not None
+        case constraints.SpeedLimit():
+            features = hazard.features
+            named = isinstance(features, tuple) and all(isinstance(name, str) for name in features)
+            return hazard.limit is not None and named and bool(features)
+        case _:
+            return True
 
 
 def _is_name(word) -> bool:
@@ -138,124 +208,194 @@ def _is_name(word) -> bool:
     return bool(word.strip())
 
 
-def _check_name(task) -> None:
-    if not _is_name(task):
-        raise StoreError(
-            f"The card has task={repr(task)[:200]}; it must be a name without slashes, line breaks or a leading dot or "
-            "dash, of at most 120 letters, since folders of runs are called so."
-        )
+# --- rules of a store's arrays, in the order in which they can be asked ---
+def _demand(ok: bool, message: str) -> None:
+    if not ok:
+        raise StoreError(message)
 
 
-def validate(store: Arrays) -> None:
-    """Raise `StoreError` naming the array, the rule it breaks and the remedy."""
-    s = store
+def _kinds(store: Arrays) -> None:
+    """Arrays of NumPy's, of whole numbers, truth values or real numbers."""
+    expected = {
+        "episode_ends": ("iu", "whole numbers"),
+        "terminated": ("b", "true or false"),
+        "truncated": ("b", "true or false"),
+    }
+    for name, array in _arrays(store):
+        _demand(isinstance(array, np.ndarray), f"{name} is a {type(array).__name__}; give a NumPy array.")
+        kinds, what = expected.get(name, ("biuf", "real numbers"))
+        _demand(array.dtype.kind in kinds, f"{name} holds entries of type {array.dtype}; it must hold {what}.")
 
-    def demand(ok: bool, message: str) -> None:
-        if not ok:
-            raise StoreError(message)
 
-    for name in (*ARRAYS, *OPTIONAL):
-        array = getattr(s, name)
-        if array is None and name in OPTIONAL:
-            continue
-        demand(isinstance(array, np.ndarray), f"{name} is a {type(array).__name__}; give a NumPy array.")
-        kinds, what = {"episode_ends": ("iu", "whole numbers")}.get(name, ("biuf", "real numbers"))
-        if name in ("terminated", "truncated"):
-            kinds, what = "b", "true or false"
-        demand(array.dtype.kind in kinds, f"{name} holds entries of type {array.dtype}; it must hold {what}.")
-    demand(s.actions.ndim == 3, f"actions has shape {s.actions.shape}, expected (T, N, A); add the missing axis.")
-    t, n = s.actions.shape[:2]
-    demand(
-        n > 0 and s.actions.shape[2] > 0,
-        f"actions has shape {s.actions.shape}; a store needs at least one agent and one action entry.",
+def _arrays(store: Arrays) -> list[tuple[str, np.ndarray]]:
+    """Those that are there, by name."""
+    optional = [(name, getattr(store, name)) for name in OPTIONAL]
+    return [(name, getattr(store, name)) for name in ARRAYS] + [(k, x) for k, x in optional if x is not None]
+
+
+def _actions(store: Arrays) -> None:
+    shape = store.actions.shape
+    _demand(len(shape) == 3, f"actions has shape {shape}, expected (T, N, A); add the missing axis.")
+    _demand(
+        shape[1] > 0 and shape[2] > 0,
+        f"actions has shape {shape}; a store needs at least one agent and one action entry.",
     )
-    ends = s.episode_ends
-    demand(ends.ndim == 1 and len(ends) > 0, "episode_ends is empty; a store needs at least one whole episode.")
-    demand(bool((np.diff(ends, prepend=0) > 0).all()), "episode_ends must increase; give cumulative step counts.")
-    demand(ends[-1] == t, f"episode_ends ends at {ends[-1]}, actions has {t} steps; drop an unfinished episode.")
-    e = len(ends)
+
+
+def _episode_ends(store: Arrays) -> None:
+    ends = store.episode_ends
+    steps = len(store.actions)
+    _demand(ends.ndim == 1 and len(ends) > 0, "episode_ends is empty; a store needs at least one whole episode.")
+    _demand(bool((np.diff(ends, prepend=0) > 0).all()), "episode_ends must increase; give cumulative step counts.")
+    _demand(
+        ends[-1] == steps, f"episode_ends ends at {ends[-1]}, actions has {steps} steps; drop an unfinished episode."
+    )
+
+
+def _shapes(store: Arrays) -> None:
+    steps, n_agents = store.actions.shape[:2]
+    episodes = len(store.episode_ends)
     shapes = {
-        "observations": (t + e, n),
-        "rewards": (t, n),
-        "costs": (t, n) if np.ndim(s.costs) == 2 else (t,),
-        "terminated": (t,),
-        "truncated": (t,),
+        "observations": (steps + episodes, n_agents),
+        "rewards": (steps, n_agents),
+        "costs": (steps, n_agents) if np.ndim(store.costs) == 2 else (steps,),
+        "terminated": (steps,),
+        "truncated": (steps,),
     }
     for name, expected in shapes.items():
-        got = getattr(s, name).shape
-        demand(
-            got[: len(expected)] == expected and len(got) == len(expected) + (name == "observations"),
-            f"{name} has shape {got}, expected {(*expected, 'O') if name == 'observations' else expected} for "
-            f"{t} steps, {e} episodes and {n} agents; every episode keeps one more observation than steps.",
+        shape = getattr(store, name).shape
+        own_axes = int(name == "observations")  # the entries, of any number
+        _demand(
+            shape[: len(expected)] == expected and len(shape) == len(expected) + own_axes,
+            f"{name} has shape {shape}, expected {(*expected, 'O') if own_axes else expected} for "
+            f"{steps} steps, {episodes} episodes and {n_agents} agents; every episode keeps one more observation than "
+            "steps.",
         )
-    demand(s.observations.shape[2] > 0, "observations has no entries; an agent must see at least one number.")
-    if s.state is not None:
-        demand(
-            s.state.ndim == 2 and len(s.state) == t + e,
-            f"state has shape {s.state.shape}, expected ({t + e}, S); keep the state each episode ended in.",
+    _demand(store.observations.shape[2] > 0, "observations has no entries; an agent must see at least one number.")
+    if store.state is not None:
+        _demand(
+            store.state.ndim == 2 and len(store.state) == steps + episodes,
+            f"state has shape {store.state.shape}, expected ({steps + episodes}, S); keep the state each episode "
+            "ended in.",
         )
-    known = np.isfinite(s.costs).mean()
-    demand(
+
+
+def _costs_are_known(store: Arrays) -> None:
+    known = np.isfinite(store.costs).mean()
+    _demand(
         known > 0.5 or known == 1,
         f"costs is known for {100 * known:.2g} % of the steps; say 0 or 1 of every step that is kept, and drop "
         "episodes of which nobody knows.",
     )
-    if s.speed is not None:
-        demand(s.speed.shape == (t,), f"speed has shape {s.speed.shape}, expected ({t},); give one of every step.")
-    for name in ("observations", "actions", "rewards", "costs", *OPTIONAL):
-        array = getattr(s, name)
-        if array is not None and not np.isfinite(array).all():
-            where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-            raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
-    demand(bool((s.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
-    if s.constraints is not None or s.limits:
-        shape, wanted = np.shape(s.constraints), (*s.costs.shape, len(s.limits))
-        demand(
-            shape == wanted,
-            f"constraints has shape {shape}, its card names {len(s.limits)} ({', '.join(s.limits) or 'none'}) for "
-            f"costs of {s.costs.shape}; give costs={{name: array, ...}}, and a limit for each in the card.",
+
+
+def _speed(store: Arrays) -> None:
+    if store.speed is None:
+        return
+    steps = len(store.actions)
+    _demand(
+        store.speed.shape == (steps,),
+        f"speed has shape {store.speed.shape}, expected ({steps},); give one of every step.",
+    )
+
+
+def _finite(store: Arrays) -> None:
+    for name, array in _arrays(store):
+        if name in ("terminated", "truncated", "episode_ends") or np.isfinite(array).all():
+            continue
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
+
+
+def _costs(store: Arrays) -> None:
+    _demand(bool((store.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
+
+
+def _constraints(store: Arrays) -> None:
+    """Named in the card, and the costs are the largest of them."""
+    limits = store.limits
+    if store.constraints is None and not limits:
+        return
+    shape = () if store.constraints is None else store.constraints.shape
+    if store.constraints is None or shape != (*store.costs.shape, len(limits)):
+        raise StoreError(
+            f"constraints has shape {shape}, its card names {len(limits)} ({', '.join(limits) or 'none'}) for "
+            f"costs of {store.costs.shape}; give costs={{name: array, ...}}, and a limit for each in the card."
         )
-        demand(
-            bool((s.constraints >= 0).all()),
-            "constraints holds negative entries; a cost is 0 or positive, check its sign.",
-        )
-        demand(
-            bool(np.array_equal(s.constraints.max(-1), s.costs)),
-            "costs is not the largest of the constraints at every step; give costs={name: array, ...} alone.",
-        )
-    low, high = s.card["action_low"], s.card["action_high"]
+    _demand(
+        bool((store.constraints >= 0).all()),
+        "constraints holds negative entries; a cost is 0 or positive, check its sign.",
+    )
+    _demand(
+        bool(np.array_equal(store.constraints.max(-1), store.costs)),
+        "costs is not the largest of the constraints at every step; give costs={name: array, ...} alone.",
+    )
+
+
+def _actions_within_bounds(store: Arrays) -> None:
+    low = store.card["action_low"]
+    high = store.card["action_high"]
     slack = 1e-4 * (high - low)
-    outside = (s.actions < low - slack) | (s.actions > high + slack)
+    outside = (store.actions < low - slack) | (store.actions > high + slack)
     if outside.any():
         where = tuple(int(i) for i in np.argwhere(outside)[0])
         raise StoreError(
-            f"actions{list(where)} is {s.actions[where]:.4g}, outside [{low:g}, {high:g}]; rescale the actions or set "
-            "action_low and action_high in the card."
+            f"actions{list(where)} is {store.actions[where]:.4g}, outside [{low:g}, {high:g}]; rescale the actions or "
+            "set action_low and action_high in the card."
         )
-    both = s.terminated & s.truncated
-    demand(not both.any(), "terminated and truncated are both set somewhere; a step ends in one way, keep terminated.")
-    last = np.zeros(t, bool)
-    last[ends - 1] = True
-    over = s.terminated | s.truncated
+
+
+def _episodes_end_in_one_way(store: Arrays) -> None:
+    both = store.terminated & store.truncated
+    _demand(not both.any(), "terminated and truncated are both set somewhere; a step ends in one way, keep terminated.")
+    last = np.zeros(len(store.actions), bool)
+    last[store.episode_ends - 1] = True
+    over = store.terminated | store.truncated
     if (last & ~over).any():
-        bad = int(np.flatnonzero(~over[ends - 1])[0])
+        unfinished = int(np.flatnonzero(~over[store.episode_ends - 1])[0])
         raise StoreError(
-            f"Episode {bad} is unfinished: its last step is neither terminated nor truncated; set one or drop it."
+            f"Episode {unfinished} is unfinished: its last step is neither terminated nor truncated; set one or drop "
+            "it."
         )
-    demand(not (over & ~last).any(), "A step inside an episode is flagged as its end; split the episode there.")
-    sizes, most = s.card.get("action_sizes"), s.actions.shape[2]
-    if sizes is not None:
-        told = isinstance(sizes, list | tuple) and len(sizes) == n
-        demand(
-            told and all(type(k) is int and 1 <= k <= most for k in sizes),
-            f"The card has action_sizes={sizes!r}; it must say for each of the {n} agents how many entries its action "
-            f"has, 1 to {most}.",
-        )
-    for key, size in (("observation_names", s.observations.shape[2]), ("state_names", s.state is not None)):
-        names = s.card.get(key)
-        if names and key == "observation_names":
-            demand(len(names) == size, f"The card names {len(names)} observation entries, the data has {size}.")
-        if names and key == "state_names" and s.state is not None:
-            demand(
-                len(names) == s.state.shape[1], f"The card names {len(names)} state entries, not {s.state.shape[1]}."
-            )
+    _demand(not (over & ~last).any(), "A step inside an episode is flagged as its end; split the episode there.")
+
+
+def _action_sizes(store: Arrays) -> None:
+    sizes = store.card.get("action_sizes")
+    if sizes is None:
+        return
+    n_agents, widest = store.actions.shape[1:]
+    counted = isinstance(sizes, list | tuple) and len(sizes) == n_agents
+    _demand(
+        counted and all(type(size) is int and 1 <= size <= widest for size in sizes),
+        f"The card has action_sizes={sizes!r}; it must say for each of the {n_agents} agents how many entries its "
+        f"action has, 1 to {widest}.",
+    )
+
+
+def _names_of_entries(store: Arrays) -> None:
+    names = store.card.get("observation_names")
+    size = store.observations.shape[2]
+    if names:
+        _demand(len(names) == size, f"The card names {len(names)} observation entries, the data has {size}.")
+    names = store.card.get("state_names")
+    if names and store.state is not None:
+        size = store.state.shape[1]
+        _demand(len(names) == size, f"The card names {len(names)} state entries, not {size}.")
+
+
+STORE_RULES: tuple[Callable[[Arrays], None], ...] = (
+    _kinds,
+    _actions,
+    _episode_ends,
+    _shapes,
+    _costs_are_known,
+    _speed,
+    _finite,
+    _costs,
+    _constraints,
+    _actions_within_bounds,
+    _episodes_end_in_one_way,
+    _action_sizes,
+    _names_of_entries,
+)
