@@ -6,8 +6,8 @@ Time runs along the first axis, episodes one after another. T is the number of s
     state        (T+E, S)      global state, when known
     actions      (T, N, A)     rewards (T, N)     costs (T,) of the team, or (T, N) of each agent
     constraints  (T, C)        or (T, N, C): the cost of each of several constraints, whose names and limits per episode
-                               the card's `constraints` tells; `costs` is then the largest of them
-    speed        (T,)          m/s, of robots whose simulator told it: what another speed limit would count
+                               the card's `constraints` holds; `costs` is then the largest of them
+    speed        (T,)          m/s, of robots whose simulator reports it: what another speed limit would count
     terminated   (T,) bool     truncated (T,) bool; never merged, and the last step of every episode has one of them
     episode_ends (E,)          cumulative number of steps
 
@@ -119,6 +119,8 @@ class EpisodeStore:
 
     def of_constraint(self, name: str) -> np.ndarray:
         """(T,) or (T, N) cost of one constraint."""
+        if self.constraints is None or name not in self.limits:
+            raise unknown("constraint", name, self.limits)
         return self.constraints[..., list(self.limits).index(name)]
 
     def episode_costs_of(self, name: str) -> np.ndarray:
@@ -170,20 +172,37 @@ class EpisodeStore:
             raise StoreError("One of the stores holds a global state and the other none; leave it out of both.")
         if list(self.limits) != list(other.limits):
             raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
-        costs, several = ([getattr(s, name) for s in (self, other)] for name in ("costs", "constraints"))
-        if costs[0].ndim != costs[1].ndim:  # the team's are everybody's
-            costs = [c if c.ndim == 2 else np.repeat(c[:, None], self.n_agents, 1) for c in costs]
-            several = [c if c is None or c.ndim == 3 else np.repeat(c[:, None], self.n_agents, 1) for c in several]
-        told = {name: [getattr(s, name) for s in (self, other)] for name in (*ARRAYS, *OPTIONAL)}
-        told |= {
-            "costs": costs,
-            "constraints": several,
-            "episode_ends": [self.episode_ends, other.episode_ends + self.steps],
-        }
-        if len({x.shape[1:] for x in told["observations"]}) > 1 or len({x.shape[1:] for x in told["actions"]}) > 1:
+        if self._shape_of_agents() != other._shape_of_agents():
             raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
-        kept = {name: None if any(x is None for x in both) else np.concatenate(both) for name, both in told.items()}
-        return EpisodeStore(**kept, card=self.card)
+        each = self.costs.ndim != other.costs.ndim  # the team's are everybody's, then
+
+        def joined(name: str) -> np.ndarray:
+            parts = [getattr(store, name) for store in (self, other)]
+            if each and name == "costs":
+                parts = [x if x.ndim == 2 else np.repeat(x[:, None], self.n_agents, 1) for x in parts]
+            if each and name == "constraints":
+                parts = [x if x.ndim == 3 else np.repeat(x[:, None], self.n_agents, 1) for x in parts]
+            return np.concatenate(parts)
+
+        def joined_or_none(name: str) -> np.ndarray | None:
+            return None if getattr(self, name) is None or getattr(other, name) is None else joined(name)
+
+        return EpisodeStore(
+            joined("observations"),
+            joined("actions"),
+            joined("rewards"),
+            joined("costs"),
+            joined("terminated"),
+            joined("truncated"),
+            np.concatenate([self.episode_ends, other.episode_ends + self.steps]),
+            joined_or_none("state"),
+            self.card,
+            joined_or_none("speed"),
+            joined_or_none("constraints"),
+        )
+
+    def _shape_of_agents(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        return self.observations.shape[1:], self.actions.shape[1:]
 
     def apart(self) -> EpisodeStore:
         """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
@@ -194,8 +213,6 @@ class EpisodeStore:
                 f"The agents of '{self.card['task']}' are alike and learn from what each of them meets, but its costs "
                 "are the team's; give costs (T, N)."
             )
-
-        c = len(self.limits)
 
         def own(x: np.ndarray) -> np.ndarray:
             return np.ascontiguousarray(np.moveaxis(x, 1, 0)).reshape(-1, 1, *x.shape[2:])
@@ -216,7 +233,9 @@ class EpisodeStore:
                 "team": n,
                 "content": self.content,
             },
-            constraints=None if self.constraints is None else np.moveaxis(self.constraints, 1, 0).reshape(-1, c),
+            constraints=None
+            if self.constraints is None
+            else np.moveaxis(self.constraints, 1, 0).reshape(-1, len(self.limits)),
         )
 
     # --- making ---
@@ -225,7 +244,8 @@ class EpisodeStore:
         """Episodes of one length L: observations (E, L+1, N, O), actions (E, L, N, A), rewards (E, L, N) or (E, L),
         costs (E, L), (E, L, N), a dictionary of these by the constraint's name, or None, state (E, L+1, S);
         `terminated` (E,) bool says which ended by themselves (none, if it is not given)."""
-        observations, actions = _numbers("observations", observations), _numbers("actions", actions)
+        observations = _numbers("observations", observations)
+        actions = _numbers("actions", actions)
         if observations.ndim != 4 or actions.ndim != 4 or observations.shape[1] != actions.shape[1] + 1:
             raise StoreError(
                 f"from_episodes got observations {observations.shape} and actions {actions.shape}; they must be "
@@ -235,40 +255,41 @@ class EpisodeStore:
         rewards = _numbers("rewards", rewards)
         costs, several, card = _several(costs, (e, length), n, card)
         costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
-        one = {
+        expected_shapes = {
             "observations": (observations, (e, length + 1, n)),
             "costs": (costs, (e, length, n)[: max(2, costs.ndim)]),
+            "rewards": (rewards, (e, length, n)[: max(2, rewards.ndim)]),
         }
-        one["rewards"] = (rewards, (e, length, n)[: max(2, rewards.ndim)])
         if state is not None:
             state = _numbers("state", state)
-            one["state"] = (state, (e, length + 1))
+            expected_shapes["state"] = (state, (e, length + 1))
         if terminated is not None:
-            one["terminated"] = (np.asarray(terminated), (e,))
-        for name, (value, expected) in one.items():
-            wide = len(expected) + (name in ("observations", "state"))
-            if value.shape[: len(expected)] != expected or value.ndim != wide:
+            expected_shapes["terminated"] = (np.asarray(terminated), (e,))
+        for name, (value, expected) in expected_shapes.items():
+            entries = name in ("observations", "state")  # one more axis, of any size
+            if value.shape[: len(expected)] != expected or value.ndim != len(expected) + int(entries):
+                wanted = ", ".join(map(str, expected)) + (", ..." if entries else "")
                 raise StoreError(
                     f"from_episodes got {name} of shape {value.shape}, the actions say {e} episodes of {length} steps "
-                    f"and {n} agents; give ({', '.join(map(str, expected))}{', ...' * (wide > len(expected))})."
+                    f"and {n} agents; give ({wanted})."
                 )
         if rewards.ndim == 2:
             rewards = np.repeat(rewards[..., None], n, -1)
         last = np.zeros((e, length), bool)
         last[:, -1] = True
         ended = np.zeros(e, bool) if terminated is None else np.asarray(terminated, bool)
-        flat = lambda x, lead: np.ascontiguousarray(np.asarray(x).reshape(lead, *np.shape(x)[2:]))  # noqa: E731
+        steps = e * length
         return cls(
-            flat(observations, e * (length + 1)).astype(np.float32, copy=False),
-            flat(actions, e * length).astype(np.float32, copy=False),
-            flat(rewards, e * length).astype(np.float32, copy=False),
-            flat(costs, e * length).astype(np.float32, copy=False),
+            _flat(observations, e * (length + 1)),
+            _flat(actions, steps),
+            _flat(rewards, steps),
+            _flat(costs, steps),
             (last & ended[:, None]).ravel(),
             (last & ~ended[:, None]).ravel(),
             np.arange(1, e + 1) * length,
-            None if state is None else flat(state, e * (length + 1)).astype(np.float32, copy=False),
+            None if state is None else _flat(state, e * (length + 1)),
             {} if card is None else card,
-            constraints=None if several is None else flat(several, e * length),
+            constraints=None if several is None else _flat(several, steps),
         )
 
     @classmethod
@@ -292,59 +313,41 @@ class EpisodeStore:
         default), state (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state`
         (E, S): the state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit);
         speed (T,)."""
-        ends = _numbers("episode_ends", episode_ends, 1)
-        if (ends % 1 != 0).any():
-            raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
-        ends = ends.astype(np.int64)
-        observations = _numbers("observations", observations, 3).astype(np.float32, copy=False)
-        actions = _numbers("actions", actions, 3).astype(np.float32, copy=False)
-        final_observations = _numbers("final_observations", final_observations, 3).astype(np.float32, copy=False)
-        rewards = _numbers("rewards", rewards).astype(np.float32, copy=False)
-        costs, several, card = _several(costs, actions.shape[:1], actions.shape[1], card)
-        state, final_state = (
-            None if x is None else _numbers(name, x, 2).astype(np.float32, copy=False)
-            for name, x in (("state", state), ("final_state", final_state))
-        )
-        if len(ends) == 0 or ends[-1] != len(actions):
-            raise StoreError(
-                f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {len(actions)} steps; "
-                "it must be cumulative and end with the number of steps (drop an unfinished last episode)."
-            )
-        if (np.diff(ends, prepend=0) <= 0).any():
-            raise StoreError("episode_ends must increase; give cumulative step counts.")
-        for name, value, rows in (
-            ("observations", observations, len(actions)),
-            ("state", state, len(actions)),
-            ("terminated", terminated, len(ends)),
-        ):
-            if value is not None and len(value) != rows:
-                raise StoreError(f"from_steps got {len(value)} rows of {name}, it takes {rows}; see its docstring.")
-        lasts = {"final_observations": (final_observations, (len(ends), *observations.shape[1:]))}
+        ends = _whole_ends(episode_ends)
+        observations = _floats("observations", observations, 3)
+        actions = _floats("actions", actions, 3)
+        final_observations = _floats("final_observations", final_observations, 3)
+        rewards = _floats("rewards", rewards)
+        n_steps, n_agents = actions.shape[:2]
+        costs, several, card = _several(costs, (n_steps,), n_agents, card)
+        state = None if state is None else _floats("state", state, 2)
+        final_state = None if final_state is None else _floats("final_state", final_state, 2)
+        _check_ends(ends, n_steps)
+        _check_rows("observations", observations, n_steps)
+        _check_rows("state", state, n_steps)
+        _check_rows("terminated", terminated, len(ends))
+        _check_last("final_observations", final_observations, (len(ends), *observations.shape[1:]))
         if state is not None and final_state is not None:
-            lasts["final_state"] = (final_state, (len(ends), *np.shape(state)[1:]))
-        for name, (value, expected) in lasts.items():
-            if np.shape(value) != expected:
-                raise StoreError(
-                    f"{name} has shape {np.shape(value)}, expected {expected}: the state that each of the {len(ends)} "
-                    "episodes ended in."
-                )
+            _check_last("final_state", final_state, (len(ends), *state.shape[1:]))
         if rewards.ndim == 1:
-            rewards = np.repeat(rewards[:, None], actions.shape[1], 1)
+            rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else np.asarray(terminated, bool)
-        flags = np.zeros((2, len(actions)), bool)
-        flags[0, ends[ended] - 1] = True
-        flags[1, ends[~ended] - 1] = True
-        if state is not None and final_state is None:
-            raise StoreError("state was given without final_state; pass the global state each episode ended in, too.")
+        states = None
+        if state is not None:
+            if final_state is None:
+                raise StoreError(
+                    "state was given without final_state; pass the global state each episode ended in, too."
+                )
+            states = np.insert(state, ends, final_state, axis=0)
         return cls(
             np.insert(observations, ends, final_observations, axis=0),
             actions,
             rewards,
-            np.zeros(len(actions), np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
-            flags[0],
-            flags[1],
+            np.zeros(n_steps, np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
+            _flags(ends[ended], n_steps),
+            _flags(ends[~ended], n_steps),
             ends,
-            None if state is None else np.insert(state, ends, final_state, axis=0),
+            states,
             {} if card is None else card,
             None if speed is None else _numbers("speed", speed),
             several,
@@ -365,12 +368,14 @@ class EpisodeStore:
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
         path = Path(path)
+        card = json.dumps(self.card)
         with whole(path) as temporary:
             try:
                 with h5py.File(temporary, "w") as f:
                     f.attrs["ringfence_store"] = FORMAT
-                    f.attrs["card"] = told = json.dumps(self.card)
-                    f.attrs["digest"], f.attrs["card_digest"] = self.content, _digest(told)
+                    f.attrs["card"] = card
+                    f.attrs["digest"] = self.content
+                    f.attrs["card_digest"] = _digest(card)
                     for name in (*ARRAYS, *OPTIONAL):
                         if getattr(self, name) is not None:
                             f.create_dataset(name, data=getattr(self, name))
@@ -393,10 +398,12 @@ class EpisodeStore:
                         f"'{path}' is not an episode store of format {FORMAT}; import it with `ringfence data`."
                     )
                 there = _checked(path, f)
-                raw, digest = f.attrs["card"], f.attrs.get("digest")
+                raw = f.attrs["card"]
+                digest = f.attrs.get("digest")
                 if not isinstance(raw, str | bytes) or len(raw) > 2**24:
                     raise StoreError(f"'{path}' has no card that can be read; make or import it again.")
-                if f.attrs.get("card_digest", of := _digest(raw)) != of:
+                digest_of_card = _digest(raw)
+                if f.attrs.get("card_digest", digest_of_card) != digest_of_card:
                     raise StoreError(
                         f"'{path}' has another card than was written; make or import it again, or delete its "
                         "attribute 'card_digest' if you wrote the card yourself."
@@ -406,11 +413,13 @@ class EpisodeStore:
         except StoreError:
             raise
         except OSError as error:
-            told = str(error).splitlines()[0]
-            raise StoreError(f"'{path}' is truncated or not HDF5 ({told}); make or import the store again.") from error
+            reason = str(error).splitlines()[0]
+            raise StoreError(
+                f"'{path}' is truncated or not HDF5 ({reason}); make or import the store again."
+            ) from error
         except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
-            told = (str(error).splitlines() or [type(error).__name__])[0]
-            raise StoreError(f"'{path}' is damaged or has no card ({told}); make or import it again.") from error
+            reason = (str(error).splitlines() or [type(error).__name__])[0]
+            raise StoreError(f"'{path}' is damaged or has no card ({reason}); make or import it again.") from error
         try:
             found = cls(**content, card=card)
         except UserError as error:
@@ -429,7 +438,8 @@ def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:
     if missing:
         raise StoreError(f"'{path}' lacks the array '{missing[0]}'; make or import the store again.")
     found = {name: arrays.array(path, f, name) for name in (*ARRAYS, *OPTIONAL) if name in f}
-    steps, episodes = found["actions"].shape[0], found["episode_ends"].shape[0]
+    steps = found["actions"].shape[0]
+    episodes = found["episode_ends"].shape[0]
     rows = {"observations": steps + episodes, "state": steps + episodes, "episode_ends": episodes}
     for name, array in found.items():
         if array.shape[0] != rows.get(name, steps):
@@ -446,7 +456,9 @@ def team(costs: np.ndarray) -> np.ndarray:
     return costs if costs.ndim == 1 else costs.max(1)
 
 
-def _several(costs, lead: tuple[int, ...], agents: int, card: dict | None):
+def _several(
+    costs: Any, lead: tuple[int, ...], agents: int, card: dict | None
+) -> tuple[Any, np.ndarray | None, dict | None]:
     """(costs, constraints, card): of a dictionary by name the largest, all of them (*lead, C) or (*lead, N, C), and the
     card with a limit of each."""
     if not isinstance(costs, dict):
@@ -459,11 +471,12 @@ def _several(costs, lead: tuple[int, ...], agents: int, card: dict | None):
             raise StoreError(f"costs['{name}'] has shape {x.shape}, expected {lead} or {(*lead, agents)}.")
     if any(x.ndim > len(lead) for x in found.values()):  # the team's are everybody's
         found = {k: x if x.ndim > len(lead) else np.repeat(x[..., None], agents, -1) for k, x in found.items()}
-    told = dict((card or {}).get("constraints") or {})
-    if strangers := [name for name in told if name not in found]:
-        raise unknown("constraint with a limit", strangers[0], found)
+    given = dict((card or {}).get("constraints") or {})
+    for name in given:
+        if name not in found:
+            raise unknown("constraint with a limit", name, found)
     several = np.stack(list(found.values()), -1).astype(np.float32)
-    limits = {name: told.get(name, 0.0) for name in found}
+    limits = {name: given.get(name, 0.0) for name in found}
     return several.max(-1), several, {**(card or {}), "constraints": limits}
 
 
@@ -485,3 +498,49 @@ def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
     if axes is not None and array.ndim != axes:
         raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
     return array
+
+
+def _floats(name: str, value, axes: int | None = None) -> np.ndarray:
+    return _numbers(name, value, axes).astype(np.float32, copy=False)
+
+
+def _flat(x: np.ndarray, rows: int) -> np.ndarray:
+    """(E, L, ...) as (rows, ...), episodes one after another."""
+    return np.ascontiguousarray(x.reshape(rows, *x.shape[2:])).astype(np.float32, copy=False)
+
+
+def _flags(ends: np.ndarray, steps: int) -> np.ndarray:
+    """(T,) bool: the last step of each of these episodes."""
+    flags = np.zeros(steps, bool)
+    flags[ends - 1] = True
+    return flags
+
+
+def _whole_ends(episode_ends) -> np.ndarray:
+    ends = _numbers("episode_ends", episode_ends, 1)
+    if (ends % 1 != 0).any():
+        raise StoreError("episode_ends holds fractions; give cumulative step counts, whole numbers.")
+    return ends.astype(np.int64)
+
+
+def _check_ends(ends: np.ndarray, steps: int) -> None:
+    if len(ends) == 0 or ends[-1] != steps:
+        raise StoreError(
+            f"episode_ends ends at {ends[-1] if len(ends) else 'nothing'}, the data has {steps} steps; "
+            "it must be cumulative and end with the number of steps (drop an unfinished last episode)."
+        )
+    if (np.diff(ends, prepend=0) <= 0).any():
+        raise StoreError("episode_ends must increase; give cumulative step counts.")
+
+
+def _check_rows(name: str, value: Any, rows: int) -> None:
+    if value is not None and len(value) != rows:
+        raise StoreError(f"from_steps got {len(value)} rows of {name}, it takes {rows}; see its docstring.")
+
+
+def _check_last(name: str, value: np.ndarray, expected: tuple[int, ...]) -> None:
+    if value.shape != expected:
+        raise StoreError(
+            f"{name} has shape {value.shape}, expected {expected}: the state that each of the {expected[0]} "
+            "episodes ended in."
+        )
