@@ -13,7 +13,6 @@ import zipfile
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -222,29 +221,6 @@ def test_what_cannot_be_exported_is_named(run, tmp_path):
     odd = exporting.Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [])
     with pytest.raises(UserError, match="cannot be written as ONNX .*pure_callback.*; write it as StableHLO"):
         exporting.as_onnx(odd)
-
-
-def test_known_places_are_picked_exactly():
-    """Gathers and scatters at places that are known become picks; repeated, left-out and outer places included."""
-    x, put = jax.random.normal(jax.random.key(0), (4, 5)), jax.random.normal(jax.random.key(1), (4, 3))
-    at = np.array([3, 0, 3])
-
-    def odd(x, put):
-        rows = jnp.array([2, 9, 2])
-        return [
-            x[:, at],
-            x.at[:, np.array([4, 1, 0])].set(put),
-            x.at[:, at].add(put),
-            x.at[rows].add(put.T[:, 0:1], mode="drop"),
-            jax.grad(lambda x: (x[:, at] ** 2).sum())(x),
-        ]
-
-    program = jax.make_jaxpr(odd)(x, put)
-    plain = lambda *a: exporting._played(program, a, exporting._How(lambda *_: None, simpler=True))  # noqa: E731
-    names = {e.primitive.name for e in jax.make_jaxpr(plain)(x, put).jaxpr.eqns}
-    assert not any("scatter" in name for name in names)
-    for ours, theirs in zip(jax.jit(plain)(x, put), odd(x, put)):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
 def test_the_node_plays_the_file(run, small_store, small_world, tmp_path):

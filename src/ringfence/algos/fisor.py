@@ -181,7 +181,7 @@ class Proposer(eqx.Module):
     def start(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O) -> joint action (B, N, A)."""
         x = self.normaliser.state(self.feature_map(observations, state))
         (b, n, _), s = x.shape, self.candidates

@@ -35,7 +35,7 @@ class Rest(eqx.Module):
     def start(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         s = self.spec
         middle = (s.action_low + s.action_high) / 2
         return memory, PolicyStep(jnp.full((observations.shape[0], s.n_agents, s.action_dim), middle), {})

@@ -27,7 +27,7 @@ class Direct(eqx.Module):
     def start(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         return memory, PolicyStep(from_unit(self.decide(self.feature_map(observations, state)), self.spec), {})
 
     def decide(self, x: Array) -> Array:
@@ -56,7 +56,7 @@ class Constant(eqx.Module):
     def start(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         s = self.spec
         shape = (observations.shape[0], s.n_agents, s.action_dim)
         if self.random:

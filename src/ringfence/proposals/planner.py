@@ -73,7 +73,7 @@ class Planner(eqx.Module):
             "age": jnp.zeros((), jnp.int32),
         }
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds, of one plan."""
         o, (past, present) = self.options, self._context(memory, observations, state)
         if o.replan == 1:
@@ -110,7 +110,7 @@ class Planner(eqx.Module):
         actions = jnp.stack(actions, 1).reshape(*plans.shape[:2], rows, *actions[0].shape[1:])
         return self._kept(memory, past, present, plans[:, 0]), actions, {}
 
-    def _context(self, memory: PyTree, observations: Array, state: Array) -> tuple[Array, Array]:
+    def _context(self, memory: PyTree, observations: Array, state: Array | None) -> tuple[Array, Array]:
         """Past rows (B, history, N, D) and the present (B, N, D)."""
         present, past = self.feature_map(observations, state), memory["past"]
         if self.history:
