@@ -352,7 +352,7 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
     assert not any(tmp_path.rglob("ckpt"))
 
 
-def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
+def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, caplog):
     run = Run(tmp_path / "copy")
     shutil.copytree(trained["bc"].path, run.path)
     file = run.checkpoints()[-1][1]
@@ -366,7 +366,8 @@ def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, capsys):
     for wrong in (whole[: len(whole) // 2], bytes(flipped), stepped):
         save_file(wrong, file) if isinstance(wrong, dict) else file.write_bytes(wrong)
         assert resolve.resolve(PolicySpec.of(run)).step == before
-        assert "the one before is used" in capsys.readouterr().err
+        assert "the one before is used" in caplog.text
+        caplog.clear()
         with pytest.raises(CheckpointError, match="truncated or damaged.*train the run again"):
             resolve.resolve(PolicySpec.of(run, checkpoint=12))
     file.write_bytes(whole)
@@ -435,7 +436,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     loop.train("icbf", store, out=tmp_path, **how)  # is still that run
 
 
-def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, capsys):
+def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, caplog):
     def stop(step, _):
         if step >= 5:
             raise KeyboardInterrupt
@@ -444,9 +445,10 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
         loop.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True, chunk=5, on_chunk=stop)
     run = Run(next(tmp_path.rglob("config.json")).parent)
     assert evaluate(run, episodes=2)["step"] == 5
-    assert "is at step 5 of 12; its training is unfinished" in capsys.readouterr().err
+    assert "is at step 5 of 12; its training is unfinished" in caplog.text
+    caplog.clear()
     assert evaluate(str(trained["bc"].path), episodes=2)["step"] == 12
-    assert not capsys.readouterr().err
+    assert not caplog.text
     with pytest.raises(CheckpointError, match="no checkpoint of step 7; take one of: 5"):
         evaluate(run, episodes=2, step=7)
 

@@ -190,15 +190,15 @@ def test_the_papers_grids_are_refused_or_made_as_a_whole(tmp_path, capsys):
     assert not (tmp_path / "simple_spread").exists(), "the second part was looked at before the first was begun"
 
 
-def test_a_reference_whose_worker_dies_is_reported(made, capsys):
+def test_a_reference_whose_worker_dies_is_reported(made, caplog):
     pool = local._Pool(made, queue.Queue(), None, 1, 2.0, -1)
     dead, job = SimpleNamespace(pid=1, returncode=-9), {"reference": "simple_spread-random"}
     pool._died(dead, None, [], job)
-    assert pool.jobs.get_nowait() == job and not capsys.readouterr().err, "tried again"
+    assert pool.jobs.get_nowait() == job and not caplog.text, "tried again"
     pool._died(dead, None, [], job)
     pool.too_big.add(2)
     pool._died(SimpleNamespace(pid=2, returncode=-9), None, [], {"reference": "other"})
-    said = capsys.readouterr().err
+    said = caplog.text
     assert pool.jobs.empty()
     assert "simple_spread-random could not be made: its worker died 2 times (exit status -9)" in said
     assert "other could not be made: its worker grew beyond 2 GiB" in said

@@ -12,8 +12,8 @@ import dataclasses
 import functools
 import hashlib
 import json
+import logging
 import shutil
-import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
@@ -43,6 +43,8 @@ from ringfence.utils import stored as names
 from ringfence.utils.config import build_config
 from ringfence.utils.files import whole
 from ringfence.world import Settings
+
+_log = logging.getLogger(__name__)
 
 FORMAT = 1  # of a results folder
 DAMAGED = "has a damaged status.json; delete that file"
@@ -445,8 +447,8 @@ def record_failure(cell: Cell, out: Path, error: str, trace: str = "") -> None:
 
 
 def tell_lost(what: str, why: str) -> None:
-    """Say on stderr that something which no cell needs could not be made."""
-    print(f"{what} could not be made: {why}", file=sys.stderr, flush=True)
+    """Say that something which no cell needs could not be made."""
+    _log.warning(f"{what} could not be made: {why}")
 
 
 def make_reference(task: str, out: Path, episodes: int, transitions: int | None = None) -> None:

@@ -14,6 +14,7 @@ from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.utils.cache import cache_dir
+from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 
 SIMULATED_BY = ("simulator", "episode_length", "integrator", "reward")  # of the card: who else simulated other steps
@@ -30,6 +31,7 @@ def make(
     """(store, its file). `transitions` (default: the full size) is rounded up to whole episodes; a kept file of the
     same data is taken, unless `fresh` or another place is asked for. Where the cache cannot be written, the data are
     used all the same if they need not be kept."""
+    keep_programs()
     recipe = task.recipe
     if recipe is None:
         raise UserError(f"Task '{task.name}' has no simulator to regenerate data with; import its files instead.")

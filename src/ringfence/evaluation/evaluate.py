@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
+import logging
 from typing import Any, Literal
 
 import jax
@@ -17,7 +17,10 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.types import Policy
+from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
+
+_log = logging.getLogger(__name__)
 
 Split = Literal["test", "validation"]
 
@@ -51,6 +54,7 @@ def evaluate_spec(
     spec: PolicySpec, *, episodes: int = 200, split: Split = "test", record: int = 0, quiet: bool = True
 ) -> dict[str, Any]:
     """`evaluate` of what a spec names."""
+    keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
     whole_number("record", record)
     resolved = resolve(spec)
@@ -61,7 +65,7 @@ def evaluate_spec(
     writable(run.path / "results.json")
     if spec.checkpoint is None and resolved.step < job.config.steps:
         message = f"'{run.path}' is at step {resolved.step} of {job.config.steps}; its training is unfinished."
-        print(message, file=sys.stderr)
+        _log.warning(message)
     variant = resolved.variant(split)
     seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"

@@ -24,6 +24,7 @@ from ringfence.problem.constraints import CostColumn
 from ringfence.problem.homogeneous import look
 from ringfence.proposals.base import act_with, heard
 from ringfence.training.runs import Run
+from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
 
@@ -76,6 +77,7 @@ def play(
 
     The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
     """
+    keep_programs()
     for name, value in (("episodes", episodes), ("at_once", at_once), ("longest", 1 if longest is None else longest)):
         whole_number(name, value, 1)
     if split not in rollout.RESETS:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -17,7 +18,7 @@ from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import COUNTED, rollout
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import look
-from ringfence.types import Policy
+from ringfence.types import Array, Policy
 
 RATES = {"infeasible": "infeasible_rate", "strange": "ood_rate"}  # columns of what is counted in steps
 PROTOCOL = 1  # results of different protocols are never mixed in one table
@@ -87,9 +88,14 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
     """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
     view = task.feature_map("pruned")
     bound = constraints.bind(task.hazard, view.names, view.plus.shape[0])
-    seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(jnp.asarray(states)))
-    unsafe, _ = bound.labels(jnp.asarray(look(view, task.alike, seen, states)))
-    return np.asarray(unsafe.reshape(len(states), -1).any(-1))
+
+    @jax.jit  # one program instead of one for every operation
+    def unsafe(states: Array) -> Array:
+        seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(states))
+        found, _ = bound.labels(look(view, task.alike, seen, states))
+        return found.reshape(len(states), -1).any(-1)
+
+    return np.asarray(unsafe(jnp.asarray(states)))
 
 
 def evaluate_policy(

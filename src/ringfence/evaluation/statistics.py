@@ -12,7 +12,7 @@ from typing import TypedDict
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
+from scipy import special
 
 from ringfence.errors import UserError
 
@@ -41,13 +41,13 @@ def upper_bound(violations: int, episodes: int, level: float = 0.95) -> float:
 
 def _lower(violations: int, episodes: int, quantile: float) -> float:
     """scipy's `binomtest(...).proportion_ci("exact")` gives the same, to nine digits, by a search."""
-    return float(stats.beta.ppf(quantile, violations, episodes - violations + 1)) if violations else 0.0
+    return float(special.betaincinv(violations, episodes - violations + 1, quantile)) if violations else 0.0
 
 
 def _upper(violations: int, episodes: int, quantile: float) -> float:
     if violations == episodes:
         return 1.0
-    return float(stats.beta.ppf(quantile, violations + 1, episodes - violations))
+    return float(special.betaincinv(violations + 1, episodes - violations, quantile))
 
 
 def bootstrap_mean(x: ArrayLike, level: float = 0.95, draws: int = 2000, seed: int = 0) -> Interval:
@@ -89,7 +89,7 @@ def _half_width(means: np.ndarray, level: float) -> float:
     """Of Student's interval of the mean of runs' means; 0 of one run."""
     if len(means) < 2:
         return 0.0
-    return float(stats.t.ppf((1 + level) / 2, len(means) - 1) * means.std(ddof=1) / len(means) ** 0.5)
+    return float(special.stdtrit(len(means) - 1, (1 + level) / 2) * means.std(ddof=1) / len(means) ** 0.5)
 
 
 @functools.lru_cache(maxsize=8)
@@ -108,6 +108,8 @@ def cvar(x: ArrayLike, share: float = 0.1) -> float:
 def iqm(scores: ArrayLike) -> np.ndarray:
     """Interquartile mean of (..., R, M) scores: the mean of the middle half of all R·M of them."""
     x = np.asarray(scores, np.float64)
+    from scipy import stats  # slow to import, and no evaluation needs it
+
     return stats.trim_mean(x.reshape(*x.shape[:-2], -1), 0.25, axis=-1)
 
 
@@ -151,6 +153,8 @@ def cost_profile(costs: ArrayLike, thresholds: ArrayLike) -> np.ndarray:
 
 def paired_test(x: ArrayLike, y: ArrayLike) -> PairedTest:
     """x against y on the same resets: mean difference, its bootstrap interval, Wilcoxon's signed-rank p-value."""
+    from scipy import stats
+
     difference = np.asarray(x, np.float64) - np.asarray(y, np.float64)
     p = float(np.asarray(stats.wilcoxon(difference))[1]) if difference.any() else 1.0
     return {"difference": float(difference.mean()), "interval": bootstrap_mean(difference), "p": p}

@@ -11,6 +11,7 @@ from ringfence.guards.policy import Paid, costs_of_one
 from ringfence.loading.resolve import load
 from ringfence.proposals.base import act_with, heard
 from ringfence.training.runs import Run
+from ringfence.utils.compilation import keep_programs
 
 
 class Controller:
@@ -25,6 +26,7 @@ class Controller:
     """
 
     def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
+        keep_programs()
         self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(whole_number("seed", seed, 0, 2**31 - 1))
         self._act = jax.jit(act_with)

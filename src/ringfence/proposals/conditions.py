@@ -6,7 +6,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import rankdata
 
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import returns_to_go
@@ -53,6 +52,8 @@ def advantages(
 
 def normal_scores(x: np.ndarray) -> np.ndarray:
     """Φ⁻¹ of the rank: a scale that is the same for every data set; +2 is the best 2.3 %."""
+    from scipy.stats import rankdata  # slow to import, and playing needs none
+
     return ndtri((rankdata(x) - 0.5) / len(x))
 
 

@@ -28,6 +28,7 @@ from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import Run, write_json
 from ringfence.types import PyTree
+from ringfence.utils.compilation import keep_programs
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
 from ringfence.utils.progress import Progress
@@ -62,6 +63,7 @@ def train(
     `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
+    keep_programs()
     if not isinstance(data, EpisodeStore):
         raise UserError(
             f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "

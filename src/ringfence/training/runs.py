@@ -10,8 +10,8 @@ results.json    what `ringfence eval` measured, one entry per variant
 from __future__ import annotations
 
 import json
+import logging
 import re
-import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +27,8 @@ from ringfence.utils import schemas, stored
 from ringfence.utils.config import RANGES
 from ringfence.utils.files import alone, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
+
+_log = logging.getLogger(__name__)
 
 KEEP = 2  # checkpoints
 
@@ -82,7 +84,7 @@ class Run:
                 sound_arrays(file, at)
                 return
             except ValueError as wrong:
-                print(f"'{file}' is truncated or damaged ({wrong}); it is dropped.", file=sys.stderr)
+                _log.warning(f"'{file}' is truncated or damaged ({wrong}); it is dropped.")
                 file.unlink(missing_ok=True)
 
     def save_checkpoint(self, step: int, state: PyTree) -> Path:
@@ -113,10 +115,10 @@ class Run:
             try:
                 arrays = sound_arrays(file, at)
             except ValueError as wrong:
-                told = f"'{file}' is truncated or damaged ({wrong})"
+                problem = f"'{file}' is truncated or damaged ({wrong})"
                 if file == found[0][1]:
-                    raise CheckpointError(f"{told}; delete it and train the run again.") from wrong
-                print(f"{told}; the one before is used.", file=sys.stderr)
+                    raise CheckpointError(f"{problem}; delete it and train the run again.") from wrong
+                _log.warning(f"{problem}; the one before is used.")
                 continue
             return at, as_tree(arrays, template, file)
 

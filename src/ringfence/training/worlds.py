@@ -11,6 +11,7 @@ from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
+from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import build_config
 from ringfence.world import Settings, World
 from ringfence.world import load as load_world
@@ -62,6 +63,7 @@ def fit(
 
     world = ringfence.fit(store); print(world.card)
     """
+    keep_programs()
     if not isinstance(store, EpisodeStore):
         raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
     if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:

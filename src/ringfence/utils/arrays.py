@@ -12,25 +12,26 @@ from ringfence.errors import StoreError
 from ringfence.utils.files import LOOSE
 
 
-def member(path: Path, group: h5py.Group, name: str, told: str | None = None) -> h5py.Group | h5py.Dataset:
-    """What lies in a group under that name; `told` is what messages call it. Links are not followed."""
-    told = told or name
+def member(path: Path, group: h5py.Group, name: str, label: str | None = None) -> h5py.Group | h5py.Dataset:
+    """What lies in a group under that name; `label` is what messages call it. Links are not followed."""
+    label = label or name
     found = group[name] if isinstance(group.get(name, getlink=True), h5py.HardLink) else None
-    if found is None or (isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)):
-        raise StoreError(f"'{path}' keeps '{told}' behind a link or in another file; copy it into the file itself.")
+    elsewhere = isinstance(found, h5py.Dataset) and (found.external or found.is_virtual)
+    if elsewhere or not isinstance(found, h5py.Group | h5py.Dataset):
+        raise StoreError(f"'{path}' keeps '{label}' behind a link or in another file; copy it into the file itself.")
     return found
 
 
-def array(path: Path, group: h5py.Group, name: str, told: str | None = None) -> h5py.Dataset:
+def array(path: Path, group: h5py.Group, name: str, label: str | None = None) -> h5py.Dataset:
     """An array of numbers in a group, unread."""
-    told = told or name
-    found = member(path, group, name, told)
+    label = label or name
+    found = member(path, group, name, label)
     if not isinstance(found, h5py.Dataset):
-        raise StoreError(f"'{path}' holds a group where the array '{told}' belongs; write the file again.")
+        raise StoreError(f"'{path}' holds a group where the array '{label}' belongs; write the file again.")
     if found.dtype.kind not in "biuf":
-        raise StoreError(f"'{path}' holds '{told}' of type {found.dtype}; it must hold numbers.")
+        raise StoreError(f"'{path}' holds '{label}' of type {found.dtype}; it must hold numbers.")
     if found.shape is None or not found.shape:
-        raise StoreError(f"'{path}' holds no array in '{told}'; write the file again.")
+        raise StoreError(f"'{path}' holds no array in '{label}'; write the file again.")
     return found
 
 
@@ -38,16 +39,17 @@ def affordable(path: Path, size: int, ratio: int) -> None:
     """Refuse arrays of `size` bytes that memory cannot take, or that a file of its size cannot hold though it were
     compressed `ratio` to one."""
     fits(path, size)
-    there = path.stat().st_size
-    if size > ratio * there + LOOSE:
+    stored = path.stat().st_size
+    if size > ratio * stored + LOOSE:
         raise StoreError(
-            f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {there / 2**20:.1f}; store them uncompressed."
+            f"'{path}' claims {size / 2**20:.0f} MiB of arrays and holds {stored / 2**20:.1f}; store them uncompressed."
         )
 
 
 def fits(path: Path, size: int) -> None:
     """Refuse arrays of `size` bytes that memory cannot take."""
-    if size > (memory := _memory()):
+    memory = _memory()
+    if size > memory:
         raise StoreError(
             f"'{path}' holds {size / 2**30:.1f} GiB of arrays, this machine has {memory / 2**30:.1f} GiB of memory; "
             "take a larger machine, or store fewer episodes."

@@ -1,9 +1,11 @@
-"""Where regenerated data and fitted Worlds are kept."""
+"""Where regenerated data, fitted Worlds and compiled programs are kept."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+import platformdirs
 
 from ringfence.errors import UserError
 
@@ -13,6 +15,9 @@ def cache_dir() -> Path:
     if home := os.environ.get("RINGFENCE_HOME"):
         return Path(home)
     try:
-        return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ringfence"
+        found = platformdirs.user_cache_path("ringfence", appauthor=False)
     except RuntimeError:
-        raise UserError("This user has no home folder to keep data in; set RINGFENCE_HOME to a folder.") from None
+        found = Path("~")  # as older versions leave it where nobody knows the user's home
+    if not found.is_absolute():
+        raise UserError("This user has no home folder to keep data in; set RINGFENCE_HOME to a folder.")
+    return found

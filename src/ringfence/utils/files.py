@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import glob
 import os
 import time
@@ -11,9 +12,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 
 from ringfence.errors import UserError
 
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
 LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
 
 
@@ -34,8 +37,8 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
-        told = str(error).splitlines()[0]  # some libraries say it in many lines
-        raise UserError(f"'{path}' could not be written ({told}); free some space or choose another place.") from error
+        why = str(error).splitlines()[0]  # some libraries say it in many lines
+        raise UserError(f"'{path}' could not be written ({why}); free some space or choose another place.") from error
     except BaseException:
         _remove(temporary)
         raise
@@ -91,28 +94,30 @@ def _remove(file: Path) -> None:
 @contextmanager
 def alone(file: Path) -> Iterator[None]:
     """Wait until nobody else is between reading, changing and writing what this lock file stands for."""
-    try:
-        import fcntl
-    except ImportError:
-        yield
-        return
+    lock = FileLock(file)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        lock = os.open(file, os.O_RDWR | os.O_CREAT)
+        lock.acquire()
+    except NotImplementedError:
+        pass
     except OSError as error:
-        raise UserError(f"'{file.parent}' could not be locked ({error}); make it a folder you may write to.") from error
+        if error.errno not in NO_LOCKS:
+            raise UserError(
+                f"'{file.parent}' could not be locked ({error}); make it a folder you may write to."
+            ) from error
     try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(lock, fcntl.LOCK_EX)
         yield
     finally:
-        os.close(lock)
+        lock.release()
 
 
 @contextmanager
 def owned(folder: Path, taken: str) -> Iterator[int]:
     """Hold a folder's lock, or refuse with the sentence `taken` where another process does; it frees itself when its
-    holder and all processes that inherited it are gone, however they went."""
+    holder and all processes that inherited it are gone, however they went.
+
+    The descriptor is handed to workers, which filelock neither gives nor leaves to them: it unlocks for all at once.
+    """
     try:
         import fcntl
     except ImportError:  # no such locks here: one process per folder is then up to the user
@@ -144,9 +149,10 @@ def read_npz(path: Path) -> dict[str, np.ndarray]:
     claim."""
     try:
         with zipfile.ZipFile(path) as packed:
-            claimed, there = sum(member.file_size for member in packed.infolist()), path.stat().st_size
-        if claimed > 4 * there + LOOSE:
-            raise ValueError(f"it claims {claimed / 2**20:.0f} MiB and holds {there / 2**20:.1f}")
+            claimed = sum(member.file_size for member in packed.infolist())
+        stored = path.stat().st_size
+        if claimed > 4 * stored + LOOSE:
+            raise ValueError(f"it claims {claimed / 2**20:.0f} MiB and holds {stored / 2**20:.1f}")
         with np.load(path, allow_pickle=False) as arrays:
             found = {name: arrays[name] for name in arrays.files}
     except ValueError:

@@ -53,5 +53,6 @@ def as_tree(arrays: dict[str, np.ndarray], template: PyTree, file: str | Path) -
                 f"'{file}': '{name}' has shape {arrays[name].shape}, its config gives {leaf.shape}; it belongs to "
                 "another task or config."
             )
-        leaves.append(jax.numpy.asarray(arrays[name], leaf.dtype))
+        # Converted by NumPy: JAX would compile a program for every shape.
+        leaves.append(jax.device_put(np.asarray(arrays[name], leaf.dtype)))
     return jax.tree.unflatten(jax.tree.structure(template), leaves)
