@@ -270,7 +270,7 @@ def test_reference_rows_follow_the_size_of_the_data(made, tmp_path):
     assert reference.there(task, tmp_path, n) and not reference.there(task, tmp_path, n, 900_000)
 
 
-def test_references_that_cannot_be_made_stop_nobody(tmp_path, capfd):
+def test_references_that_cannot_be_made_stop_nobody(tmp_path, caplog):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **{**QUICK, "seeds": 1})
     g.open()
     (g.out / "reference" / "simple_spread-random").mkdir(parents=True)
@@ -278,7 +278,7 @@ def test_references_that_cannot_be_made_stop_nobody(tmp_path, capfd):
     damaged = {"behaviour data": {}, "do-nothing": {"episodes": 4}, "data within the limit": {}}
     (g.out / "reference" / "simple_spread-random" / "reference.json").write_text(json.dumps(damaged))
     assert run_local(g, workers=1, quiet=True)["done"] == 1
-    assert "reference rows of simple_spread-random could not be made: KeyError" in capfd.readouterr().err
+    assert "reference rows of simple_spread-random could not be made: KeyError" in caplog.text
 
 
 def test_bad_names_and_folders_are_refused(made, tmp_path):
