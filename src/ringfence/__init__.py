@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib
 
+from ringfence.utils import moved
+
 __version__ = "0.1.0"
 
 # Loaded on first use, so that `import ringfence` and `ringfence --help` start at once.
@@ -30,6 +32,7 @@ _WHERE = {
     "UserError": "ringfence.errors",
 }
 __all__ = list(_WHERE)
+moved.install()
 
 
 def __getattr__(name: str):
