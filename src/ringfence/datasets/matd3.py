@@ -90,9 +90,11 @@ def _init_mlp(key: Key, lead: tuple[int, ...], sizes: tuple[int, ...], last: flo
     layers = list(zip(sizes[:-1], sizes[1:]))
     # One draw for all layers: each call of the generator costs more than a second of compilation.
     draw = jax.random.uniform(key, (*lead, sum((n_in + 1) * n_out for n_in, n_out in layers)), minval=-1.0, maxval=1.0)
-    weights, biases, at = [], [], 0
+    weights, biases = [], []
+    at = 0
     for k, (n_in, n_out) in enumerate(layers):
-        bound = last if last is not None and k == len(layers) - 1 else n_in**-0.5
+        is_last = k == len(layers) - 1
+        bound = last if last is not None and is_last else n_in**-0.5
         part = bound * draw[..., at : at + (n_in + 1) * n_out].reshape(*lead, n_in + 1, n_out)
         weights.append(part[..., :-1, :])
         biases.append(part[..., -1:, :])
@@ -100,17 +102,18 @@ def _init_mlp(key: Key, lead: tuple[int, ...], sizes: tuple[int, ...], last: flo
     return Mlp(tuple(weights), tuple(biases))
 
 
-def _optimisers(config: MATD3Config):
+def _optimisers(config: MATD3Config) -> tuple[optax.GradientTransformation, optax.GradientTransformation]:
     return optax.adam(config.actor_rate), optax.adam(config.critic_rate)
 
 
 def init(config: MATD3Config, key: Key, n: int, observed: int, seen: int, a: int, team: bool = False) -> Learner:
     """A fresh learner for N agents with O observation, F critic-input and A action entries."""
-    ka, kc = jax.random.split(key)
-    h, actor_opt, critic_opt = config.hidden, *_optimisers(config)
-    actors = _init_mlp(ka, (n,), (observed, h, h, a), last=3e-3)
-    h = config.critic_hidden or h
-    critics = _init_mlp(kc, (2, 1 if team else n), (seen + n * a, h, h, 1))
+    key_actors, key_critics = jax.random.split(key)
+    actor_opt, critic_opt = _optimisers(config)
+    width = config.hidden
+    actors = _init_mlp(key_actors, (n,), (observed, width, width, a), last=3e-3)
+    width = config.critic_hidden or config.hidden
+    critics = _init_mlp(key_critics, (2, 1 if team else n), (seen + n * a, width, width, 1))
     copy = partial(jax.tree.map, jnp.copy)  # the training loop donates its buffers, so targets need their own
     return Learner(actors, critics, copy(actors), copy(critics), actor_opt.init(actors), critic_opt.init(critics))
 

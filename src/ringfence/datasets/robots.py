@@ -13,11 +13,11 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,13 +26,15 @@ import numpy as np
 from ringfence.datasets import matd3
 from ringfence.datasets.behaviour import POLICIES, BehaviourPolicy, load_behaviour, save_behaviour
 from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
-from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.envs.base import Simulation
+from ringfence.envs.mujoco import Parts, SafeMuJoCo
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import Array, Key
 
+Numbers = np.ndarray | Array
 COMMAND = "python -m ringfence.datasets.robots"
 # Mean returns of OG-MARL's sets (Formanek et al. 2023).
-LEVELS = {
+LEVELS: dict[Parts, dict[str, float]] = {
     "2x3": {"good": 6924.0, "medium": 1485.0, "poor": 400.0},
     "2x4": {"good": 2620.0, "medium": 1100.0, "poor": 440.0},
     "4x2": {"good": 2770.0, "medium": 1550.0, "poor": 540.0},
@@ -67,21 +69,32 @@ class RobotsConfig:
     score_episodes: int = 8
     averaged: float = 0.0  # of the actors, per bout: snapshots are of the average (0: of the actors as they are)
 
+    @property
+    def per_bout(self) -> int:
+        """Transitions of a bout."""
+        return self.robots * self.stretch
+
+    @property
+    def bouts(self) -> int:
+        return self.transitions // self.per_bout
+
 
 def config_for(env: SafeMuJoCo) -> RobotsConfig:
     """The Ant falls, so it learns under the noise of collection, and its snapshots are of averages, which fall less."""
     config = RobotsConfig()
-    return replace(config, learner=replace(config.learner, noise=NOISE), averaged=0.98) if env.ant else config
+    if not env.ant:
+        return config
+    return replace(config, learner=replace(config.learner, noise=NOISE), averaged=0.98)
 
 
 class Memory(NamedTuple):
     """Everything the learner has seen, with room for M transitions."""
 
-    state: Array  # (M, S)
-    action: Array  # (M, N, A)
-    reward: Array  # (M,)
-    terminated: Array  # (M,)
-    after: Array  # (M, S)
+    state: Numbers  # (M, S)
+    action: Numbers  # (M, N, A)
+    reward: Numbers  # (M,)
+    terminated: Numbers  # (M,)
+    after: Numbers  # (M, S)
 
 
 class Snapshot(NamedTuple):
@@ -99,7 +112,7 @@ def learn(
     learner: Learner,
     memory: Memory,
     fresh: Memory,
-    at: Array,
+    at: int | Array,
     key: Key,
 ) -> tuple[Learner, Memory]:
     """Put fresh transitions into the memory at row `at` and make a bout of updates."""
@@ -108,21 +121,101 @@ def learn(
 
     def one(learner: Learner, xs) -> tuple[Learner, None]:
         index, key = xs
-        k_rows, k_noise = jax.random.split(key)
-        rows = jax.random.randint(k_rows, (config.learner.batch,), 0, stored)
-        m = Memory(*(x[rows] for x in memory))
-        seen, later = m.state[:, env.observed], m.after[:, env.observed]
-        batch = Transitions(seen, m.state, m.action, m.reward[:, None], m.terminated, later, m.after)
-        return matd3.update(config.learner, learner, batch, index % config.learner.delay == 0, k_noise), None
+        key_rows, key_noise = jax.random.split(key)
+        rows = jax.random.randint(key_rows, (config.learner.batch,), 0, stored)
+        state, action, reward, terminated, after = (jnp.asarray(x)[rows] for x in memory)
+        batch = Transitions(
+            observations=state[:, env.observed],
+            seen=state,
+            actions=action,
+            rewards=reward[:, None],
+            terminated=terminated,
+            next_observations=after[:, env.observed],
+            next_seen=after,
+        )
+        return matd3.update(config.learner, learner, batch, index % config.learner.delay == 0, key_noise), None
 
-    steps = jnp.arange(config.updates), jax.random.split(key, config.updates)
+    steps = (jnp.arange(config.updates), jax.random.split(key, config.updates))
     return jax.lax.scan(one, learner, steps)[0], memory
 
 
 @jax.jit
-def choose(actors: Mlp, observations: Array, noise: Array, key: Key) -> Array:
+def choose(actors: Mlp, observations: Numbers, noise: float | Array, key: Key) -> Array:
     """(B, N, O) -> (B, N, A) with exploration noise."""
-    return matd3.noisy(matd3.act(actors, observations), noise, key)
+    return matd3.noisy(matd3.act(actors, jnp.asarray(observations)), noise, key)
+
+
+class Trainer:
+    """A learner at work on a batch of robots."""
+
+    def __init__(self, env: SafeMuJoCo, config: RobotsConfig, seed: int):
+        self.env = env
+        self.config = config
+        self.seed = seed
+        self.sim = env.simulate(config.robots)
+        self.rng = np.random.default_rng(seed)
+        self.key, key_init = jax.random.split(jax.random.key(seed))
+        self.memory = _empty_memory(env, config.bouts * config.per_bout)
+        states = len(env.state_names)
+        self.learner = matd3.init(
+            config.learner, key_init, env.n_agents, env.observation_dim, states, env.action_dim, team=True
+        )
+        self.average = jax.tree.map(np.array, self.learner.actors)
+        self.begun = config.robots  # episodes
+        self.age = np.zeros(config.robots, int)  # steps of the episodes under way
+        self.sim.reset([(seed, episode) for episode in range(config.robots)])
+
+    def bout(self, number: int) -> None:
+        """A stretch of steps of every robot, then updates."""
+        seen = number * self.config.per_bout
+        fresh = self._explore(uniform=seen < self.config.random_steps)
+        self.key, key = jax.random.split(self.key)
+        self.learner, self.memory = learn(self.config, self.env, self.learner, self.memory, fresh, seen, key)
+        share = self.config.averaged
+        self.average = jax.tree.map(
+            lambda old, new: share * old + (1 - share) * np.asarray(new), self.average, self.learner.actors
+        )
+
+    def _explore(self, uniform: bool) -> Memory:
+        """Transitions of a stretch of steps."""
+        rows = []
+        for _ in range(self.config.stretch):
+            state = self.sim.state().astype(np.float32)
+            action = self._action(state, uniform)
+            outcome = self.sim.step(action)
+            reward = outcome.reward.astype(np.float32)
+            rows.append((state, action, reward, outcome.terminated, self.sim.state().astype(np.float32)))
+            self.age += 1
+            self._begin_again(outcome.terminated | (self.age >= self.env.episode_length))
+        return Memory(*(np.concatenate(column) for column in zip(*rows)))
+
+    def _action(self, state: np.ndarray, uniform: bool) -> np.ndarray:
+        if uniform:
+            shape = (self.config.robots, self.env.n_agents, self.env.action_dim)
+            return self.rng.uniform(-1, 1, shape).astype(np.float32)
+        self.key, key = jax.random.split(self.key)
+        observations = self.sim.observe(state)
+        return np.asarray(choose(self.learner.actors, observations, self.config.learner.noise, key))
+
+    def _begin_again(self, over: np.ndarray) -> None:
+        """New episodes of the robots whose episode is `over` (B,)."""
+        robots = np.flatnonzero(over)
+        if not len(robots):
+            return
+        self.sim.reset([(self.seed, self.begun + k) for k in range(len(robots))], robots)
+        self.begun += len(robots)
+        self.age[robots] = 0
+
+
+def _empty_memory(env: SafeMuJoCo, size: int) -> Memory:
+    states = len(env.state_names)
+    return Memory(
+        state=jnp.zeros((size, states)),
+        action=jnp.zeros((size, env.n_agents, env.action_dim)),
+        reward=jnp.zeros(size),
+        terminated=jnp.zeros(size, bool),
+        after=jnp.zeros((size, states)),
+    )
 
 
 def train(
@@ -134,70 +227,40 @@ def train(
 ) -> list[Snapshot]:
     """Train from scratch; a snapshot every `score_every` bouts, with the return it earns under noise 0.2. Ends early
     when the last four earn `enough` on average."""
-    b, n = config.robots, env.n_agents
-    sim, judge = env.simulate(b), env.simulate(config.score_episodes)
-    rng = np.random.default_rng(seed)
-    key = jax.random.key(seed)
-    s = len(env.state_names)
-    bouts = config.transitions // (b * config.stretch)
-    size = bouts * b * config.stretch
-    memory = Memory(
-        jnp.zeros((size, s)),
-        jnp.zeros((size, n, env.action_dim)),
-        jnp.zeros(size),
-        jnp.zeros(size, bool),
-        jnp.zeros((size, s)),
-    )
-    key, k = jax.random.split(key)
-    learner = matd3.init(config.learner, k, n, env.observed.shape[1], s, env.action_dim, team=True)
-    episode, age, average = b, np.zeros(b, int), jax.tree.map(np.array, learner.actors)
-    sim.reset([(seed, e) for e in range(b)])
-    found = []
-    for bout in range(bouts):
-        rows = []
-        for _ in range(config.stretch):
-            state = sim.state().astype(np.float32)
-            if bout * b * config.stretch < config.random_steps:
-                action = rng.uniform(-1, 1, (b, n, env.action_dim)).astype(np.float32)
-            else:
-                key, k = jax.random.split(key)
-                action = np.asarray(choose(learner.actors, sim.observe(state), config.learner.noise, k))
-            out = sim.step(action)
-            age += 1
-            rows.append((state, action, out.reward.astype(np.float32), out.terminated, sim.state().astype(np.float32)))
-            over = np.flatnonzero(out.terminated | (age >= env.episode_length))
-            if len(over):
-                sim.reset([(seed, episode + e) for e in range(len(over))], over)
-                episode, age[over] = episode + len(over), 0
-        fresh = Memory(*(np.concatenate(x) for x in zip(*rows)))
-        key, k = jax.random.split(key)
-        learner, memory = learn(config, env, learner, memory, fresh, bout * b * config.stretch, k)
-        fold = lambda a, w: config.averaged * a + (1 - config.averaged) * np.asarray(w)  # noqa: E731
-        average = jax.tree.map(fold, average, learner.actors)
-        if (bout + 1) % config.score_every == 0 or bout + 1 == bouts:
-            score = float(returns(env, average, judge, seed).mean())
-            found.append(Snapshot(average, (bout + 1) * b * config.stretch, score))
-            if progress is not None:
-                progress(found[-1])
-            if len(found) >= MIXED and np.mean([s.score for s in found[-MIXED:]]) > enough:
-                break
-    return found
+    trainer = Trainer(env, config, seed)
+    judge = env.simulate(config.score_episodes)
+    snapshots: list[Snapshot] = []
+    for number in range(config.bouts):
+        trainer.bout(number)
+        done = number + 1
+        if done % config.score_every and done < config.bouts:
+            continue
+        score = float(returns(env, trainer.average, judge, seed).mean())
+        snapshots.append(Snapshot(trainer.average, done * config.per_bout, score))
+        if progress is not None:
+            progress(snapshots[-1])
+        latest = [s.score for s in snapshots[-MIXED:]]
+        if len(latest) == MIXED and np.mean(latest) > enough:
+            break
+    return snapshots
 
 
-def returns(env: SafeMuJoCo, actors: Mlp, sim, seed: int, noise: float = NOISE) -> np.ndarray:
+def returns(env: SafeMuJoCo, actors: Mlp, sim: Simulation, seed: int, noise: float = NOISE) -> np.ndarray:
     """(B,) returns of an episode of every robot."""
-    key, total = jax.random.key(seed + 1), np.zeros(sim.batch)
-    sim.reset([(seed, 10**6 + e) for e in range(sim.batch)])
+    key = jax.random.key(seed + 1)
+    total = np.zeros(sim.batch)
+    sim.reset([(seed, 10**6 + episode) for episode in range(sim.batch)])
     for _ in range(env.episode_length):
         if not sim.running.any():
             break
-        key, k = jax.random.split(key)
-        total += sim.step(np.asarray(choose(actors, sim.observe().astype(np.float32), noise, k))).reward
+        key, key_noise = jax.random.split(key)
+        action = choose(actors, sim.observe().astype(np.float32), noise, key_noise)
+        total += sim.step(np.asarray(action)).reward
     return total
 
 
 def collect(
-    env: SafeMuJoCo, policies: list[BehaviourPolicy | None], transitions: int, seed: int, batch: int = 256
+    env: SafeMuJoCo, policies: Sequence[BehaviourPolicy | None], transitions: int, seed: int, batch: int = 256
 ) -> dict[str, np.ndarray]:
     """At least `transitions` steps in whole episodes, the same number from every policy (None: uniform actions).
 
@@ -205,21 +268,26 @@ def collect(
     episode_ends (E,), final_state (E, S), terminated (E,), policy (E,).
     """
     parts = []
+    share = -(-transitions // len(policies))
     for number, policy in enumerate(policies):
-        wanted, got = -(-transitions // len(policies)), 0
-        while got < wanted:
-            need = -(-(wanted - got) // env.episode_length)
-            part = _episodes(env, policy, min(batch, max(need, 1)), (seed, number, got))
-            got += len(part["rewards"])
+        steps = 0
+        while steps < share:
+            episodes = -(-(share - steps) // env.episode_length)
+            part = _episodes(env, policy, min(batch, episodes), (seed, number, steps))
+            steps += len(part["rewards"])
             part["policy"] = np.full(len(part["lengths"]), number)
             parts.append(part)
-    out = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
-    return {**out, "episode_ends": np.cumsum(out.pop("lengths"))}
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    arrays["episode_ends"] = np.cumsum(arrays["lengths"])
+    return arrays
 
 
-def _episodes(env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed: tuple[int, ...]) -> dict:
+def _episodes(
+    env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed: tuple[int, ...]
+) -> dict[str, np.ndarray]:
     """One episode of every robot of a batch, cut to their lengths."""
-    sim, rng = env.simulate(batch), np.random.default_rng(seed)
+    sim = env.simulate(batch)
+    rng = np.random.default_rng(seed)
     key = jax.random.key(int(rng.integers(2**31)))
     sim.reset([(*seed, k) for k in range(batch)])
     rows, running = [], []
@@ -230,16 +298,23 @@ def _episodes(env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed:
         if policy is None:
             action = rng.uniform(-1, 1, (batch, env.n_agents, env.action_dim)).astype(np.float32)
         else:
-            key, k = jax.random.split(key)
-            action = np.asarray(choose(policy.actors, sim.observe(state), policy.noise, k))
+            key, key_noise = jax.random.split(key)
+            action = np.asarray(choose(policy.actors, sim.observe(state), policy.noise, key_noise))
         running.append(sim.running.copy())
-        out = sim.step(action)
-        counted = out.reward.astype(np.float32), out.cost.astype(np.float32)
-        rows.append((state, action, *counted, out.speed, out.terminated))
+        outcome = sim.step(action)
+        rows.append(
+            {
+                "state": state,
+                "actions": action,
+                "rewards": outcome.reward.astype(np.float32),
+                "costs": outcome.cost.astype(np.float32),
+                "speed": outcome.speed,
+                "ended": outcome.terminated,
+            }
+        )
     alive = np.stack(running, 1)  # (B, T)
     lengths = alive.sum(1)
-    names = ("state", "actions", "rewards", "costs", "speed", "ended")
-    flat = {k: np.stack(x, 1)[alive] for k, x in zip(names, zip(*rows))}
+    flat = {name: np.stack([row[name] for row in rows], 1)[alive] for name in rows[0]}
     terminated = flat.pop("ended")[np.cumsum(lengths) - 1]
     return {**flat, "lengths": lengths, "final_state": sim.state().astype(np.float32), "terminated": terminated}
 
@@ -250,9 +325,11 @@ def _episodes(env: SafeMuJoCo, policy: BehaviourPolicy | None, batch: int, seed:
 def shipped_policies(env: SafeMuJoCo, tier: str, folder: Path = POLICIES) -> list[BehaviourPolicy]:
     """The policies whose episodes a tier mixes."""
     packed = load_behaviour(folder / _file(env, tier))
-    count = packed.actors.weights[0].shape[0]
-    one = lambda k: jax.tree.map(lambda x: x[k], packed.actors)  # noqa: E731
-    return [BehaviourPolicy(one(k), packed.noise, packed.info) for k in range(count)]
+
+    def one(k: int) -> BehaviourPolicy:
+        return BehaviourPolicy(jax.tree.map(lambda x: x[k], packed.actors), packed.noise, packed.info)
+
+    return [one(k) for k in range(packed.actors.weights[0].shape[0])]
 
 
 def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES, tiers: tuple[str, ...] = TIERS) -> dict[str, dict]:
@@ -261,10 +338,12 @@ def pack(env: SafeMuJoCo, runs: list[Path], folder: Path = POLICIES, tiers: tupl
     The runs take turns: of each, the snapshot whose return is nearest to the tier's level, then the next nearest, as
     long as it is within a tenth of it. Returns are of 32 episodes of the policy as it is stored, in half precision.
     """
-    judge, cards = env.simulate(32), {}
+    judge = env.simulate(32)
+    cards = {}
     for tier in tiers:
         level = LEVELS[env.parts][tier]
-        chosen = _in_turns([c for run in runs for c in _nearest(env, judge, run, level)], level)[:MIXED]
+        candidates = [candidate for run in runs for candidate in _nearest(env, judge, run, level)]
+        chosen = _in_turns(candidates, level)[:MIXED]
         if len(chosen) < MIXED:
             raise CheckpointError(
                 f"The runs hold {len(chosen)} snapshots for '{tier}', {MIXED} are needed; train more."
@@ -294,14 +373,14 @@ class Candidate(NamedTuple):
 def _in_turns(found: list[Candidate], level: float) -> list[Candidate]:
     """Those within a tenth of the level, one of every run in turn, then the others, the nearest first."""
 
-    def place(c: Candidate) -> tuple:
-        gap = abs(c.earned - level)
-        return (False, c.rank, gap) if gap <= 0.1 * level else (True, 0, gap)
+    def place(candidate: Candidate) -> tuple[bool, int, float]:
+        gap = abs(candidate.earned - level)
+        return (False, candidate.rank, gap) if gap <= 0.1 * level else (True, 0, gap)
 
     return sorted(found, key=place)
 
 
-def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]:
+def _nearest(env: SafeMuJoCo, judge: Simulation, run: Path, level: float) -> list[Candidate]:
     """The snapshots of a run that come nearest to a level: picked by the scores of training, which are rough, and
     judged again; of a run that never came near, the nearest few."""
     rough = sorted(_scores(run), key=lambda s: abs(s["score"] - level))
@@ -318,8 +397,8 @@ def _nearest(env: SafeMuJoCo, judge, run: Path, level: float) -> list[Candidate]
 def keep(snapshot: Snapshot, run: Path, seconds: float) -> None:
     """Add a snapshot to a run folder: its actors, and a line of scores.jsonl."""
     run.mkdir(parents=True, exist_ok=True)
-    arrays = {f"w{k}": w for k, w in enumerate(snapshot.actors.weights)}
-    arrays |= {f"b{k}": b for k, b in enumerate(snapshot.actors.biases)}
+    arrays: dict[str, Any] = {f"w{k}": weights for k, weights in enumerate(snapshot.actors.weights)}
+    arrays |= {f"b{k}": biases for k, biases in enumerate(snapshot.actors.biases)}
     np.savez(run / f"{snapshot.seen:07d}.npz", **arrays)
     line = {"seen": snapshot.seen, "score": round(snapshot.score, 1), "seconds": round(seconds, 1)}
     with open(run / "scores.jsonl", "a") as f:
@@ -338,9 +417,12 @@ def _scores(run: Path) -> list[dict]:
 
 
 def _load_snapshot(file: Path) -> Mlp:
-    with np.load(file) as f:
-        layers = sum(k.startswith("w") for k in f)
-        return Mlp(*(tuple(jnp.asarray(f[f"{c}{k}"]) for k in range(layers)) for c in "wb"))
+    with np.load(file) as arrays:
+        layers = range(sum(name.startswith("w") for name in arrays))
+        return Mlp(
+            weights=tuple(jnp.asarray(arrays[f"w{k}"]) for k in layers),
+            biases=tuple(jnp.asarray(arrays[f"b{k}"]) for k in layers),
+        )
 
 
 def _halved(actors: Mlp) -> Mlp:
@@ -364,33 +446,36 @@ def main() -> None:
     packed.add_argument("runs", type=Path, nargs="+")
     packed.add_argument("--tiers", nargs="+", choices=TIERS, default=TIERS)
     packed.add_argument("--out", type=Path, default=POLICIES)
-    a = parser.parse_args()
+    given = parser.parse_args()
     try:
-        _run(a)
+        _run(given)
     except UserError as error:
         parser.exit(2, f"error: {error}\n")
 
 
-def _run(a: argparse.Namespace) -> None:
-    env = SafeMuJoCo(a.parts)
-    if a.what == "pack":
-        for tier, card in pack(env, a.runs, a.out, tuple(a.tiers)).items():
+def _run(given: argparse.Namespace) -> None:
+    env = SafeMuJoCo(given.parts)
+    if given.what == "pack":
+        for tier, card in pack(env, given.runs, given.out, tuple(given.tiers)).items():
             print(tier, json.dumps(card["policies"]))
-    else:
-        config = replace(config_for(env), transitions=a.transitions)
-        if a.noise is not None:
-            config = replace(config, learner=replace(config.learner, noise=a.noise))
-        if a.averaged is not None:
-            config = replace(config, averaged=a.averaged)
-        _train_and_keep(env, config, a.seed, a.level, a.out)
+        return
+    config = replace(config_for(env), transitions=given.transitions)
+    if given.noise is not None:
+        config = replace(config, learner=replace(config.learner, noise=given.noise))
+    if given.averaged is not None:
+        config = replace(config, averaged=given.averaged)
+    _train_and_keep(env, config, given.seed, given.level, given.out)
 
 
 def _train_and_keep(env: SafeMuJoCo, config: RobotsConfig, seed: int, level: str, out: Path) -> None:
-    folder, begun = out / f"{env.parts}-{seed}", time.perf_counter()
+    folder = out / f"{env.parts}-{seed}"
+    begun = time.perf_counter()
     if folder.exists():
         raise UserError(f"'{folder}' exists already; delete it or give another --seed or --out.")
-    if config.transitions < (least := config.robots * config.stretch):
-        raise UserError(f"--transitions {config.transitions} holds no bout of learning; give {least} or more.")
+    if config.bouts < 1:
+        raise UserError(
+            f"--transitions {config.transitions} holds no bout of learning; give {config.per_bout} or more."
+        )
     enough = 1.03 * LEVELS[env.parts][level]
 
     def progress(snapshot: Snapshot) -> None:

@@ -13,14 +13,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
 from ringfence.types import Array
+
+Numbers = np.ndarray | Array
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class All:
     """Every hazard at once: unsafe for any is unsafe, and safe is what every one calls safe by its own margin. The
     clearance is the smallest one, in the unit of the first: metres and m/s are compared by their safe margins."""
 
-    hazards: tuple[Separation | SpeedLimit, ...]
+    hazards: tuple[Hazard, ...]
 
 
 Hazard = Separation | SpeedLimit | CostColumn | All
@@ -65,7 +68,7 @@ class BoundHazard:
     """
 
     hazard: Hazard
-    clearance: Callable[[Array], Array] | None
+    clearance: Callable[[Numbers], Array] | None
     safe_margin: float
     members: tuple[BoundHazard, ...] = ()  # of All: each has a margin of its own
 
@@ -73,11 +76,11 @@ class BoundHazard:
     def has_formula(self) -> bool:
         return self.clearance is not None
 
-    def labels(self, features: Array, costs: Array | None = None) -> tuple[Array, Array]:
+    def labels(self, features: Numbers, costs: Numbers | None = None) -> tuple[Array, Array]:
         """(unsafe, safe), each (..., N) bool. `costs` (...) is the cost charged on arriving in the state, negative
         where nobody knows; it is read only where there is no formula."""
         if self.members:
-            unsafe, safe = zip(*(m.labels(features) for m in self.members))
+            unsafe, safe = zip(*(member.labels(features) for member in self.members))
             return functools.reduce(jnp.logical_or, unsafe), functools.reduce(jnp.logical_and, safe)
         if self.clearance is not None:
             ell = self.clearance(features)
@@ -107,21 +110,24 @@ def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
         return _bind_separation(hazard, names, n_agents)
     if isinstance(hazard, SpeedLimit):
         return _bind_speed(hazard, names)
-    parts = [bind(h, names, n_agents) for h in hazard.hazards]
-    if not parts or not all(p.has_formula for p in parts):
+    return _bind_all(hazard, names, n_agents)
+
+
+def _bind_all(hazard: All, names: tuple[str, ...], n_agents: int) -> BoundHazard:
+    parts = tuple(bind(h, names, n_agents) for h in hazard.hazards)
+    formulas = [part.clearance for part in parts if part.clearance is not None]
+    if not parts or len(formulas) < len(parts):
         raise UserError("All(...) needs at least one hazard and a formula for each; leave CostColumn out of it.")
-
     unit = parts[0].safe_margin
-    if any(p.safe_margin != unit for p in parts) and not all(p.safe_margin > 0 for p in parts):
+    margins = [part.safe_margin for part in parts]
+    if any(margin != unit for margin in margins) and not all(margin > 0 for margin in margins):
         raise UserError("All(...) compares its hazards by their safe margins; give each a safe_margin above 0.")
-    scales = [1.0 if p.safe_margin == unit else unit / p.safe_margin for p in parts]
+    scales = [1.0 if margin == unit else unit / margin for margin in margins]
 
-    return BoundHazard(
-        hazard,
-        lambda x: least([s * p.clearance(x) for s, p in zip(scales, parts, strict=True)]),
-        unit,
-        tuple(parts),
-    )
+    def clearance(x: Numbers) -> Array:
+        return least([scale * formula(x) for scale, formula in zip(scales, formulas, strict=True)])
+
+    return BoundHazard(hazard, clearance, unit, parts)
 
 
 def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard | None:
@@ -133,39 +139,45 @@ def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> Bound
 
 
 def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
-    nearest = "other0.seen" in names
-    if n_agents < 2 and not nearest:
+    nearest_only = "other0.seen" in names  # an agent sees not all others, but those who come nearest
+    if n_agents < 2 and not nearest_only:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
-    # `other0.seen` says that not all others are told, but those who come nearest.
-    told = sum(bool(re.fullmatch(r"other\d+\.seen", name)) for name in names) if nearest else n_agents - 1
-    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(told)]
-    if all(a in names and b in names for a, b in relative):
-        index = np.array([[names.index(a), names.index(b)] for a, b in relative])  # (N-1, 2)
+    others = n_agents - 1
+    if nearest_only:
+        others = sum(bool(re.fullmatch(r"other\d+\.seen", name)) for name in names)
+    offsets = _offsets(names, n_agents, others)
 
-        def offsets(x: Array) -> Array:
-            return x[..., index]  # (..., N, N-1, 2)
-    else:
-        absolute = [(f"agent{j}.x", f"agent{j}.y") for j in range(n_agents)]
-        wanted = [n for pair in relative for n in pair]
-        for name in [n for pair in absolute for n in pair]:
-            if name not in names:
-                missing = next(n for n in wanted if n not in names)
-                raise _missing("Separation", missing, names)
-        index = np.array([[names.index(a), names.index(b)] for a, b in absolute])  # (N, 2)
-        rows, columns = np.nonzero(~np.eye(n_agents, dtype=bool))
-
-        def offsets(x: Array) -> Array:
-            p = x[..., index]  # (..., N, N, 2): every agent's copy of all positions
-            own = p[..., np.arange(n_agents), np.arange(n_agents), :]
-            gap = p - own[..., None, :]
-            return gap[..., rows, columns, :].reshape(*gap.shape[:-2], n_agents - 1, 2)
-
-    def clearance(x: Array) -> Array:
+    def clearance(x: Numbers) -> Array:
         squared = (offsets(x) ** 2).sum(-1)
         distance = jnp.sqrt(jnp.maximum(squared, 1e-12))
         return least([distance[..., j] for j in range(distance.shape[-1])]) - hazard.radius
 
     return BoundHazard(hazard, clearance, hazard.safe_margin)
+
+
+def _offsets(names: tuple[str, ...], n_agents: int, others: int) -> Callable[[Numbers], Numbers]:
+    """A function from features (..., N, D) to the places of others relative to an agent (..., N, others, 2), where
+    features hold these or everybody's places."""
+    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(others)]
+    lacking = [name for pair in relative for name in pair if name not in names]
+    if not lacking:
+        index = np.array([[names.index(x), names.index(y)] for x, y in relative])  # (others, 2)
+        return lambda x: x[..., index]
+
+    absolute = [(f"agent{j}.x", f"agent{j}.y") for j in range(n_agents)]
+    if any(name not in names for pair in absolute for name in pair):
+        raise _missing("Separation", lacking[0], names)
+    index = np.array([[names.index(x), names.index(y)] for x, y in absolute])  # (N, 2)
+    agents = np.arange(n_agents)
+    rows, columns = np.nonzero(~np.eye(n_agents, dtype=bool))
+
+    def offsets(x: Numbers) -> Numbers:
+        places = x[..., index]  # (..., N, N, 2): every agent's copy of all positions
+        own = places[..., agents, agents, :]
+        gap = places - own[..., None, :]
+        return gap[..., rows, columns, :].reshape(*gap.shape[:-2], n_agents - 1, 2)
+
+    return offsets
 
 
 def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
@@ -174,7 +186,7 @@ def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
             raise _missing("SpeedLimit", name, names)
     index = np.array([names.index(n) for n in hazard.features])
 
-    def speed(x: Array) -> Array:
+    def speed(x: Numbers) -> Array:
         return jnp.sqrt(jnp.maximum((x[..., index] ** 2).sum(-1), 1e-12))
 
     margin = 0.2 * hazard.limit if hazard.safe_margin is None else hazard.safe_margin
@@ -192,12 +204,17 @@ def reads(hazard: Hazard, n_agents: int, names: tuple[str, ...]) -> tuple[str, .
     return ()
 
 
+def _is_size(value: object) -> bool:
+    """Whether it is a finite number, 0 or more."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value < float("inf")
+
+
 def _missing(kind: str, name: str, names: tuple[str, ...]) -> UserError:
     near = unknown("feature", name, names)
     return UserError(f"{kind} reads the feature '{name}', which this data does not have: name it in the card. {near}")
 
 
-def to_dict(hazard: Hazard) -> dict:
+def to_dict(hazard: Hazard) -> dict[str, Any]:
     """JSON form of a hazard, equal to what is read back from a file: lists, no tuples."""
     if isinstance(hazard, All):
         return {"kind": "All", "hazards": [to_dict(h) for h in hazard.hazards]}
@@ -205,10 +222,10 @@ def to_dict(hazard: Hazard) -> dict:
     return {"kind": type(hazard).__name__, **fields}
 
 
-def from_dict(data: dict) -> Hazard:
+def from_dict(data: Mapping[str, Any]) -> Hazard:
     """Inverse of `to_dict`; an unknown kind or field is refused."""
     kinds = {"Separation": Separation, "SpeedLimit": SpeedLimit, "CostColumn": CostColumn, "All": All}
-    data = dict(data)
+    data = dict(data)  # a TypeError where it is no mapping
     kind = data.pop("kind", "")
     if kind not in kinds:
         raise unknown("hazard", str(kind), kinds)
@@ -223,7 +240,6 @@ def from_dict(data: dict) -> Hazard:
             raise UserError(f"Hazard {kind} needs a value of '{name}'; add it to the card.")
     for name in ("radius", "limit", "safe_margin"):
         value = data.get(name)
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if value is not None and not (number and 0 <= value < float("inf")):
+        if value is not None and not _is_size(value):
             raise UserError(f"Hazard {kind} has {name}={value!r}; it must be a number, 0 or more, and finite.")
     return kinds[kind](**{k: tuple(v) if isinstance(v, list) else v for k, v in data.items()})

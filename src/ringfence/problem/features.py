@@ -11,9 +11,9 @@ exact, differentiable and linear in the number of entries. Three views exist, be
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +23,7 @@ from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
+X = TypeVar("X", np.ndarray, Array)
 VIEWS = ("pruned", "centralized", "decentralized")
 
 
@@ -43,7 +44,7 @@ class FeatureMap:
     joint: bool = False  # what comes next depends on everybody's action, which is known
     solitary: bool = False  # what follows does so from the agent's own movement alone
     guessing: bool = False  # what comes next depends on what others see and do, which has to be guessed
-    dt: float | None = None  # s, of a solitary map: the step that velocities are foreseen by
+    dt: float | None = None  # s, of a solitary map: the step that velocities are predicted by
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
 
@@ -51,19 +52,26 @@ class FeatureMap:
     def reads_state(self) -> bool:
         return self.source == "state"
 
-    def __call__(self, observations: Array, state: Array | None) -> Array:
-        """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out."""
-        taken = self.minus >= 0
+    def __call__(self, observations: X | None, state: X | None) -> X:
+        """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out. Only the
+        `source` is read."""
         if self.source == "state":
-            if state is None:
-                raise UserError(
-                    f"View '{self.view}' needs the global state, which this data does not have; "
-                    "store it or use view='decentralized'."
-                )
-            entries = state[..., self.plus]
-            return entries - state[..., np.maximum(self.minus, 0)] * taken if taken.any() else entries
+            return self._of_state(state)
+        assert observations is not None, "a map of observations is given some"
         rows = np.arange(self.plus.shape[0])[:, None]
         return observations[..., rows, self.plus]
+
+    def _of_state(self, state: X | None) -> X:
+        if state is None:
+            raise UserError(
+                f"View '{self.view}' needs the global state, which this data does not have; "
+                "store it or use view='decentralized'."
+            )
+        entries = state[..., self.plus]
+        taken = self.minus >= 0
+        if not taken.any():
+            return entries
+        return entries - state[..., np.maximum(self.minus, 0)] * taken
 
     def agreed(self, plan: Array, history: int = 0) -> Array:
         """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
@@ -98,19 +106,29 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     return found
 
 
-def translation(wanted: FeatureMap, told: FeatureMap) -> np.ndarray | None:
-    """(N, D') where a view holds the entries of another one, so that what is foreseen in it can be read in the other;
-    None where it does not hold them all."""
+def translation(wanted: FeatureMap, given: FeatureMap) -> np.ndarray | None:
+    """(N, D') where the `given` view holds the entries of the `wanted` one, so that what is predicted in it can be read
+    in the other; None where it does not hold them all."""
     n = wanted.plus.shape[0]
-    if wanted.origin is not None and told.origin is not None:
-        at = [{source: d for d, source in enumerate(row.tolist())} for row in told.origin]
-        if all(source in at[i] for i, row in enumerate(wanted.origin.tolist()) for source in row):
-            return np.array([[at[i][source] for source in row] for i, row in enumerate(wanted.origin.tolist())])
+    if wanted.origin is not None and given.origin is not None:
+        rows = zip(wanted.origin.tolist(), given.origin.tolist(), strict=True)
+        found = [_places(entries, within) for entries, within in rows]
+        if any(row is None for row in found):
+            return None
+        return np.array(found)
+    if "centralized" not in (wanted.view, given.view):
+        places = _places(wanted.names, given.names)
+        if places is not None:
+            return np.tile(places, (n, 1))
+    return np.tile(np.arange(len(given.names)), (n, 1)) if wanted.names == given.names else None
+
+
+def _places(wanted: Sequence[Hashable], given: Sequence[Hashable]) -> list[int] | None:
+    """Where each of the wanted entries stands among the given ones; None where one is missing."""
+    at = {entry: d for d, entry in enumerate(given)}
+    if any(entry not in at for entry in wanted):
         return None
-    names = {name: d for d, name in enumerate(told.names)}
-    if wanted.view != "centralized" and told.view != "centralized" and all(x in names for x in wanted.names):
-        return np.tile([names[x] for x in wanted.names], (n, 1))
-    return np.tile(np.arange(len(names)), (n, 1)) if wanted.names == told.names else None
+    return [at[entry] for entry in wanted]
 
 
 def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
@@ -124,18 +142,20 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
 def coasting(map: FeatureMap, dt: float) -> FeatureMap:
     """A map of agents who know where they are by their speed alone: everything named `goal.dx`, `obstacle0.dx` moves
     by `own.vx` in a step of `dt` seconds, and `other0.dx`, `other0.dvx` as if that other kept its velocity. So what is
-    foreseen of an agent is its own velocity, whoever the others are and however many; what else is told of things
+    predicted of an agent is its own velocity, whoever the others are and however many; what else is told of things
     (`obstacle0.radius`) stays."""
     names = {name: d for d, name in enumerate(map.names)}
     axes = [c for c in "xyz" if f"own.v{c}" in names]
     rules = []  # entry of the place, entry of the relative velocity or -1, entry of the own velocity
     for name, d in names.items():
         match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
-        if match and match[2] in axes:
-            rules.append((d, names.get(f"{match[1]}.dv{match[2]}", -1), names[f"own.v{match[2]}"]))
+        if match is None or match[2] not in axes:
+            continue
+        thing, axis = match.groups()
+        rules.append((d, names.get(f"{thing}.dv{axis}", -1), names[f"own.v{axis}"]))
     if not rules:
         return map
-    moved = {d for place, speed, _ in rules for d in (place, speed) if d >= 0}
+    moved = {place for place, _, _ in rules} | {speed for _, speed, _ in rules if speed >= 0}
     stays = {d for name, d in names.items() if d not in moved and not name.startswith("own.")}
     follows = tuple(sorted(moved | stays))
     own = tuple(d for d in range(len(map.names)) if d not in follows)
@@ -159,19 +179,20 @@ def solitary(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
 
 def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities."""
-    place, mine = rules[:, 0], rules[:, 2]
-    relative = rules[:, 1] >= 0
+    place, speed, mine = rules.T
+    relative = speed >= 0
 
     def agree(x: Array) -> Array:
-        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        start = x[..., :1, :, :]
+        later = x[..., 1:, :, :]
         steps = later.shape[-3]
         own = later[..., mine]
-        theirs = jnp.where(relative, start[..., rules[:, 1]] + start[..., mine], 0.0)  # their velocity, which they keep
+        theirs = jnp.where(relative, start[..., speed] + start[..., mine], 0.0)  # their velocity, which they keep
         count = jnp.arange(1, steps + 1, dtype=x.dtype)[:, None, None]
         later = later.at[..., stays].set(start[..., stays])
         later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, axis=-3)))
         if relative.any():
-            later = later.at[..., rules[relative, 1]].set((theirs - own)[..., relative])
+            later = later.at[..., speed[relative]].set((theirs - own)[..., relative])
         return jnp.concatenate([start, later], -3)
 
     return agree
@@ -183,7 +204,8 @@ def alone(map: FeatureMap) -> FeatureMap:
     whose actions it does not know, and guessing them helps no guard there."""
     if map.solitary:
         return map
-    how = {d: (own, j) for d, (own, j) in derived(map.names, map.plus.shape[0]).items() if d in map.follows and j < 0}
+    rules = derived(map.names, map.plus.shape[0])
+    how = {d: rule for d, rule in rules.items() if d in map.follows and rule[1] < 0}  # what stands still
     guessing = map.plus.shape[0] > 1 and not map.body
     return following(replace(map, own=None, reconcile=None, follows=(), joint=False, guessing=guessing), how)
 
@@ -195,13 +217,15 @@ def _reconcile_relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Ar
     Agents execute their own part of a plan, so danger and value have to be judged on that, not on what they imagine
     of one another; and a gradient on the result moves bodies, not images of them.
     """
-    entries, sources = np.array(list(how)), np.array([own for own, _ in how.values()])
-    about = np.array([j for _, j in how.values()])
+    entries = np.array(list(how))
+    sources = np.array([own for own, _ in how.values()])
+    about = np.array([other for _, other in how.values()])
     moving = about >= 0
     whose = others(n)[:, about[moving]] if moving.any() else np.zeros((n, 0), int)  # (N, entries about others)
 
     def agree(x: Array) -> Array:
-        start, later = x[..., :1, :, :], x[..., 1:, :, :]
+        start = x[..., :1, :, :]
+        later = x[..., 1:, :, :]
         change = later[..., sources] - start[..., sources]
         follow = start[..., entries] - change
         if moving.any():
@@ -235,101 +259,146 @@ def from_data(
         raise unknown("view", view, VIEWS)
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
-    m, n, o = observations.shape
-    own = [observations[:, :, d] for d in range(o)]
-    shared = [] if state is None else [np.broadcast_to(state[:, d : d + 1], (m, n)) for d in range(state.shape[1])]
-    repeated = set() if state is None or view != "pruned" else _told_twice(observations, state, set(keep), state_names)
-    if view == "decentralized" or state is None:
-        columns, names = own, observation_names
-    elif view == "centralized":
-        columns, names = shared, state_names
-    else:
-        columns, names = own + shared, observation_names + state_names
-    kept: list[int] = []
-    for d, column in enumerate(columns):
-        if view == "pruned" and d - o in repeated:
-            continue
-        if not _constant(column) and not any(_same(column, columns[e]) for e in kept):
-            kept.append(d)
-    if not kept:
-        raise UserError("Every observation entry is constant, so there is nothing to plan over; check the store.")
-    if view == "pruned" and state is not None:
-        # One index table needs one source: observations, then the state appended to each of them.
-        kind, source = (_Joint if max(kept) >= o else FeatureMap), "observations"
-    else:
-        kind, source = FeatureMap, "state" if view == "centralized" else "observations"
-    table = np.tile(np.array(kept), (n, 1))
-    plain = kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
+    plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
     if view == "centralized":
         return plain
     if alike and not any(f"own.{c}" in plain.names for c in "xyz"):
-        dt = dt or _step_of(plain, observations, first_rows)
+        dt = dt or _step_of(plain, _logged_steps(plain, observations, None, first_rows))
         if dt is not None:
             return coasting(plain, dt)
-    return following(plain, _confirmed(plain, observations, state, first_rows))
+    return following(plain, _confirmed(plain, _logged_steps(plain, observations, state, first_rows)))
 
 
-def _confirmed(map: FeatureMap, observations, state, first_rows, steps: int = 4000) -> dict[int, tuple[int, int]]:
-    """Those of the `derived` entries that logged steps confirm: nine in ten are foreseen to a twentieth of their
-    change."""
-    how = derived(map.names, map.plus.shape[0])
-    if not how or len(observations) < 3:
-        return {}
-    before = np.unique(np.linspace(0, len(observations) - 2, steps).astype(int))
-    if first_rows is not None:
-        before = before[~np.isin(before + 1, first_rows)]
-    now, then = (map(observations[k], None if state is None else state[k]) for k in (before, before + 1))
-    pair = jnp.asarray(np.stack([now, then], 1), jnp.float32)
-    foreseen = np.asarray(_reconcile_relative(how, map.plus.shape[0])(pair))[:, 1]
-    good = {}
-    for d, rule in how.items():
-        error, change = (np.quantile(np.abs(x[..., d]), 0.9) for x in (foreseen - then, then - now))
-        if error <= 0.05 * change + 1e-5:
-            good[d] = rule
-    return good
+def _pruned_map(
+    view: str,
+    observations: np.ndarray,
+    state: np.ndarray | None,
+    observation_names: tuple[str, ...],
+    state_names: tuple[str, ...],
+    keep: set[str],
+) -> FeatureMap:
+    """A map of the entries that tell something new."""
+    m, n, width = observations.shape
+    own = [observations[:, :, d] for d in range(width)]
+    shared = [] if state is None else [np.broadcast_to(state[:, d : d + 1], (m, n)) for d in range(state.shape[1])]
+    known: set[int] = set()
+    if view == "centralized":
+        columns, names = shared, state_names
+    elif view == "decentralized" or state is None:
+        columns, names = own, observation_names
+    else:
+        columns, names = own + shared, observation_names + state_names
+        known = {width + d for d in _observed_too(observations, state, keep, state_names)}
+    kept = _telling(columns, known)
+    if not kept:
+        raise UserError("Every observation entry is constant, so there is nothing to plan over; check the store.")
+    table = np.tile(np.array(kept), (n, 1))
+    # One index table needs one source: of a pruned view, observations with the state appended to each of them.
+    joins = view == "pruned" and state is not None and max(kept) >= width
+    kind = _Joint if joins else FeatureMap
+    source: Source = "state" if view == "centralized" else "observations"
+    return kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
 
 
-def _step_of(map: FeatureMap, observations, first_rows, steps: int = 4000) -> float | None:
-    """s between rows, of agents who know velocities and not places: what stands still (`goal.dx`) moves by −dt of
-    `own.vx`. None where no entry tells, or nine logged steps in ten do not agree to a twentieth of their change."""
-    names = {name: d for d, name in enumerate(map.names)}
+def _telling(columns: list[np.ndarray], known: set[int]) -> list[int]:
+    """The columns that vary, are not `known` and repeat no earlier one."""
+    kept: list[int] = []
+    for d, column in enumerate(columns):
+        if d in known or _constant(column):
+            continue
+        if not any(_same(column, columns[earlier]) for earlier in kept):
+            kept.append(d)
+    return kept
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Features (M, N, D) before and after some logged steps."""
+
+    before: np.ndarray
+    after: np.ndarray
+
+
+def _logged_steps(
+    map: FeatureMap,
+    observations: np.ndarray,
+    state: np.ndarray | None,
+    first_rows: np.ndarray | None,
+    steps: int = 4000,
+) -> _Steps | None:
+    """Some of the logged steps, evenly spread; None where there are too few."""
     if len(observations) < 3:
         return None
     before = np.unique(np.linspace(0, len(observations) - 2, steps).astype(int))
     if first_rows is not None:
         before = before[~np.isin(before + 1, first_rows)]
-    now, then = (np.asarray(map(observations[k], None), np.float64) for k in (before, before + 1))
+    start, end = (map(observations[rows], None if state is None else state[rows]) for rows in (before, before + 1))
+    return _Steps(start, end)
+
+
+def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, int]]:
+    """Those of the `derived` entries that logged steps confirm."""
+    how = derived(map.names, map.plus.shape[0])
+    if not how or steps is None:
+        return {}
+    pair = jnp.asarray(np.stack([steps.before, steps.after], 1), jnp.float32)
+    predicted = np.asarray(_reconcile_relative(how, map.plus.shape[0])(pair))[:, 1]
+    error = predicted - steps.after
+    change = steps.after - steps.before
+    return {d: rule for d, rule in how.items() if _follows(error[..., d], change[..., d])}
+
+
+def _follows(error: np.ndarray, change: np.ndarray) -> bool:
+    """Whether nine in ten are predicted to a twentieth of their change."""
+    return bool(np.quantile(np.abs(error), 0.9) <= 0.05 * np.quantile(np.abs(change), 0.9) + 1e-5)
+
+
+def _step_of(map: FeatureMap, steps: _Steps | None) -> float | None:
+    """s between rows, of agents who know velocities and not places: what stands still (`goal.dx`) moves by −dt of
+    `own.vx`. None where no entry tells, or logged steps do not agree."""
+    if steps is None:
+        return None
+    names = {name: d for d, name in enumerate(map.names)}
+    before = steps.before.astype(np.float64)
+    after = steps.after.astype(np.float64)
     found = []
     for name, d in names.items():
         match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
-        if match is None or f"own.v{match[2]}" not in names or f"{match[1]}.dv{match[2]}" in names:
+        if match is None:
             continue
-        moved, speed = (then - now)[..., d].ravel(), then[..., names[f"own.v{match[2]}"]].ravel()
+        thing, axis = match.groups()
+        if f"own.v{axis}" not in names or f"{thing}.dv{axis}" in names:
+            continue
+        moved = (after - before)[..., d].ravel()
+        speed = after[..., names[f"own.v{axis}"]].ravel()
         fast = np.abs(speed) > np.quantile(np.abs(speed), 0.5)
-        if not fast.any() or not np.abs(speed[fast]).min() > 0:
+        if not fast.any():
             continue
         dt = float(np.median(-moved[fast] / speed[fast]))
-        error, change = (np.quantile(np.abs(x), 0.9) for x in (moved + dt * speed, moved))
-        if dt > 0 and error <= 0.05 * change + 1e-5:
+        if dt > 0 and _follows(moved + dt * speed, moved):
             found.append(dt)
     return float(np.round(np.median(found), 6)) if found else None
 
 
-def _told_twice(observations, state, keep: set[str], names, rows: int = 4000) -> set[int]:
-    """Entries of the state (M, S) that are an affine function of the observation of each agent (M, N, O)."""
+def _observed_too(
+    observations: np.ndarray, state: np.ndarray, keep: set[str], names: tuple[str, ...], rows: int = 4000
+) -> set[int]:
+    """Entries of the state (M, S) that are an affine function of the observation of each agent (M, N, O), but for those
+    to `keep`."""
     some = np.unique(np.linspace(0, len(state) - 1, rows).astype(int))
+    if len(some) < 4 * observations.shape[2]:
+        return set()
     goal = np.asarray(state[some], np.float64)
     spread = goal.std(0)
     goal = goal - goal.mean(0)
-    told = np.ones(state.shape[1], bool)
-    if len(some) < 4 * observations.shape[2]:
-        return set()
+    known = np.ones(state.shape[1], bool)
     for i in range(observations.shape[1]):
         seen = np.asarray(observations[some, i], np.float64)
         seen = seen - seen.mean(0)
         left = goal - seen @ np.linalg.lstsq(seen, goal, rcond=None)[0]
-        told &= left.std(0) <= 1e-4 * spread
-    return {int(d) for d in np.flatnonzero(told & (spread > 0)) if not (names and names[d] in keep)}
+        known &= left.std(0) <= 1e-4 * spread
+    entries = np.flatnonzero(known & (spread > 0)).tolist()
+    return {d for d in entries if not (names and names[d] in keep)}
 
 
 def _constant(column: np.ndarray, rows: int = 10_000) -> bool:
@@ -350,31 +419,36 @@ class _Joint(FeatureMap):
     def reads_state(self) -> bool:
         return True
 
-    def __call__(self, observations: Array, state: Array | None) -> Array:
+    def __call__(self, observations: X | None, state: X | None) -> X:
         if state is None:
             raise UserError("This view was fitted with a global state; pass it when acting.")
-        o, index = observations.shape[-1], self.plus[0]
-        own = observations[..., index[index < o]]
-        shared = state[..., None, index[index >= o] - o]
+        assert observations is not None, "a map of observations is given some"
+        width = observations.shape[-1]
+        index = self.plus[0]
+        own = observations[..., index[index < width]]
+        shared = state[..., None, index[index >= width] - width]
         shape = (*own.shape[:-1], shared.shape[-1])
-        xp = np if isinstance(own, np.ndarray) else jnp
+        xp: Any = np if isinstance(own, np.ndarray) else jnp
         return xp.concatenate([own, xp.broadcast_to(shared, shape)], -1)
 
 
-def from_dict(data: dict) -> FeatureMap:
+def from_dict(data: Mapping[str, Any]) -> FeatureMap:
     """The map that a run's config.json describes."""
-    rows, width = {len(data["plus"]), len(data["minus"])}, {len(row) for row in (*data["plus"], *data["minus"])}
-    if len(rows) > 1 or width != {len(data["names"])}:
+    plus = data["plus"]
+    minus = data["minus"]
+    widths = {len(row) for row in (*plus, *minus)}
+    if len(plus) != len(minus) or widths != {len(data["names"])}:
         raise UserError("The run's feature map is damaged: its rows are not of one length; train the run again.")
     kind = _Joint if data["joint"] else FeatureMap
-    map = kind(data["view"], tuple(data["names"]), data["source"], np.array(data["plus"]), np.array(data["minus"]))
+    map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
     if data.get("dt") is not None:
         return coasting(map, data["dt"])
     kept = set(data.get("follows", ()))
-    return following(map, {d: rule for d, rule in derived(map.names, map.plus.shape[0]).items() if d in kept})
+    rules = derived(map.names, map.plus.shape[0])
+    return following(map, {d: rule for d, rule in rules.items() if d in kept})
 
 
-def to_dict(map: FeatureMap) -> dict:
+def to_dict(map: FeatureMap) -> dict[str, Any]:
     """JSON form of a map."""
     return {
         "view": map.view,

@@ -1,6 +1,6 @@
-"""A team of agents who are alike and see for themselves is so many teams of one.
+"""A team of homogeneous agents that see for themselves is so many teams of one.
 
-What is learned of one of them holds for all, so logs are taken apart into each agent's own (`EpisodeStore.apart`),
+What is learned of one of them holds for all. So logs are split into each agent's own (`EpisodeStore.apart`),
 every algorithm, World and guard works on teams of one, and one checkpoint plays any number of agents, at a cost per
 agent that does not grow with the team.
 """
@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from ringfence.problem.features import FeatureMap
+from ringfence.problem.features import FeatureMap, X
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
 
@@ -26,20 +26,23 @@ class Each(eqx.Module):
         return self.one.start(batch * self.agents)
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
-        """observations (B, N, O) -> actions (B, N, A); what is told of one agent is told of the team if it is of
-        any."""
+        """observations (B, N, O) -> actions (B, N, A); a flag of one agent is one of its team."""
         memory, step = self.one.act(memory, apart(observations), None, key)
-        return memory, together(step, observations.shape[:2])
+        batch, agents = observations.shape[:2]
+        return memory, together(step, (batch, agents))
 
     def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
         """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
         if not hasattr(self.one, "hear"):
             return memory
 
-        def each(cost: Array) -> Array:
-            return (cost if cost.ndim == 2 else jnp.repeat(cost[:, None], self.agents, 1)).reshape(-1)
+        def own(cost: Array) -> Array:
+            own = cost if cost.ndim == 2 else jnp.repeat(cost[:, None], self.agents, 1)
+            return own.reshape(-1)
 
-        return self.one.hear(memory, {k: each(c) for k, c in cost.items()} if isinstance(cost, dict) else each(cost))
+        if isinstance(cost, dict):
+            return self.one.hear(memory, {name: own(part) for name, part in cost.items()})
+        return self.one.hear(memory, own(cost))
 
 
 def together(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
@@ -50,11 +53,14 @@ def together(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     return PolicyStep(step.action.reshape(*shape, -1), info)
 
 
-def look(map: FeatureMap, alike: bool, observations: Array, state: Array | None) -> Array:
-    """Features (B, N, D) of a team, or (B N, 1, D) of agents who are alike."""
-    return map(apart(observations), None) if alike else map(observations, state)
+def look(map: FeatureMap, alike: bool, observations: X | None, state: X | None) -> X:
+    """Features (B, N, D) of a team, or (B N, 1, D) of homogeneous agents."""
+    if not alike:
+        return map(observations, state)
+    assert observations is not None, "homogeneous agents see for themselves"
+    return map(apart(observations), None)
 
 
-def apart(x: Array) -> Array:
+def apart(x: X) -> X:
     """Teams (B, N, ...) as teams of one, (B N, 1, ...)."""
     return x.reshape(-1, 1, *x.shape[2:])

@@ -19,44 +19,86 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from ringfence.datasets.registry import QUANTILE_LIMITS, ROBOT_COST_LIMIT
 from ringfence.envs import SafeMuJoCo, mujoco
-from ringfence.envs.mujoco import Outcome
+from ringfence.envs.base import Outcome
+from ringfence.envs.mujoco import Parts
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 
-ROBOTS = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
+ROBOTS: dict[str, Parts] = {SafeMuJoCo(parts).name: parts for parts in mujoco.ROBOTS}
 OLD_OBSERVATION = {"2x3": 13, "2x4": 54, "4x2": 33}
 TIERS = ("good", "medium", "poor", "expert", "replay")
 REPLAYED = 256  # steps that are replayed to find the order of actions
 AGREES = 0.05  # median over replayed steps of the largest error in the state; the wrong order has errors of 1 to 10
-STRAY, STRAYS = 1.0, 0.05  # a replayed step that misses by more is a stray; the share of them that is allowed
+STRAY = 1.0  # a replayed step that misses by more is a stray
+STRAYS = 0.05  # the share of them that is allowed
 SPEED_AGREES = 0.1  # m/s, median over replayed steps of the error of the speed that the reward tells
 Limit = float | Literal["quantile"] | None
+VAULT = ("actions", "rewards", "terminals", "truncations", "infos.state")
 RECORDED_WITH = "multiagent_mujoco 1.1, MuJoCo 2.1 (OG-MARL's word; the files do not say)"
 GYMNASIUM_FORCES = 78  # contact forces in the states of gymnasium-robotics' Ant, which leaves out the world's six
 CONTACT = 5e-4  # of the squared contact forces, which some versions of the Ant charge
 
 
-@dataclass
+@dataclass(frozen=True)
 class Log:
     """A flat recording; T steps, one robot."""
 
     where: str
-    state: np.ndarray | None  # (T, S) in the layout of SafeMuJoCo
-    contact: np.ndarray | None  # (T, F) contact forces, where the states hold them
-    observations: np.ndarray | None  # (T, N, O), where there is no state
     actions: np.ndarray  # (T, N, A)
-    rewards: np.ndarray  # (T, N)
+    rewards: np.ndarray  # (T, N), or (T, 1) of the team
     last: np.ndarray  # (T,) bool: the step ended an episode
+
+
+@dataclass(frozen=True)
+class StateLog(Log):
+    """One that holds the simulator's states."""
+
+    state: np.ndarray  # (T, S) in the layout of SafeMuJoCo
+    contact: np.ndarray | None = None  # (T, F) contact forces, where the states hold them
+
+
+@dataclass(frozen=True)
+class ObservationLog(Log):
+    """One that holds observations alone."""
+
+    observations: np.ndarray  # (T, N, O)
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """What a recording is of."""
+
+    env: SafeMuJoCo  # under the data's limit
+    name: str  # of the task
+    protocol: str  # what the limit is
+
+
+@dataclass(frozen=True)
+class Steps:
+    """What a store is made of; T steps, E episodes."""
+
+    simulator: str  # that it was recorded with
+    observations: np.ndarray  # (T, N, O)
+    actions: np.ndarray  # (T, N, A)
+    rewards: np.ndarray  # (T,)
+    episode_ends: np.ndarray  # (E,)
+    final_observations: np.ndarray  # (E, N, O)
+    terminated: np.ndarray  # (E,) bool
+    speed: np.ndarray  # (T,) m/s
+    speed_names: tuple[str, ...]  # the entries whose norm the speed is
+    names: list[str]  # of an observation's entries
+    state: np.ndarray | None = None  # (T, S)
+    final_state: np.ndarray | None = None  # (E, S)
 
 
 def import_vault(
@@ -67,43 +109,56 @@ def import_vault(
     `speed_limit`: safety-gymnasium's (None), that of the tier's `-quantile` task ("quantile"), or any other (m/s).
     `tier`: a word for the data; the folder's name, where it is good, medium, poor, expert or replay.
     """
-    env, vault = _robot(task), Path(vault)
-    env, called, protocol = _limited(env, f"{task}-{_tier(vault, tier)}", speed_limit)
-    wanted = ("actions", "rewards", "terminals", "truncations", "infos.state")
-    arrays = _read_vault(vault, wanted)
+    vault = Path(vault)
+    data_set = _data_set(task, _tier(vault, tier), speed_limit)
+    env = data_set.env
     where = f"Vault '{vault}'"
-    for name in wanted:
+    arrays = _read_vault(vault, VAULT)
+    for name in VAULT:
         if name not in arrays:
             raise StoreError(
                 f"{where} holds no '{name}'; only recordings with actions, rewards and states can be read."
             )
     sequences, steps = arrays["actions"].shape[:2]
-    _shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
-    state = arrays["infos.state"]
-    state = state[:, :, 0] if state.ndim == 4 else state  # some copies repeat it for every agent
-    s = len(env.state_names)
-    known = {17} if not env.ant else {27, 105, 111}
-    if state.ndim != 3 or state.shape[-1] not in known:
-        raise StoreError(
-            f"{where} has states of {state.shape[-1]} entries; known layouts of {task} have "
-            f"{', '.join(str(k) for k in sorted(known))} (positions but the planar place, velocities, contact forces)."
-        )
+    _check_shape(where, "actions", arrays["actions"], (sequences, steps, env.n_agents, env.action_dim))
+    states = _vault_states(where, task, env, arrays["infos.state"])
+    width = len(env.state_names)
     for name in ("rewards", "terminals", "truncations"):  # of every agent, or of the team
         if arrays[name].ndim == 2:
             arrays[name] = np.repeat(arrays[name][..., None], env.n_agents, -1)
-        _shape(where, name, arrays[name], (sequences, steps, env.n_agents))
-    last = ((arrays["terminals"] > 0) | (arrays["truncations"] > 0)).any(-1)
-    open_ = int((~last[:, -1]).sum())
+        _check_shape(where, name, arrays[name], (sequences, steps, env.n_agents))
+    last = np.any((arrays["terminals"] > 0) | (arrays["truncations"] > 0), axis=-1)
+    unended = int((~last[:, -1]).sum())
     last[:, -1] = True  # nothing after a sequence's end belongs to it
-    flat = lambda x: x.reshape(sequences * steps, *x.shape[2:])  # noqa: E731
-    contact = flat(state[..., s:]) if state.shape[-1] > s else None
-    log = Log(
-        where, flat(state[..., :s]), contact, None, flat(arrays["actions"]), flat(arrays["rewards"]), last.ravel()
+
+    def flat(x: np.ndarray) -> np.ndarray:
+        return x.reshape(sequences * steps, *x.shape[2:])
+
+    log = StateLog(
+        where=where,
+        actions=flat(arrays["actions"]),
+        rewards=flat(arrays["rewards"]),
+        last=last.ravel(),
+        state=flat(states[..., :width]),
+        contact=flat(states[..., width:]) if states.shape[-1] > width else None,
     )
-    notes = (
-        [f"{open_} episodes at the end of a recording have no end of their own and count as cut off"] if open_ else []
-    )
-    return _store(log, env, called, protocol, f"imported from an OG-MARL Vault, '{vault}'", notes)
+    notes = []
+    if unended:
+        notes.append(f"{unended} episodes at the end of a recording have no end of their own and count as cut off")
+    return _store(log, data_set, f"imported from an OG-MARL Vault, '{vault}'", notes)
+
+
+def _vault_states(where: str, task: str, env: SafeMuJoCo, states: np.ndarray) -> np.ndarray:
+    """(B, T, S and contact forces); a layout that nobody knows is refused."""
+    if states.ndim == 4:
+        states = states[:, :, 0]  # some copies repeat them for every agent
+    known = (27, 105, 111) if env.ant else (17,)
+    if states.ndim != 3 or states.shape[-1] not in known:
+        raise StoreError(
+            f"{where} has states of {states.shape[-1]} entries; known layouts of {task} have "
+            f"{', '.join(map(str, known))} (positions but the planar place, velocities, contact forces)."
+        )
+    return states
 
 
 def import_madiff(
@@ -111,45 +166,57 @@ def import_madiff(
 ) -> EpisodeStore:
     """The store of MADIFF's `obs.npy` (T, N, N+O), `actions.npy`, `rewards.npy`, `path_lengths.npy`; `speed_limit` and
     `tier` as of `import_vault`."""
-    env, directory = _robot(task), Path(directory)
-    env, called, protocol = _limited(env, f"{task}-{_tier(directory, tier)}", speed_limit)
+    directory = Path(directory)
+    data_set = _data_set(task, _tier(directory, tier), speed_limit)
+    env = data_set.env
+    n = env.n_agents
     where = f"'{directory}'"
-    obs, actions, rewards, lengths = (_load(directory, f) for f in ("obs", "actions", "rewards", "path_lengths"))
-    n, wide = env.n_agents, OLD_OBSERVATION[env.parts]
-    if lengths.ndim != 1 or lengths.dtype.kind == "b" or not ((lengths >= 1) & (lengths % 1 == 0)).all():
+    observations = _load(directory, "obs")
+    actions = _load(directory, "actions")
+    rewards = _load(directory, "rewards")
+    lengths = _load(directory, "path_lengths")
+    whole = lengths.dtype.kind != "b" and ((lengths >= 1) & (lengths % 1 == 0)).all()
+    if lengths.ndim != 1 or not whole:
         raise StoreError(f"{where}: path_lengths.npy must hold the steps of every episode, whole numbers of 1 or more.")
     lengths = lengths.astype(np.int64)
     steps = int(lengths.sum())
-    _shape(where, "obs.npy", obs, (steps, n, n + wide))
-    _shape(where, "actions.npy", actions, (steps, n, env.action_dim))
+    _check_shape(where, "obs.npy", observations, (steps, n, n + OLD_OBSERVATION[env.parts]))
+    _check_shape(where, "actions.npy", actions, (steps, n, env.action_dim))
     if rewards.shape in ((steps,), (steps, 1), (steps, n, 1)):  # of the team, or with an axis too many
         rewards = rewards.reshape(steps, -1)
-    _shape(where, "rewards.npy", rewards, (steps, rewards.shape[-1] if rewards.shape[-1:] == (1,) else n))
-    _finite(where, {"obs.npy": obs, "actions.npy": actions, "rewards.npy": rewards})
-    if not (obs[:, :, :n] == np.eye(n)).all():
+    of_team = rewards.shape[-1:] == (1,)
+    _check_shape(where, "rewards.npy", rewards, (steps, 1 if of_team else n))
+    _check_finite(where, {"obs.npy": observations, "actions.npy": actions, "rewards.npy": rewards})
+    if not (observations[:, :, :n] == np.eye(n)).all():
         raise StoreError(
             f"{where}: obs.npy does not begin with every agent's number in one-hot form; it is not MADIFF's."
         )
+    observations = observations[:, :, n:]
     last = np.zeros(steps, bool)
     last[np.cumsum(lengths) - 1] = True
-    obs = obs[:, :, n:]
-    state = _cheetah_state(where, obs) if not env.ant else None
-    log = Log(where, state, None, None if state is not None else obs, actions, rewards, last)
-    return _store(log, env, called, protocol, f"imported from MADIFF's arrays in {where}", [])
+    provenance = f"imported from MADIFF's arrays in {where}"
+    if env.ant:
+        return _store(ObservationLog(where, actions, rewards, last, observations), data_set, provenance, [])
+    state = _cheetah_state(where, observations)
+    return _store(StateLog(where, actions, rewards, last, state), data_set, provenance, [])
 
 
-def _limited(env: SafeMuJoCo, name: str, speed_limit: Limit) -> tuple[SafeMuJoCo, str, str]:
-    """(the robot under its limit, the task's name, what the limit is): a name stands for one limit."""
+def _data_set(task: str, tier: str, speed_limit: Limit) -> DataSet:
+    """A robot's data of a tier under a limit: a name stands for one limit."""
+    if task not in ROBOTS:
+        raise unknown("robot", task, ROBOTS)
+    env = SafeMuJoCo(ROBOTS[task])
+    name = f"{task}-{tier}"
     if speed_limit is None:
-        return env, name, "native"
+        return DataSet(env, name, "native")
     if speed_limit == "quantile":
         if name not in QUANTILE_LIMITS:
             raise UserError(
                 f"There is no quantile limit for '{name}'; name the tier with --tier good, medium or poor, or pass "
                 "--speed-limit in m/s."
             )
-        return replace(env, speed_limit=QUANTILE_LIMITS[name]), f"{name}-quantile", "quantile"
-    return replace(env, speed_limit=float(speed_limit)), f"{name}-below-{speed_limit:g}", "own"
+        return DataSet(replace(env, speed_limit=QUANTILE_LIMITS[name]), f"{name}-quantile", "quantile")
+    return DataSet(replace(env, speed_limit=float(speed_limit)), f"{name}-below-{speed_limit:g}", "own")
 
 
 def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
@@ -162,8 +229,14 @@ def _cheetah_state(where: str, obs: np.ndarray) -> np.ndarray:
     return np.column_stack([z, pitch, position, vx, vz, vpitch, velocity])
 
 
-def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str, notes: list[str]) -> EpisodeStore:
-    _finite(log.where, {k: getattr(log, k) for k in ("state", "contact", "observations", "actions", "rewards")})
+def _store(log: StateLog | ObservationLog, data_set: DataSet, provenance: str, notes: list[str]) -> EpisodeStore:
+    env = data_set.env
+    arrays: dict[str, np.ndarray | None] = {"actions": log.actions, "rewards": log.rewards}
+    if isinstance(log, StateLog):
+        arrays = {"state": log.state, "contact": log.contact} | arrays
+    else:
+        arrays = {"observations": log.observations} | arrays
+    _check_finite(log.where, arrays)
     if not log.last.any():
         raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
     ends = np.flatnonzero(log.last) + 1
@@ -179,29 +252,42 @@ def _store(log: Log, env: SafeMuJoCo, name: str, protocol: str, provenance: str,
     beyond = float((np.abs(log.actions[:total]) > 1 + 1e-3).mean())
     if beyond:
         notes.append(f"{100 * beyond:.2g} % of action entries are beyond ±1 and were clipped, as the robot does")
-    made = (_from_states if log.state is not None else _from_observations)(log, env, ends, notes)
-    short = int((lengths < env.episode_length).sum() - made["terminated"].sum())
+    if isinstance(log, StateLog):
+        steps = _from_states(log, env, ends, notes)
+        task = data_set.name
+    else:
+        steps = _from_observations(log, env, ends, notes)
+        task = f"{data_set.name}-observations"
+    short = int((lengths < env.episode_length).sum() - steps.terminated.sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
-    name += "" if log.state is not None else "-observations"
-    speed, seen = made.pop("speed"), made.pop("seen")
-    card = {
-        "task": name,
-        "simulator": made.pop("simulator"),
-        "provenance": provenance,
-        "agents": [f"agent{i}" for i in range(env.n_agents)],
-        "observation_names": made.pop("names"),
-        "state_names": list(env.state_names) if log.state is not None else [],
-        "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, seen)),
-        "episode_length": env.episode_length,
-        "warnings": notes,
-        "protocol": protocol,
-        **env.describe(speed, ROBOT_COST_LIMIT),
-    }
-    return EpisodeStore.from_steps(**made, costs=speed > env.limit, card=card)
+    return EpisodeStore.from_steps(
+        steps.observations,
+        steps.actions,
+        steps.rewards,
+        episode_ends=steps.episode_ends,
+        final_observations=steps.final_observations,
+        costs=steps.speed > env.limit,
+        state=steps.state,
+        final_state=steps.final_state,
+        terminated=steps.terminated,
+        card={
+            "task": task,
+            "simulator": steps.simulator,
+            "provenance": provenance,
+            "agents": [f"agent{i}" for i in range(env.n_agents)],
+            "observation_names": steps.names,
+            "state_names": list(env.state_names) if steps.state is not None else [],
+            "hazard": constraints.to_dict(constraints.SpeedLimit(env.limit, steps.speed_names)),
+            "episode_length": env.episode_length,
+            "warnings": notes,
+            "protocol": data_set.protocol,
+            **env.describe(steps.speed, ROBOT_COST_LIMIT),
+        },
+    )
 
 
-def _finite(where: str, arrays: dict[str, np.ndarray | None]) -> None:
+def _check_finite(where: str, arrays: dict[str, np.ndarray | None]) -> None:
     for name, x in arrays.items():
         if x is not None and not np.isfinite(x).all():
             row = int(np.argwhere(~np.isfinite(x).reshape(len(x), -1).all(1))[0, 0])
@@ -214,111 +300,145 @@ def _earned_by_running(env: SafeMuJoCo, rewards: np.ndarray, actions: np.ndarray
     return rewards + (0.5 * effort - 1.0 if env.ant else 0.1 * effort)
 
 
-def _forward_speed(log: Log, env: SafeMuJoCo, total: int, contact: bool = False) -> np.ndarray:
-    """(T,) vx of every step, from its reward. Contact forces are those after the step."""
-    rewards = log.rewards[:total].astype(np.float64).mean(-1)
-    vx = _earned_by_running(env, rewards, log.actions[:total].astype(np.float64))  # as recorded: what was charged
-    if contact:
-        after = np.append(log.contact[1:total], log.contact[total - 1 : total], 0)
+def _forward_speed(log: Log, env: SafeMuJoCo, total: int, contact: np.ndarray | None = None) -> np.ndarray:
+    """(T,) vx of every step, from its reward; `contact` (T', F): forces that it was charged for, those after the
+    step."""
+    vx = _earned_by_running(env, _team_rewards(log)[:total], log.actions[:total].astype(np.float64))
+    if contact is not None:
+        after = np.append(contact[1:total], contact[total - 1 : total], 0)
         vx += CONTACT * (np.clip(after, -1.0, 1.0) ** 2).sum(1)
     return vx
 
 
-def _from_states(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> dict:
-    """Arrays of a store whose episodes end with what the simulator says their last action led to."""
-    total, at = int(ends[-1]), ends - 1
+def _team_rewards(log: Log) -> np.ndarray:
+    """(T,) as recorded."""
+    return log.rewards.astype(np.float64).mean(-1)
+
+
+def _from_states(log: StateLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Steps:
+    """Episodes that end with what the simulator says their last action led to."""
+    total = int(ends[-1])
+    at = ends - 1
     actions = np.clip(log.actions[:total], -1.0, 1.0).astype(np.float64)
+    rewards = _team_rewards(log)[:total]
     inside = np.ones(total, bool)
     inside[at] = False
     order, vx = _replay(log, env, actions, np.flatnonzero(inside), notes)
     actions = actions[:, :, order]
-    outcome, final = _one_step(env, log.state[at], actions[at])
+    outcome, final_state = _one_step(env, log.state[at], actions[at])
+    falls = f", in which {int(outcome.terminated.sum())} of {len(ends)} episodes end with a fall" if env.ant else ""
     notes.append(
-        "what the last action of every episode led to is not recorded: it was replayed in the simulator"
-        + (f", in which {int(outcome.terminated.sum())} of {len(ends)} episodes end with a fall" if env.ant else "")
+        f"what the last action of every episode led to is not recorded: it was replayed in the simulator{falls}"
     )
-    # Gymnasium's version 5 does not pay the 1 for standing on the step that falls: its reward tells 1 m/s too little.
-    missing = outcome.reward - log.rewards[at].mean(-1)
-    unpaid = outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
+    unpaid = _unpaid_falls(outcome, rewards[at])
     vx[at[unpaid]] += 1.0
     if unpaid.any():
         notes.append(f"{int(unpaid.sum())} falls were not paid the 1 for standing; their speed is corrected")
-    state, final = log.state[:total].astype(np.float32), final.astype(np.float32)
-    speed, seen = np.abs(vx), ("torso.vx",)
+    state = log.state[:total].astype(np.float32)
+    final_state = final_state.astype(np.float32)
+    speed = np.abs(vx)
     if env.ant:
-        k = env.state_names.index("torso.vy")
-        after = np.append(state[1:, k], 0.0)
-        after[at] = final[:, k]
-        speed, seen = np.hypot(vx, (state[:, k] + after) / 2), ("torso.vx", "torso.vy")
+        sideways = env.state_names.index("torso.vy")
+        after = np.append(state[1:, sideways], 0.0)
+        after[at] = final_state[:, sideways]
+        speed = np.hypot(vx, (state[:, sideways] + after) / 2)
     newer = unpaid.any() or (log.contact is not None and log.contact.shape[1] == GYMNASIUM_FORCES)
-    return {
-        "simulator": "gymnasium-robotics, version not recorded" if newer else RECORDED_WITH,
-        "observations": state[:, env.observed],
-        "actions": actions,
-        "rewards": log.rewards[:total].astype(np.float64).mean(-1),
-        "episode_ends": ends,
-        "final_observations": final[:, env.observed],
-        "state": state,
-        "final_state": final,
-        "terminated": outcome.terminated,
-        "speed": speed,
-        "seen": seen,
-        "names": list(env.observation_names),
-    }
+    return Steps(
+        simulator="gymnasium-robotics, version not recorded" if newer else RECORDED_WITH,
+        observations=state[:, env.observed],
+        actions=actions,
+        rewards=rewards,
+        episode_ends=ends,
+        final_observations=final_state[:, env.observed],
+        terminated=outcome.terminated,
+        speed=speed,
+        speed_names=("torso.vx", "torso.vy") if env.ant else ("torso.vx",),
+        names=list(env.observation_names),
+        state=state,
+        final_state=final_state,
+    )
 
 
-def _from_observations(log: Log, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> dict:
-    """Arrays of a store without states; the last step of every episode is missing."""
+def _unpaid_falls(outcome: Outcome, rewards: np.ndarray) -> np.ndarray:
+    """(E,) bool. Gymnasium's version 5 does not pay the 1 for standing on the step that falls: its reward tells 1 m/s
+    too little."""
+    missing = outcome.reward - rewards
+    return outcome.terminated & (np.abs(missing - 1.0) < np.abs(missing))
+
+
+def _from_observations(log: ObservationLog, env: SafeMuJoCo, ends: np.ndarray, notes: list[str]) -> Steps:
+    """Episodes without states, the last step of each missing."""
     notes += [
         "the last step of every episode was dropped: what it led to is not recorded, and falls are not marked",
         "vy, height and orientation are in no observation and cannot be recovered: costs and hazard read |vx| "
         "alone, and the simulator cannot evaluate what is learned from this data",
         "without states nothing could be replayed: rewards and the order of actions are taken as recorded",
     ]
-    total, lengths = int(ends[-1]), np.diff(ends, prepend=0)
+    total = int(ends[-1])
+    lengths = np.diff(ends, prepend=0)
     keep = np.ones(total, bool)
     keep[ends - 1] = False
     if not keep.any():
         raise StoreError(f"{log.where} holds no episode of two steps or more.")
-    x = log.observations[:total].astype(np.float32)
-    return {
-        "simulator": RECORDED_WITH,
-        "observations": x[keep],
-        "actions": np.clip(log.actions[:total], -1.0, 1.0)[keep],
-        "rewards": log.rewards[:total].astype(np.float64).mean(-1)[keep],
-        "episode_ends": np.cumsum(lengths[lengths > 1] - 1),
-        "final_observations": x[ends[lengths > 1] - 1],
-        "terminated": np.zeros(int((lengths > 1).sum()), bool),
-        "speed": np.abs(_forward_speed(log, env, total))[keep],
-        "seen": ("torso.vx",),
-        "names": _old_names(x.shape[2], env),
-    }
+    long_enough = lengths > 1
+    observations = log.observations[:total].astype(np.float32)
+    return Steps(
+        simulator=RECORDED_WITH,
+        observations=observations[keep],
+        actions=np.clip(log.actions[:total], -1.0, 1.0)[keep],
+        rewards=_team_rewards(log)[:total][keep],
+        episode_ends=np.cumsum(lengths[long_enough] - 1),
+        final_observations=observations[ends[long_enough] - 1],
+        terminated=np.zeros(int(long_enough.sum()), bool),
+        speed=np.abs(_forward_speed(log, env, total))[keep],
+        speed_names=("torso.vx",),
+        names=_old_names(observations.shape[2], env),
+    )
 
 
 def _one_step(env: SafeMuJoCo, state: np.ndarray, actions: np.ndarray) -> tuple[Outcome, np.ndarray]:
     """What the simulator makes of actions (B, N, A) in states (B, S): its outcome and the next states."""
     sim = env.simulate(len(state))
-    planar, nq = (2, 15) if env.ant else (1, 9)
+    planar = 2 if env.ant else 1  # entries of the place, which states leave out
+    positions = (15 if env.ant else 9) - planar
     state = state.astype(np.float64)
-    sim.restore(np.concatenate([np.zeros((len(state), planar)), state[:, : nq - planar]], 1), state[:, nq - planar :])
+    place = np.zeros((len(state), planar))
+    sim.restore(np.concatenate([place, state[:, :positions]], 1), state[:, positions:])
     return sim.step(actions), sim.state()
 
 
 def _replay(
-    log: Log, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndarray, notes: list[str]
+    log: StateLog, env: SafeMuJoCo, actions: np.ndarray, steps: np.ndarray, notes: list[str]
 ) -> tuple[np.ndarray, np.ndarray]:
     """(order of an agent's action entries, vx (T,)), checked by replaying some of `steps` in the simulator."""
     if not len(steps):
         raise StoreError(f"{log.where} holds no episode of two steps or more.")
     steps = np.sort(np.random.default_rng(0).permutation(steps)[:REPLAYED])
-    forward, errors, earned = np.arange(env.action_dim), {}, {}
+    forward = np.arange(env.action_dim)
     orders = {"as recorded": forward, "reversed": forward[::-1]}
+    errors: dict[str, np.ndarray] = {}
+    rewards: dict[str, np.ndarray] = {}
     for name, order in orders.items():
         outcome, after = _one_step(env, log.state[steps], actions[steps][:, :, order])
         errors[name] = np.abs(after - log.state[steps + 1]).max(1)
-        earned[name] = outcome.reward
-    best, other = sorted(errors, key=lambda name: np.median(errors[name]))
-    miss, astray = float(np.median(errors[best])), errors[best] > STRAY
+        rewards[name] = outcome.reward
+    best, other = sorted(errors, key=lambda name: float(np.median(errors[name])))
+    _check_replay(log, steps, errors[best])
+    wanted = _earned_by_running(env, rewards[best], actions[steps])
+    vx, speed_note = _checked_speed(log, env, len(actions), steps, wanted)
+    astray = errors[best] > STRAY
+    notes.append(
+        f"actions are {best}: a replayed step misses by {np.median(errors[best]):.2g} in the median, in the other "
+        f"order by {np.median(errors[other]):.2g}; {100 * astray.mean():.2g} % miss by more than {STRAY:g}"
+    )
+    notes.append(speed_note)
+    return orders[best], vx
+
+
+def _check_replay(log: StateLog, steps: np.ndarray, errors: np.ndarray) -> None:
+    """Refuse states that the simulator does not reproduce: largest errors (K,) of replayed steps (K,)."""
+    miss = float(np.median(errors))
+    astray = errors > STRAY
     if miss > AGREES:
         raise StoreError(
             f"{log.where} is not this robot's: one step in the simulator misses the recorded state by "
@@ -330,25 +450,31 @@ def _replay(
             f"{STRAY:g} ({100 * STRAYS:.0f} % are allowed), the first of them step {steps[astray][0]}; its rows are "
             "not consecutive, so put them in order and mark the ends of episodes."
         )
-    wanted = _earned_by_running(env, earned[best], actions[steps])
-    told = {
-        c: _forward_speed(log, env, len(actions), c) for c in ((False, True) if log.contact is not None else (False,))
-    }
-    off = {c: float(np.median(np.abs(vx[steps] - wanted))) for c, vx in told.items()}
-    charged = min(off, key=off.get)
-    if off[charged] > SPEED_AGREES:
+
+
+def _checked_speed(
+    log: StateLog, env: SafeMuJoCo, total: int, steps: np.ndarray, wanted: np.ndarray
+) -> tuple[np.ndarray, str]:
+    """(vx (T,) from rewards, a note of how), with or without a charge for contact, whichever agrees better with that of
+    replayed steps: `wanted` (K,) of `steps` (K,)."""
+
+    def error(vx: np.ndarray) -> float:
+        return float(np.median(np.abs(vx[steps] - wanted)))
+
+    vx = _forward_speed(log, env, total)
+    how = ""
+    if log.contact is not None:
+        charged = _forward_speed(log, env, total, log.contact)
+        if error(charged) < error(vx):
+            vx = charged
+            how = ", contact forces charged"
+    off = error(vx)
+    if off > SPEED_AGREES:
         raise StoreError(
-            f"{log.where}: rewards are not this robot's, the speed that they tell is {off[charged]:.3g} m/s off in the "
+            f"{log.where}: rewards are not this robot's, the speed that they tell is {off:.3g} m/s off in the "
             f"median ({SPEED_AGREES} is allowed); undo any scaling or sharing out of rewards first."
         )
-    notes.append(
-        f"actions are {best}: a replayed step misses by {miss:.2g} in the median, in the other order by "
-        f"{np.median(errors[other]):.2g}; {100 * astray.mean():.2g} % miss by more than {STRAY:g}"
-    )
-    notes.append(
-        f"speeds follow from rewards, {off[charged]:.2g} m/s off in the median{', contact forces charged' * charged}"
-    )
-    return orders[best], told[charged]
+    return vx, f"speeds follow from rewards, {off:.2g} m/s off in the median{how}"
 
 
 def _old_names(width: int, env: SafeMuJoCo) -> list[str]:
@@ -357,20 +483,15 @@ def _old_names(width: int, env: SafeMuJoCo) -> list[str]:
     return [f"own{k}" for k in range(own)] + [f"near{k}.q" for k in range(near)] + ["torso.vx", "torso.x"]
 
 
-def _robot(task: str) -> SafeMuJoCo:
-    if task not in ROBOTS:
-        raise unknown("robot", task, ROBOTS)
-    return SafeMuJoCo(ROBOTS[task])
-
-
-def _tier(path: Path, told: str | None) -> str:
-    if told:
-        return told.lower() if told.lower() in TIERS else told
+def _tier(path: Path, given: str | None) -> str:
+    """The word for the data: the one that is given, or the folder's name."""
+    if given:
+        return given.lower() if given.lower() in TIERS else given
     name = path.resolve().name.lower()
     return name if name in TIERS else "imported"
 
 
-def _shape(where: str, name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:
+def _check_shape(where: str, name: str, array: np.ndarray, wanted: tuple[int, ...]) -> None:
     if array.shape != wanted:
         raise StoreError(
             f"{where}: {name} has shape {array.shape}, {wanted} is expected; known are halfcheetah_2x3 "
@@ -420,10 +541,12 @@ def _read_vault(vault: Path, wanted: Sequence[str]) -> dict[str, np.ndarray]:
                 f"The array '{name}' of '{vault}' is missing or damaged ({str(error)[:80]}); copy the Vault again."
             ) from error
 
-    def leaves(tree: dict, lead: str = "") -> list[str]:
-        return [
-            x for k, v in tree.items() for x in (leaves(v, f"{lead}{k}.") if isinstance(v, dict) else [f"{lead}{k}"])
-        ]
+    def leaves(tree: dict[str, Any], lead: str = "") -> Iterator[str]:
+        for name, part in tree.items():
+            if isinstance(part, dict):
+                yield from leaves(part, f"{lead}{name}.")
+            else:
+                yield f"{lead}{name}"
 
     steps = int(read("vault_index")[0])
     if steps < 2:

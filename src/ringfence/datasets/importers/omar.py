@@ -15,9 +15,11 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets import registry
@@ -53,65 +55,24 @@ def import_omar(
         raise StoreError(f"episode_length={episode_length} leaves no whole step; OMAR's episodes have 25.")
     env = SimpleSpread(n_agents=n, episode_length=episode_length)
     task = _task_name(directory, n) if task is None else task
-    known = registry.TASKS.get(task)
-    if known is not None and known.env is not None and known.env.n_agents != n:
-        raise StoreError(
-            f"'{directory}' holds {n} agents, the task '{task}' has {known.env.n_agents}; pass another name as task."
-        )
-
-    width = env.observation_dim
-    observations = _agents(directory, "obs", n, None, width)  # (M, N, O)
-    rows = len(observations)
-    actions = _agents(directory, "acs", n, rows, 2)
-    rewards = _agents(directory, "rews", n, rows, None)
-    dones = _agents(directory, "dones", n, rows, None).astype(bool).all(1)
-    following = _agents(directory, "next_obs", n, rows, width) if has_next else None
-    _check_state(directory, env, observations, "obs")
-    if following is not None:
-        _check_state(directory, env, following, "next_obs")
-    actions = _clip(directory, actions)
-
-    notes = []
-    ends = _episode_ends(dones, episode_length)
-    if not len(ends):
-        raise StoreError(
-            f"'{directory}' holds {rows} rows, fewer than one episode of {episode_length}; pass a smaller "
-            "episode_length."
-        )
-    kept = int(ends[-1])
-    if kept < rows:
-        notes.append(f"the last {rows - kept} rows are an unfinished episode and were dropped")
-    if dones[:kept].any():
-        notes.append("dones are set; a done before the time limit is read as a termination, at the limit as truncation")
-    if following is not None:
-        _check_order(directory, observations, following, ends, episode_length)
-    lengths = np.diff(ends, prepend=0)
-    terminated = dones[ends - 1] & (lengths < episode_length)
-    if following is not None:
-        steps = np.arange(kept)
-        final = following[ends - 1]
-    else:
-        notes.append("next_obs is missing, so the last step of every episode was dropped")
-        long_enough = lengths > 1
-        final = observations[ends[long_enough] - 1]
-        inside = np.ones(kept, bool)
-        inside[ends - 1] = False
-        steps = np.flatnonzero(inside)
-        ends = np.cumsum(lengths[long_enough] - 1)
-        terminated = np.zeros(len(ends), bool)  # where they ended is not recorded
-
-    state = _global_state(env, observations[steps])
-    final_state = _global_state(env, final)
-    store = EpisodeStore.from_steps(
-        observations[steps],
-        actions[steps],
-        rewards[steps],
-        episode_ends=ends,
-        final_observations=final,
+    known = _agents_of(task)
+    if known not in (None, n):
+        raise StoreError(f"'{directory}' holds {n} agents, the task '{task}' has {known}; pass another name as task.")
+    hazard = hazard or constraints.Separation()
+    files = _read(directory, env, has_next)
+    log = _whole_episodes(directory, files, episode_length)
+    state = _global_state(env, log.observations)
+    final_state = _global_state(env, log.final)
+    return EpisodeStore.from_steps(
+        log.observations,
+        log.actions,
+        log.rewards,
+        episode_ends=log.ends,
+        final_observations=log.final,
         state=state,
         final_state=final_state,
-        terminated=terminated,
-        costs=_costs(hazard or constraints.Separation(), env, state, final_state, ends),
+        terminated=log.terminated,
+        costs=_costs(hazard, env, state, final_state, log.ends),
         card={
             "task": task,
             "simulator": "multiagent-particle-envs simple_spread, as changed by OMAR",
@@ -121,12 +82,102 @@ def import_omar(
             "agents": [f"agent{i}" for i in range(n)],
             "observation_names": list(_observation_names(n)),
             "state_names": list(env.state_names),
-            "hazard": constraints.to_dict(hazard or constraints.Separation()),
+            "hazard": constraints.to_dict(hazard),
             "episode_length": episode_length,
-            "warnings": notes,
+            "warnings": log.notes,
         },
     )
-    return store
+
+
+@dataclass(frozen=True)
+class Files:
+    """What a directory holds, M rows."""
+
+    observations: np.ndarray  # (M, N, O)
+    actions: np.ndarray  # (M, N, 2)
+    rewards: np.ndarray  # (M, N)
+    dones: np.ndarray  # (M,) bool
+    following: np.ndarray | None  # (M, N, O) next_obs
+
+
+@dataclass(frozen=True)
+class Log:
+    """Whole episodes, T steps."""
+
+    observations: np.ndarray  # (T, N, O)
+    actions: np.ndarray  # (T, N, 2)
+    rewards: np.ndarray  # (T, N)
+    ends: np.ndarray  # (E,) cumulative steps
+    final: np.ndarray  # (E, N, O)
+    terminated: np.ndarray  # (E,) bool
+    notes: list[str]  # what was found and lost
+
+
+def _read(directory: Path, env: SimpleSpread, has_next: bool) -> Files:
+    """The arrays, each of the right shape and of Simple Spread."""
+    n = env.n_agents
+    width = env.observation_dim
+    observations = _agents(directory, "obs", n, None, width)
+    rows = len(observations)
+    files = Files(
+        observations=observations,
+        actions=_agents(directory, "acs", n, rows, 2),
+        rewards=_agents(directory, "rews", n, rows, None),
+        dones=np.all(_agents(directory, "dones", n, rows, None).astype(bool), axis=1),
+        following=_agents(directory, "next_obs", n, rows, width) if has_next else None,
+    )
+    _check_state(directory, env, observations, "obs")
+    if files.following is not None:
+        _check_state(directory, env, files.following, "next_obs")
+    return replace(files, actions=_clip(directory, files.actions))
+
+
+def _whole_episodes(directory: Path, files: Files, episode_length: int) -> Log:
+    """The files cut into episodes; an unfinished last one is dropped."""
+    rows = len(files.observations)
+    ends = _episode_ends(files.dones, episode_length)
+    if not len(ends):
+        raise StoreError(
+            f"'{directory}' holds {rows} rows, fewer than one episode of {episode_length}; pass a smaller "
+            "episode_length."
+        )
+    notes = []
+    kept = int(ends[-1])
+    if kept < rows:
+        notes.append(f"the last {rows - kept} rows are an unfinished episode and were dropped")
+    if files.dones[:kept].any():
+        notes.append("dones are set; a done before the time limit is read as a termination, at the limit as truncation")
+    if files.following is not None:
+        _check_order(directory, files.observations, files.following, ends, episode_length)
+        return Log(
+            observations=files.observations[:kept],
+            actions=files.actions[:kept],
+            rewards=files.rewards[:kept],
+            ends=ends,
+            final=files.following[ends - 1],
+            terminated=files.dones[ends - 1] & (np.diff(ends, prepend=0) < episode_length),
+            notes=notes,
+        )
+    notes.append("next_obs is missing, so the last step of every episode was dropped")
+    return _without_last_steps(files, ends, notes)
+
+
+def _without_last_steps(files: Files, ends: np.ndarray, notes: list[str]) -> Log:
+    """Episodes up to the last row that is known, where nothing says what their last action led to."""
+    inside = np.ones(int(ends[-1]), bool)
+    inside[ends - 1] = False
+    steps = np.flatnonzero(inside)
+    lengths = np.diff(ends, prepend=0)
+    long_enough = lengths > 1
+    return Log(
+        observations=files.observations[steps],
+        actions=files.actions[steps],
+        rewards=files.rewards[steps],
+        ends=np.cumsum(lengths[long_enough] - 1),
+        final=files.observations[ends[long_enough] - 1],
+        terminated=np.zeros(int(long_enough.sum()), bool),  # where they ended is not recorded
+        notes=notes,
+    )
 
 
 def _survey(directory: Path) -> tuple[int, bool]:
@@ -185,13 +236,13 @@ def _check_state(directory: Path, env: SimpleSpread, observations: np.ndarray, k
     """Refuse joint observations that do not describe one state: files of different runs, or another environment."""
     n = env.n_agents
     seen = 4 + 2 * n + 2 * (n - 1)  # without the communication channel
-    retell = jax.jit(lambda x: env.observe(env.from_observations(x)))
+    reconstruct = jax.jit(lambda x: env.observe(env.from_observations(x)))
     for start in range(0, len(observations), CHUNK):
         given = observations[start : start + CHUNK]
-        told = np.asarray(retell(given))
-        error = np.abs(told - given)[..., :seen].max(-1)  # (M, N)
+        expected = np.asarray(reconstruct(given))
+        error = np.abs(expected - given)[..., :seen].max(-1)  # (M, N)
         if (error > STATE_SLACK).any():
-            row, agent = (int(v) for v in np.argwhere(error > STATE_SLACK)[0])
+            row, agent = np.argwhere(error > STATE_SLACK)[0].tolist()
             raise StoreError(
                 f"'{directory / f'{kind}_{agent}.npy'}' row {start + row} contradicts the other agents' observations "
                 f"by {error[row, agent]:.3g}; the files belong to different runs or another environment."
@@ -201,7 +252,7 @@ def _check_state(directory: Path, env: SimpleSpread, observations: np.ndarray, k
 def _clip(directory: Path, actions: np.ndarray) -> np.ndarray:
     beyond = np.abs(actions) - 1.0
     if (beyond >= ACTION_SLACK).any():
-        row, agent, entry = (int(v) for v in np.argwhere(beyond >= ACTION_SLACK)[0])
+        row, agent, entry = np.argwhere(beyond >= ACTION_SLACK)[0].tolist()
         raise StoreError(
             f"'{directory / f'acs_{agent}.npy'}' row {row} is {actions[row, agent, entry]:.4g}, outside [-1, 1]; "
             "rescale the actions."
@@ -214,7 +265,7 @@ def _episode_ends(dones: np.ndarray, length: int) -> np.ndarray:
     cuts = np.flatnonzero(dones) + 1
     starts = np.concatenate([[0], cuts]).astype(np.int64)
     stops = np.concatenate([cuts, [len(dones)]]).astype(np.int64)
-    parts = [np.arange(a + length, b + 1, length) for a, b in zip(starts, stops)]
+    parts = [np.arange(start + length, stop + 1, length) for start, stop in zip(starts, stops)]
     return np.unique(np.concatenate([*parts, cuts]))
 
 
@@ -230,11 +281,13 @@ def _check_order(
     boundary = np.zeros(kept, bool)
     boundary[ends - 1] = True
     boundary = boundary[:-1]
-    apart, together = gap > STATE_SLACK, gap <= STATE_SLACK  # neither where a value is NaN, which the store refuses
-    wrong = np.flatnonzero(np.where(boundary, together, apart))
+    breaks_here = gap > STATE_SLACK  # neither this nor the next where a value is NaN, which the store refuses
+    goes_on = gap <= STATE_SLACK
+    wrong = np.flatnonzero(np.where(boundary, goes_on, breaks_here))
     if not len(wrong):
         return
-    row, breaks = int(wrong[0]), np.flatnonzero(apart)
+    row = int(wrong[0])
+    breaks = np.flatnonzero(breaks_here)
     first = f"the first break comes after {breaks[0] + 1} rows" if len(breaks) else "the rows never break"
     if boundary[row]:
         raise StoreError(
@@ -248,7 +301,7 @@ def _check_order(
 
 
 def _global_state(env: SimpleSpread, observations: np.ndarray) -> np.ndarray:
-    return np.asarray(env.global_state(env.from_observations(observations)))
+    return np.asarray(env.global_state(env.from_observations(jnp.asarray(observations))))
 
 
 def _costs(
@@ -262,8 +315,9 @@ def _costs(
     reached = np.concatenate([state[1:], final_state[-1:]])
     reached[ends - 1] = final_state
     labels = jax.jit(bound.labels)
-    unsafe = [labels(view(None, reached[i : i + CHUNK]))[0] for i in range(0, len(reached), CHUNK)]
-    return np.concatenate(unsafe).any(-1).astype(np.float32)
+    chunks = [reached[start : start + CHUNK] for start in range(0, len(reached), CHUNK)]
+    unsafe = [labels(view(None, chunk))[0] for chunk in chunks]
+    return np.any(np.concatenate(unsafe), axis=-1).astype(np.float32)
 
 
 def _observation_names(n: int) -> tuple[str, ...]:
@@ -277,6 +331,12 @@ def _task_name(directory: Path, n: int) -> str:
     for part in reversed(directory.resolve().parts[-3:]):
         match = TIER.fullmatch(part.lower())
         name = match and f"simple_spread-{match[1].replace('_', '-')}"
-        if name in registry.TASKS and registry.TASKS[name].env.n_agents == n:
+        if name and _agents_of(name) == n:
             return name
     return "simple_spread-imported"
+
+
+def _agents_of(task: str) -> int | None:
+    """How many agents a task of that name has; None where there is none."""
+    known = registry.TASKS.get(task)
+    return None if known is None or known.env is None else known.env.n_agents
