@@ -115,7 +115,8 @@ def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
         changes["barrier_updates"] = worlds.settings_for(subject.store).barrier_updates // 2
     begun = time.perf_counter()
     world = worlds.fit(subject.store, seed=seed, **changes)
-    took, facts = time.perf_counter() - begun, world.card["barrier"]
+    took = time.perf_counter() - begun
+    scores = world.card.barrier
     played = subject.play(world, **subject.guards[guard])
     low, high = played["cost_interval"]
     row = {
@@ -123,9 +124,9 @@ def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
         "way": way,
         "guard": guard,
         "seed": seed,
-        "fit_seconds": world.card["seconds"].get("label", took),
+        "fit_seconds": world.card.seconds.get("label", took),
     }
-    row |= {k: facts[k] for k in ("unsafe_share", "recall", "auroc", "margin", "foreseen_false_safe")}
+    row |= {k: getattr(scores, k) for k in ("unsafe_share", "recall", "auroc", "margin", "foreseen_false_safe")}
     row |= {"episodes": subject.episodes, "return": played["return_mean"], "cost": played["cost_mean"]}
     row |= {"cost_low": low, "cost_high": high, "infeasible_rate": played.get("infeasible_rate", "")}
     row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}

@@ -149,9 +149,9 @@ def losses(scene):
         made = icbf.Generated(x, valid, 0.1 * one, one)
 
         def of(net, x):
-            told = made._replace(features=x)
+            moved = made._replace(features=x)
             c, norm = config("paper"), frozen["normaliser"]
-            return joint.joint_losses(net, norm, batch._replace(valid=valid), told, icbf.retention(c), c, hazard)
+            return joint.joint_losses(net, norm, batch._replace(valid=valid), moved, icbf.retention(c), c, hazard)
 
         (value, metrics), pull = jax.value_and_grad(of, (0, 1), has_aux=True)(net, x)
         return value, pull, metrics
@@ -222,15 +222,15 @@ def test_empty_sets_are_finite(scene, losses, follow, case):
 def test_means_do_not_depend_on_the_number_of_agents():
     """The same h for every agent gives the same losses and shares for 2 and for 6 of them."""
 
-    def told(n):
+    def means(n):
         h = jnp.broadcast_to(jnp.linspace(-1, 1, 20).reshape(4, 5, 1), (4, 5, n))
         valid = jnp.ones((4, 5, 1), bool)
         shaped = cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, True, jnp.ones((4, 1, 1)))
         terms = joint.hinges(h, h < 0, h >= 0, valid, cbf.Retention(0.9), 0.0, 0.1, True)
         return [float(x) for x in (shaped, *terms[:3], terms.metrics["share_unsafe"])]
 
-    assert told(2) == pytest.approx(told(6), rel=1e-5)
-    assert told(2)[-1] == pytest.approx(0.5)
+    assert means(2) == pytest.approx(means(6), rel=1e-5)
+    assert means(2)[-1] == pytest.approx(0.5)
 
 
 def test_paper_needs_a_formula():

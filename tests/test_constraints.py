@@ -40,9 +40,9 @@ class Sleds(ParallelEnv):
         chance = np.random.default_rng(seed)
         self.x, self.v, self.t = chance.uniform(-0.8, 0.8, 2), chance.uniform(-0.5, 0.5, 2), 0
         self.agents = list(self.possible_agents)
-        return self.told(), {a: {} for a in self.agents}
+        return self.seen(), {a: {} for a in self.agents}
 
-    def told(self):
+    def seen(self):
         return {a: np.array([self.x[i], self.v[i]], np.float32) for i, a in enumerate(self.possible_agents)}
 
     def step(self, actions):
@@ -52,7 +52,7 @@ class Sleds(ParallelEnv):
         infos = {a: {"cost": {k: float(c[i]) for k, c in costs.items()}} for i, a in enumerate(self.possible_agents)}
         both = dict.fromkeys(self.possible_agents)
         rewards = {a: float(self.v[i]) for i, a in enumerate(self.possible_agents)}
-        return self.told(), rewards, both | dict.fromkeys(both, False), dict.fromkeys(both, self.t == STEPS), infos
+        return self.seen(), rewards, both | dict.fromkeys(both, False), dict.fromkeys(both, self.t == STEPS), infos
 
 
 def wander(observations, state):
@@ -74,8 +74,8 @@ def logs():
 
 @pytest.fixture(scope="module")
 def fitted(logs):
-    told = dict(members=2, dynamics_updates=1500, dynamics_width=32, value_updates=50)
-    return worlds.fit(logs, **told, barrier_updates=800, barrier_width=32, future_updates=100)
+    settings = dict(members=2, dynamics_updates=1500, dynamics_width=32, value_updates=50)
+    return worlds.fit(logs, **settings, barrier_updates=800, barrier_width=32, future_updates=100)
 
 
 def test_costs_by_name_are_kept_through_everything(logs, tmp_path):
@@ -91,9 +91,9 @@ def test_costs_by_name_are_kept_through_everything(logs, tmp_path):
     np.testing.assert_array_equal(both.constraints[: some.steps], some.constraints)
     apart = logs.apart()
     np.testing.assert_array_equal(apart.of_constraint("fast")[: logs.steps], logs.of_constraint("fast")[:, 0])
-    told = audit(logs).facts["constraint wall"]
+    fact = audit(logs).facts["constraint wall"]
     within = 100 * (logs.episode_costs_of("wall") == 0).mean()
-    assert f"{within:.1f} % of episodes are within 0" in told and f"\nconstraint wall: {told}\n" in str(audit(logs))
+    assert f"{within:.1f} % of episodes are within 0" in fact and f"\nconstraint wall: {fact}\n" in str(audit(logs))
 
 
 def test_costs_by_name_that_do_not_fit_are_refused(logs):
@@ -136,9 +136,9 @@ def test_every_constraint_has_a_barrier(logs, fitted, tmp_path):
         [[False, True], [False, True]],
     ]
     np.testing.assert_allclose(fitted.barrier.of_steps(x, x), fitted.barrier.apart(x, x).min(-1))
-    told = str(fitted.card)
-    assert "Constraint 'wall', at most 0 per episode" in told and "Constraint 'fast', at most 10" in told
-    assert min(f["recall"] for f in fitted.card["constraints"].values()) > 0.9
+    card = str(fitted.card)
+    assert "Constraint 'wall', at most 0 per episode" in card and "Constraint 'fast', at most 10" in card
+    assert min(scores.recall for scores in fitted.card.constraints.values()) > 0.9
     loaded = worlds.load(world.save(fitted, tmp_path / "w.safetensors"))
     np.testing.assert_array_equal(loaded.barrier.apart(x, x), fitted.barrier.apart(x, x))
     assert loaded.limits == LIMITS
@@ -185,11 +185,11 @@ def test_learners_keep_every_limit(logs):
 def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path, capsys):
     changes = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
     run = loop.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
-    told = play(run, Sleds, episodes=3, keep=True)["constraints"]
-    assert {k: v["limit"] for k, v in told.items()} == LIMITS
+    found = play(run, Sleds, episodes=3, keep=True)["constraints"]
+    assert {k: v["limit"] for k, v in found.items()} == LIMITS
     page = build_report([run], tmp_path / "page.html").read_text()
     shown = re.findall(r"<td>(wall|fast)</td><td>([\d.]+)</td><td>(\d+)</td>", page)
-    assert shown == [(k, f"{told[k]['cost_mean']:.3f}", f"{v:g}") for k, v in LIMITS.items()]
+    assert shown == [(k, f"{found[k]['cost_mean']:.3f}", f"{v:g}") for k, v in LIMITS.items()]
     app.main(["play", str(run.path), "--env", "tests.test_constraints:Sleds", "--episodes", "2"])
     shown = capsys.readouterr().out
     assert "wall" in shown and "fast" in shown
@@ -198,10 +198,10 @@ def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path, capsys):
 def test_simulators_that_change_their_constraints_are_refused(fitted):
     class Odd(Sleds):
         def step(self, actions):
-            *told, infos = super().step(actions)
+            *transition, infos = super().step(actions)
             if self.t == 3:
                 infos = {a: {"cost": self.odd(i["cost"])} for a, i in infos.items()}
-            return *told, infos
+            return *transition, infos
 
     pilot = guard(hurry, fitted)
     for odd, said in (

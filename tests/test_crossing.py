@@ -24,7 +24,7 @@ from ringfence.guards import guard
 from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save
-from ringfence.world.fit import held_out
+from ringfence.world.logged import held_out
 from tests.quick import QUICK_WORLD
 
 
@@ -180,7 +180,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     monkeypatch.setattr(sys.modules["ringfence.evaluation.rollout"], "CHUNK", 2)
     run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
-    assert world.alone and world.spec.n_agents == 1 and world.card["data"]["episodes"] == 20
+    assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20
     result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, shield=1, rows=1)
     assert result["agents"] == 3 and result["sight"] == "own" and 0 <= result["infeasible_rate"] <= 1
     assert 0 <= result["agent_violation_rate"] <= result["violation_rate"]

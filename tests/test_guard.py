@@ -20,7 +20,7 @@ from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
-from ringfence.world import Card
+from ringfence.world.card import Avoidable, BarrierScores, Card
 from tests.quick import QUICK_WORLD
 
 
@@ -123,8 +123,8 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
 def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, options, future):
     """Where three rows come too late, the value of danger judges the last one, unless it calls most safe steps lost, or
     something else is asked for."""
-    told = {"avoidable": {"before": [1, 3, 15], "avoided": avoided, "rows": 15}, "ahead_kept": kept}
-    card = Card({"barrier": told})
+    avoidable = Avoidable(before=(1, 3, 15), avoided=tuple(avoided), rows=15)
+    card = Card(data=small_world.card.data, barrier=BarrierScores(ahead_kept=kept, avoidable=avoidable))
     world = dataclasses.replace(small_world, card=card)
     for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
                    ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip
@@ -216,8 +216,8 @@ def test_entries_of_actions_that_an_agent_has_not_stay_where_they_are(small_worl
 
 def test_the_smaller_of_both(small_world, bound, present):
     rows, spread = jnp.stack([present, present], 1)[:, None], jnp.zeros((64, 1, 1, 3))
-    told = {s: Danger(small_world, s, bound, False).along(rows, spread) for s in ("formula", "learned", "both")}
-    np.testing.assert_array_equal(told["both"], jnp.minimum(told["formula"], told["learned"]))
+    scores = {s: Danger(small_world, s, bound, False).along(rows, spread) for s in ("formula", "learned", "both")}
+    np.testing.assert_array_equal(scores["both"], jnp.minimum(scores["formula"], scores["learned"]))
 
 
 def test_any_callable_is_guarded(small_world, small_store):

@@ -40,10 +40,11 @@ def test_normal_scores_are_ordered_and_standard():
 def test_critic_learns_what_is_there_to_learn():
     """A team reward that is linear in every agent's features, and a return-to-go that is quadratic."""
     x = jax.random.normal(jax.random.key(0), (4000, 3, 4))
-    reward, togo = x[..., 0].mean(-1), (x[..., 1] ** 2).mean(-1)
-    critic = values.fit_critic(x, reward, togo, jax.random.key(1), updates=600, batch=256)
+    reward = x[..., 0].mean(-1)
+    returns = (x[..., 1] ** 2).mean(-1)
+    critic = values.fit_critic(x, reward, returns, jax.random.key(1), updates=600, batch=256)
     r, g = values.state_values(critic, x)
-    for got, truth in ((r, reward), (g, togo)):
+    for got, truth in ((r, reward), (g, returns)):
         assert float(1 - ((got - truth) ** 2).mean() / truth.var()) > 0.9
     np.testing.assert_allclose(values.values_of(critic, x), np.asarray(g), rtol=1e-5, atol=1e-5)
 
@@ -93,15 +94,15 @@ def test_what_ended_for_good_is_worth_nothing(played, monkeypatch):
     view = SimpleSpread().feature_map("pruned")
     seen = {}
 
-    def fit_critic(x, arrived, togo, *_, **__):
-        seen.update(x=x, arrived=arrived, togo=togo)
+    def fit_critic(x, arrived, returns, *_, **__):
+        seen.update(x=x, arrived=arrived, returns=returns)
         return values.blank_critic(x.shape[-1])
 
     monkeypatch.setattr(values, "fit_critic", fit_critic)
-    arrays = WindowData(store, view).arrays | {"togo": jnp.ones(store.steps)}
+    arrays = WindowData(store, view).arrays | {"returns_to_go": jnp.ones(store.steps)}
     picked = jnp.arange(25, store.steps)  # the first fall is held out
     values.fit_values(arrays, picked, view, jax.random.key(0), discount=0.9, updates=1, period=26)
-    assert len(seen["x"]) == len(seen["togo"]) == len(picked) + 2
-    np.testing.assert_array_equal(seen["togo"][-3:], [1, 0, 0])
+    assert len(seen["x"]) == len(seen["returns"]) == len(picked) + 2
+    np.testing.assert_array_equal(seen["returns"][-3:], [1, 0, 0])
     np.testing.assert_array_equal(seen["x"][-2:], arrays["features"][jnp.asarray([51, 77])])
     np.testing.assert_allclose(seen["arrived"][-1], store.rewards[74].mean(), rtol=1e-6)

@@ -1,7 +1,6 @@
 """The World: what is learned of the logs before and without a policy."""
 
 import dataclasses
-from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -34,7 +33,7 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     for other in (again, loaded):
         for a, b in zip(jax.tree.leaves(small_world), jax.tree.leaves(other), strict=True):
             np.testing.assert_array_equal(a, b)
-    assert loaded.card["seed"] == 0 and str(loaded.card) == str(small_world.card)
+    assert loaded.card.seed == 0 and str(loaded.card) == str(small_world.card)
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
         worlds.load(tmp_path / "w.safetensors")
@@ -44,7 +43,6 @@ class Head(eqx.Module):
     """Two cars in a lane, features (gap, closing speed), that brake by at most 1 m/s²: dynamics and barrier in one."""
 
     shape: object = eqx.field(static=True, default=None)
-    dynamics = barrier = property(lambda self: self)
 
     def step(self, x, action):
         speed = x[..., 1] - 0.1 * action.mean((-1, -2))[..., None]
@@ -61,13 +59,13 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     arrays = {"features": jnp.asarray(x, jnp.float32), "actions": jnp.zeros((20, 2, 1))}
     arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
     entered = np.array([19])  # the step that ends with a gap below 0
-    found = validate._avoidable(Head(), SimpleNamespace(arrays=arrays), entered)
-    assert found["before"] == list(validate.BEFORE) and found["rows"] == 7
-    assert found["avoided"] == [0, 0, 0, 0, 1, 1, 1]
+    found = validate._avoidable(Head(), Head(), arrays, entered)
+    assert found.before == validate.BEFORE and found.rows == 7
+    assert found.avoided == (0, 0, 0, 0, 1, 1, 1)
 
 
 def test_held_out_episodes_are_whole_and_differ_between_seeds(small_store):
-    from ringfence.world.fit import held_out
+    from ringfence.world.logged import held_out
 
     a, b = held_out(small_store, 0), held_out(small_store, 1)
     assert a.sum() == b.sum() == 4 and (a != b).any()
@@ -96,8 +94,8 @@ def test_names_tell_who_is_who():
     shape = cbf.shape_of(spread)
     (kind, pairs), *more = shape.pairs
     assert kind == "other" and not more and len(pairs) == 2 and shape.groups == 1 and shape.blame == "worst"
-    told = [spread.names[d] for d in pairs[1]]
-    assert told == ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"] or sorted(told) == sorted(
+    read = [spread.names[d] for d in pairs[1]]
+    assert read == ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"] or sorted(read) == sorted(
         ["own.vx", "own.vy", "other1.dvx", "other1.dvy", "other1.dx", "other1.dy"]
     )
     assert "own.x" in [spread.names[d] for d in shape.own]
@@ -124,10 +122,10 @@ def test_the_worst_agent_explains_the_teams_cost():
     blank = cbf.blank_barrier(map, 32)
     data = jnp.asarray(x), jnp.asarray(x[1:]), jnp.arange(len(x) - 1), jnp.asarray(unsafe)
     steps = np.arange(len(x) - 1)
-    told = dict(loss="cross-entropy", updates=800, width=32)
-    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **told)
+    settings = dict(loss="cross-entropy", updates=800, width=32)
+    fitted = cbf.fit_label(blank, data, steps[unsafe], steps[~unsafe], jax.random.key(0), **settings)
     h = np.asarray(fitted.of_steps(jnp.asarray(x), jnp.asarray(x)))
-    assert ((h < 0) == near).mean() > 0.95  # each agent's own danger, though nobody's was ever told
+    assert ((h < 0) == near).mean() > 0.95  # each agent's own danger, though no label named it
     assert np.abs(h).max() <= cbf.FARTHEST
 
 
@@ -142,15 +140,15 @@ def test_danger_is_seen_ahead():
     unsafe = rows[row + 1, 0, 0] > 0.8
     table = np.zeros((1, 2), int)
     blank = cbf.blank_barrier(FeatureMap("pruned", ("x", "v"), "observations", table, table - 1), 32)
-    told = dict(loss="cross-entropy", updates=500, width=32)
+    settings = dict(loss="cross-entropy", updates=500, width=32)
     data = jnp.asarray(rows), jnp.asarray(rows[row + 1]), jnp.asarray(row), jnp.asarray(unsafe)
     every = np.arange(len(row))
-    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **told)
+    fitted = cbf.fit_label(blank, data, every[unsafe], every[~unsafe], jax.random.key(0), **settings)
     arrays = {"features": data[0], "row": data[2], "terminated": jnp.zeros(len(row), bool)}
-    told = dict(discount=0.9, expectile=0.9)
-    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), updates=1, **told)
+    settings = dict(discount=0.9, expectile=0.9)
+    start = cbf.fit_future(fitted, arrays, every, every[:0], jax.random.key(1), updates=1, **settings)
     np.testing.assert_allclose(start.ahead(data[0]), fitted.of_steps(data[0], data[0]), atol=1.0)  # it begins as ℓ
-    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), updates=1000, **told)
+    ahead = cbf.fit_future(fitted, arrays, every, every[unsafe], jax.random.key(1), updates=1000, **settings)
     doomed, fine = jnp.asarray([[[0.4, 0.9]]]), jnp.asarray([[[0.4, -0.9]]])
     assert fitted.of_steps(doomed, doomed) > 0 and fitted.of_steps(fine, fine) > 0
     assert ahead.ahead(doomed) < 0 < ahead.ahead(fine)

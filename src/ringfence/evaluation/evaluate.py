@@ -92,7 +92,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "sight": worlds.sight_of(resolved.job.task, spec.sight),
         "agents": resolved.job.team,
         "guard_options": {} if guard is None else dataclasses.asdict(guard.options),
-        **({} if guard is None else {"world_settings": guard.world.card["settings"]}),
+        **({} if guard is None else {"world_settings": dataclasses.asdict(guard.world.card.settings)}),
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(resolved.policy),
     }

@@ -2,11 +2,11 @@
 
     refine   climb the value of every proposal's actions through the World's dynamics, away from danger
     select   the best of the safe ones, or the safest
-    shield   correct the actions until danger keeps its distance along the foreseen rows
+    shield   correct the actions until danger keeps its distance along the predicted rows
     adapt    move the margin by what happens: up after a cost, down while there is none
 
-The shield asks the paper's condition (3) of foreseen rows, h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k), or a margin; its correction is
-the supremum over actions. Where no action meets it, the least bad one found is taken, and counted.
+The shield asks the paper's condition (3) of predicted rows, h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k), or a margin; its correction is
+the supremum over actions. Where no action meets it, the best one found is taken, and counted as infeasible.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 
 from ringfence.guards.danger import Danger
 from ringfence.guards.options import GuardOptions
+from ringfence.nets.mlp import MLP
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.world import World
@@ -27,6 +29,7 @@ from ringfence.world.dynamics import Dynamics
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
 TOGETHER = 32  # teams whose plans are corrected at once
+TOLERANCE = 1e-3  # of the condition, in margins: less is not counted as infeasible
 
 
 class Decision(NamedTuple):
@@ -37,7 +40,17 @@ class Decision(NamedTuple):
     rows: Array  # (B, P, K+1, N, D) where the proposals lead
     safety: Array  # (B, N) least score along the plan, of any constraint
     short: Array  # (B, N) bool: the condition is not met along it
-    strange: Array  # (B, N) bool: the World does not know where the first action leads
+    strange: Array  # (B, N) bool: the first action leads out of distribution
+
+
+class Correction(NamedTuple):
+    """Plans while they are corrected."""
+
+    plan: Array  # (B, K, N, A)
+    best: Array  # (B, K, N, A) of those so far
+    least: Array  # (B, 1 or N) shortfall of the best
+    short: Array  # (B, 1 or N) shortfall of the plan before the last correction
+    round: Array  # () int
 
 
 class Guard(eqx.Module):
@@ -54,29 +67,33 @@ class Guard(eqx.Module):
     def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
         (B, C), of each constraint, or (B, N, C) of agents who are alone."""
-        o = self.options
         proposals = self.world.spec.own(proposals)
-        if o.refine:
+        if self.options.refine:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.foreseen(present, proposals)
         chosen = self.selected(rows, proposals, self.clear(rows, spread, margin))
-        if self.world.alone:
-            plan = jnp.take_along_axis(proposals, chosen[:, None, None, :, None], 1)[:, 0]
-        else:
-            plan = jnp.take_along_axis(proposals, chosen[:, None, None, None, None], 1)[:, 0]
-        if o.shield:
+        index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
+        plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
+        if self.options.shield:
             plan = self.shielded(present, plan, margin)
         ahead, spread = self.foreseen(present, plan[:, None])
-        short = (self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin) < -1e-3).any(1)
-        unknown = spread[:, 0, 0] > self.world.strange
-        return Decision(plan, chosen, rows, self.danger.along(ahead, spread)[:, 0].min((1, 3)), short, unknown)
+        missing = self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin)
+        return Decision(
+            plan=plan,
+            chosen=chosen,
+            rows=rows,
+            safety=self.danger.along(ahead, spread)[:, 0].min((1, 3)),
+            short=(missing < -TOLERANCE).any(1),
+            strange=spread[:, 0, 0] > self.world.strange,
+        )
 
     def foreseen(self, present: Array, actions: Array, dynamics: Dynamics | None = None) -> tuple[Array, Array]:
         """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A)."""
+        model = dynamics or self.world.dynamics
         x = jnp.broadcast_to(present[:, None], (*actions.shape[:2], *present.shape[1:]))
 
-        def step(x: Array, action: Array):
-            after, spread = (dynamics or self.world.dynamics).step(x, action)
+        def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
+            after, spread = model.step(x, action)
             return after, (after, spread)
 
         _, (rows, spread) = jax.lax.scan(step, x, jnp.moveaxis(actions, 2, 0), unroll=True)
@@ -86,65 +103,69 @@ class Guard(eqx.Module):
     def imagined(self, present: Array, actions: Array) -> tuple[Array, Array]:
         """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work.
         All of them judge what comes of it."""
-        dynamics, starts = self.world.dynamics, actions.shape[1]
-        nets = dynamics.members(jnp.arange(starts)[:, None] % dynamics.size)
+        dynamics = self.world.dynamics
+        nets = dynamics.members(jnp.arange(actions.shape[1])[:, None] % dynamics.size)
 
-        def by(nets, actions: Array) -> tuple[Array, Array]:
+        def of_start(nets: tuple[MLP, MLP | None], actions: Array) -> tuple[Array, Array]:
             rows, spread = self.foreseen(present, actions[:, None], dynamics.by_members(nets))
             return rows[:, 0], spread[:, 0]
 
-        return jax.vmap(by, (0, 1), 1)(nets, actions)
+        return jax.vmap(of_start, (0, 1), 1)(nets, actions)
 
     def clear(self, rows: Array, spread: Array, margin: Array) -> Array:
-        """(B, P, K, N) by how much the scores of foreseen rows pass the margins; of several constraints the worst."""
+        """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst."""
         return lowest(self.danger.along(rows, spread) - _over(margin, 2))
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
-        """(B, K, N) how much foreseen rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
+        """(B, K, N) how much predicted rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
         or negative."""
-        o = self.options
-        if o.condition == "margin":
+        if self.options.condition == "margin":
             return jnp.minimum(clear, 0.0)
         now = lowest(self.danger.now(present, present) - _over(margin, 0))[:, None]
         before = jnp.concatenate([now, clear[:, :-1]], 1)
-        return jnp.minimum(clear - (1.0 - o.alpha) * before, 0.0)
+        return jnp.minimum(clear - (1.0 - self.options.alpha) * before, 0.0)
 
     def started(self, proposals: Array, last: Array, key: Key) -> tuple[Array, Array, Array]:
         """(B, S, K, N, A) thrice: what is refined (the proposals, the last plan moved on by a step, and noisy copies of
         these), and the bounds of each, `reach` around the proposal that it belongs to."""
-        o, many = self.options, proposals.shape[1]
-        count = max(o.starts, many)
+        many = proposals.shape[1]
+        count = max(self.options.starts, many)
         moved = jnp.concatenate([last[:, 1:], last[:, -1:]], 1)[:, None]
         known = jnp.concatenate([proposals, moved], 1)[:, :count]
-        again = jnp.arange(count) % known.shape[1]
-        starts = known[:, again]
-        noise = o.noise * jax.random.normal(key, starts[:, known.shape[1] :].shape)
-        starts = starts.at[:, known.shape[1] :].add(noise)
-        around = proposals[:, jnp.where(again < many, again, 0)]
-        low, high = jnp.maximum(around - o.reach, -1.0), jnp.minimum(around + o.reach, 1.0)
-        low, high = self.world.spec.own(low), self.world.spec.own(high)
+        copied = known.shape[1]
+        source = jnp.arange(count) % copied
+        starts = known[:, source]
+        noise = self.options.noise * jax.random.normal(key, starts[:, copied:].shape)
+        starts = starts.at[:, copied:].add(noise)
+        low, high = self._within(proposals[:, jnp.where(source < many, source, 0)], self.options.reach)
         return jnp.clip(starts, low, high), low, high
+
+    def _within(self, actions: Array, distance: float) -> tuple[Array, Array]:
+        """The bounds of what lies no farther than that from actions (..., N, A)."""
+        low = jnp.maximum(actions - distance, -1.0)
+        high = jnp.minimum(actions + distance, 1.0)
+        return self.world.spec.own(low), self.world.spec.own(high)
 
     def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
         """Actions (B, S, K, N, A) after Adam's ascent of value within bounds, in deviations of the logs', less `care`
         for every margin that is missing."""
 
-        def worth(actions: Array) -> Array:
+        def loss(actions: Array) -> Array:
             rows, spread = self.imagined(present, actions)
             value = self.world.values.of_plan(rows, actions) / self.world.values.usual
             short = jnp.minimum(self.clear(rows, spread, margin), 0.0).sum((2, 3))
-            return value.sum() + self.options.care * short.sum()
+            return -(value.sum() + self.options.care * short.sum())
 
-        def climb(carry, t):
-            a, m, s = carry
-            g = jax.grad(worth)(a)
-            m, s = 0.9 * m + 0.1 * g, 0.99 * s + 0.01 * g * g
-            move = (m / (1 - 0.9 ** (t + 1))) / (jnp.sqrt(s / (1 - 0.99 ** (t + 1))) + 1e-6)
-            return (jnp.clip(a + RATE * move, low, high), m, s), None
+        adam = optax.adam(RATE, b1=0.9, b2=0.99, eps=1e-6)
 
-        zero = jnp.zeros_like(actions)
-        rounds = jnp.arange(self.options.refine, dtype=jnp.float32)
-        return jax.lax.scan(climb, (actions, zero, zero), rounds)[0][0]
+        def climb(carry: tuple[Array, optax.OptState], _: None) -> tuple[tuple[Array, optax.OptState], None]:
+            actions, moments = carry
+            move, moments = adam.update(jax.grad(loss)(actions), moments)
+            actions = optax.projections.projection_box(optax.apply_updates(actions, move), low, high)
+            return (actions, moments), None
+
+        (actions, _), _ = jax.lax.scan(climb, (actions, adam.init(actions)), length=self.options.refine)
+        return actions
 
     def selected(self, rows: Array, actions: Array, clear: Array) -> Array:
         """(B,) which proposal: the one of most value among those that keep the margin; where there is none, the safest.
@@ -152,16 +173,18 @@ class Guard(eqx.Module):
         if actions.shape[1] == 1 or not (self.options.select or self.options.refine):
             shape = actions.shape[:1] + ((actions.shape[3],) if self.world.alone else ())
             return jnp.zeros(shape, jnp.int32)
-        value, clear = self.world.values.of_plan(rows, actions), clear.min(2)
+        value = self.world.values.of_plan(rows, actions)
+        clear = clear.min(2)
         return pick(clear if self.world.alone else clear.min(-1), value, 0.0)
 
     def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
-        """Plans (B, K, N, A) corrected until the condition holds along the foreseen rows, and the best found otherwise.
+        """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
+        otherwise.
 
         Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within `bound`
-        of the plan: where the condition cannot be met, pushing with all there is throws robots over. Where nothing is
-        missing the plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and corrected
-        a few teams at a time as long as there is something to correct.
+        of the plan. Where the condition cannot be met, larger actions throw robots over. Where nothing is missing the
+        plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and corrected a few teams
+        at a time as long as there is something to correct.
         """
         batch = plan.shape[0]
         if batch <= TOGETHER:
@@ -171,11 +194,11 @@ class Guard(eqx.Module):
         order = jnp.concatenate([order, jnp.repeat(order[-1:], padded)])
         given = [x[order].reshape(-1, TOGETHER, *x.shape[1:]) for x in (present, plan, margin)]
 
-        def some(given) -> Array:
+        def few(given: tuple[Array, Array, Array]) -> Array:
             short = (self._shortfall(*given) < 0).any()
             return jax.lax.cond(short, lambda: self._corrected(*given), lambda: given[1])
 
-        done = jax.lax.map(some, tuple(given)).reshape(-1, *plan.shape[1:])
+        done = jax.lax.map(few, tuple(given)).reshape(-1, *plan.shape[1:])
         return plan.at[order].set(done)
 
     def _shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
@@ -186,43 +209,52 @@ class Guard(eqx.Module):
 
     def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
         """`shielded`, of all teams at once."""
-        alone, bound = self.world.alone, self.options.bound
-        low, high = map(self.world.spec.own, (jnp.maximum(plan - bound, -1.0), jnp.minimum(plan + bound, 1.0)))
+        alone = self.world.alone
+        low, high = self._within(plan, self.options.bound)
 
         def shortfall(plan: Array) -> Array:
             return self._shortfall(present, plan, margin)
 
-        def correct(carry):
-            plan, best, least, _, round = carry
-            f, back = jax.vjp(shortfall, plan)
+        def correct(c: Correction) -> Correction:
+            f, back = jax.vjp(shortfall, c.plan)
             slope = back(jnp.ones_like(f))[0]
-            better = (f > least)[:, None, :, None]
-            best, least = jnp.where(better, plan, best), jnp.maximum(f, least)
+            better = (f > c.least)[:, None, :, None]
             size = (slope**2).sum((1, 3)) if alone else (slope**2).sum((1, 2, 3))[:, None]
-            moved = plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
-            return jnp.clip(moved, low, high), best, least, f, round + 1
+            moved = c.plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
+            return Correction(
+                plan=jnp.clip(moved, low, high),
+                best=jnp.where(better, c.plan, c.best),
+                least=jnp.maximum(f, c.least),
+                short=f,
+                round=c.round + 1,
+            )
 
-        def goes_on(carry):  # until the round after the last in which something was missing
-            return (carry[4] < self.options.shield) & (carry[3] < 0).any()
+        def goes_on(c: Correction) -> Array:  # until the round after the last in which something was missing
+            return (c.round < self.options.shield) & (c.short < 0).any()
 
         nothing = jnp.full((plan.shape[0], plan.shape[2] if alone else 1), -jnp.inf)
-        plan, best, least, *_ = jax.lax.while_loop(goes_on, correct, (plan, plan, nothing, nothing, 0))
-        return jnp.where((shortfall(plan) >= least)[:, None, :, None], plan, best)
+        begun = Correction(plan, plan, nothing, nothing, jnp.asarray(0))
+        found = jax.lax.while_loop(goes_on, correct, begun)
+        return jnp.where((shortfall(found.plan) >= found.least)[:, None, :, None], found.plan, found.best)
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has
         the rate of half its limit.
 
-        Adaptive conformal inference (Gibbs and Candès 2021) on the guard's own foresight: whatever its errors, the
+        Adaptive conformal inference (Gibbs and Candès 2021) on the guard's own predictions: whatever their errors, the
         share of unsafe steps tends to `rate` as long as a margin within the bounds can prevent them.
         """
-        o, limits = self.options, self.danger.limits
-        rate = jnp.array([0.5 * v / self.world.spec.episode_length for v in limits.values()]) if limits else o.rate
-        return jnp.clip(margin + o.adapt * (unsafe - rate), 0.0, max(MAX_MARGIN, o.margin))
+        rate = self.options.rate
+        limits = self.danger.limits
+        if limits:
+            rate = jnp.array([0.5 * limit / self.world.spec.episode_length for limit in limits.values()])
+        moved = margin + self.options.adapt * (unsafe - rate)
+        return jnp.clip(moved, 0.0, max(MAX_MARGIN, self.options.margin))
 
 
 def _over(margin: Array, axes: int) -> Array:
-    """Margins (B, C) or (B, N, C) with that many axes after the first, and those of agents and constraints last."""
+    """Margins (B, C) or (B, N, C) with that many more axes after the first, and those of agents and constraints
+    last."""
     agents = 1 if margin.ndim == 2 else margin.shape[1]
     return margin.reshape(margin.shape[0], *[1] * axes, agents, margin.shape[-1])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from ringfence.errors import UserError
 
@@ -17,13 +17,13 @@ class GuardOptions:
     plans: int = 1  # proposals that are asked for
     select: bool = False  # among them; else the first is followed
     refine: int = 0  # Adam steps that climb the value; 0: none
-    starts: int = 1  # refined: the proposals, the last plan moved on, and noisy copies, so many in all
+    starts: int = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
     noise: float = 0.5  # deviation of noisy copies
     reach: float = 2.0  # how far refining may take an action from its proposal; 2: anywhere
     care: float = 10.0  # weight of danger in what is climbed, in deviations of value per margin
     shield: int = 0  # rounds of correction; 0: none
     bound: float = 2.0  # how far the shield may take an action from what it was; 2: anywhere
-    rows: int = 3  # foreseen rows that are judged
+    rows: int = 3  # predicted rows that are judged
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: float = 0.5  # share of what is left of the distance that one step may use up
     margin: float = 0.6  # distance that is kept
@@ -32,15 +32,18 @@ class GuardOptions:
     rate: float = 0.0125  # share of steps with a cost at which an adapting margin settles
 
     def __post_init__(self):
-        for name, bound in (("plans", 1), ("starts", 1), ("rows", 1), ("refine", 0), ("shield", 0)):
-            if getattr(self, name) < bound:
-                raise UserError(f"{name}={getattr(self, name)} must be at least {bound}.")
+        for name, least in (("plans", 1), ("starts", 1), ("rows", 1), ("refine", 0), ("shield", 0)):
+            value = getattr(self, name)
+            if value < least:
+                raise UserError(f"{name}={value} must be at least {least}.")
         for name in ("noise", "care", "adapt"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name}={getattr(self, name)} must not be negative.")
+            value = getattr(self, name)
+            if value < 0:
+                raise UserError(f"{name}={value} must not be negative.")
         for name in ("reach", "bound"):
-            if not 0 < getattr(self, name) <= 2:
-                raise UserError(f"{name}={getattr(self, name)} must lie in (0, 2]: actions lie in [-1, 1].")
+            value = getattr(self, name)
+            if not 0 < value <= 2:
+                raise UserError(f"{name}={value} must lie in (0, 2]: actions lie in [-1, 1].")
         if not 0 < self.rate < 1:
             raise UserError(f"rate={self.rate} must be a share of steps between 0 and 1.")
         if not 0 < self.alpha <= 1:
@@ -60,9 +63,8 @@ class GuardOptions:
 
 _SHIELD = {"shield": 10}
 
-
 # Named sets of choices; "none" follows the proposal.
-GUARDS: dict[str, dict] = {
+GUARDS: dict[str, dict[str, Any]] = {
     "none": {},
     "select": {"plans": 8, "select": True},
     "shield": _SHIELD,

@@ -19,74 +19,76 @@ from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.problem import constraints, normalise
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, PyTree
+from ringfence.utils.config import build_config
 from ringfence.world import World
+from ringfence.world.card import Avoidable
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
+FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps
 
 Paid = float | Mapping[str, float]  # what a step cost, in all or by each constraint's name
+Cost = Array | dict[str, Array]  # the same of a batch: (B,) or (B, N), or that by constraint
 
 
 class Guarded(eqx.Module):
     """A proposal under guard; itself a policy (types.Policy).
 
-    What proposes several steps has a method `propose`; of what gives one action at a time the next ones are asked along
-    foreseen rows, where its view can be read from the World's, and the last action is held where it cannot.
+    A policy that proposes several steps has a method `propose`. One that gives one action at a time has its action
+    held.
     """
 
     proposal: Any
     guard: Guard
 
     def start(self, batch: int) -> PyTree:
-        o, spec = self.guard.options, self.guard.world.spec
-        several = max(1, len(self.guard.danger.limits))
-        shape = (batch, spec.n_agents, several) if self.guard.world.alone else (batch, several)
-        told = {"costs": jnp.full((batch, several), jnp.nan)} if several > 1 else {}
-        return told | {
+        options = self.guard.options
+        spec = self.guard.world.spec
+        constraints = max(1, len(self.guard.danger.limits))
+        shape = (batch, spec.n_agents, constraints) if self.guard.world.alone else (batch, constraints)
+        memory = {
             "inner": self.proposal.start(batch),
-            "margin": jnp.full(shape, o.margin),
-            "last": jnp.zeros((batch, o.rows, spec.n_agents, spec.action_dim)),
+            "margin": jnp.full(shape, options.margin),
+            "last": jnp.zeros((batch, options.rows, spec.n_agents, spec.action_dim)),
             "before": jnp.zeros((batch, spec.n_agents, spec.feature_dim)),
             "cost": jnp.full(batch, jnp.nan),
             "age": jnp.zeros((), jnp.int32),
         }
+        if constraints > 1:
+            memory["costs"] = jnp.full((batch, constraints), jnp.nan)
+        return memory
 
-    def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
-        """The memory with the cost that the last step had, (B,) or (B, N), or of each constraint by its name: what an
-        adapting margin follows. Where none is told, it follows its own judgement of the step; a cost of nobody knows
-        which of several constraints is charged to those that judge the step unsafe, or to all."""
-        if isinstance(cost, dict):
-            each, names = {k: _of_team(c) for k, c in cost.items()}, self.guard.danger.limits
-            if "costs" in memory:
-                if strangers := [k for k in each if k not in names]:
-                    raise unknown("constraint", strangers[0], names)
-                heard = [each.get(k, jnp.full_like(memory["cost"], jnp.nan)) for k in names]
-                return {**memory, "costs": jnp.stack(heard, -1)}
-            cost = functools.reduce(jnp.maximum, each.values())
-        return {**memory, "cost": _of_team(cost)}
+    def hear(self, memory: PyTree, cost: Cost) -> PyTree:
+        """The memory with the cost of the last step, (B,) or (B, N), or of each constraint by its name: an adapting
+        margin follows it. Without a cost the margin follows the guard's own judgement of the step. A cost that names
+        none of several constraints is charged to those that judge the step unsafe, or to all."""
+        if not isinstance(cost, dict):
+            return {**memory, "cost": _of_team(cost)}
+        costs = {name: _of_team(c) for name, c in cost.items()}
+        if "costs" not in memory:
+            return {**memory, "cost": functools.reduce(jnp.maximum, costs.values())}
+        names = self.guard.danger.limits
+        for name in costs:
+            if name not in names:
+                raise unknown("constraint", name, names)
+        nothing = jnp.full_like(memory["cost"], jnp.nan)
+        return {**memory, "costs": jnp.stack([costs.get(name, nothing) for name in names], -1)}
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
-        kp, kd = jax.random.split(key)
-        inner, actions, info = self.proposed(memory["inner"], observations, state, kp)
+        key_propose, key_decide = jax.random.split(key)
+        inner, actions, info = self.proposed(memory["inner"], observations, state, key_propose)
         present = self.guard.world.map(observations, state)
-        memory, step = self.decided({**memory, "inner": inner}, present, actions, kd)
+        memory, step = self.decided({**memory, "inner": inner}, present, actions, key_decide)
         return memory, step._replace(info=info | step.info)
 
     def decided(self, memory: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
         """What becomes of proposals (B, P, K, N, A) in the present (B, N, D)."""
-        g = self.guard
-        margin = jnp.full_like(memory["margin"], g.options.margin)  # known to the compiler unless it moves
-        if g.options.adapt:
-            judged = g.danger.now(memory["before"], present) < 0
-            judged = judged if g.world.alone else judged.any(-2)
-            wide = lambda x: x.reshape(-1, *[1] * (judged.ndim - 2), x.shape[-1])  # noqa: E731
-            cost = wide(memory["cost"][:, None])
-            blamed = (cost > 0) & (judged | ~judged.any(-1, keepdims=True))
-            unsafe = jnp.where(jnp.isnan(cost), judged, blamed)
-            if "costs" in memory:
-                unsafe = jnp.where(jnp.isnan(costs := wide(memory["costs"])), unsafe, costs > 0)
-            margin = jnp.where(memory["age"] == 0, margin, g.adapted(memory["margin"], unsafe))
-        found = g.decide(present, actions, memory["last"], margin, key)
+        guard = self.guard
+        margin = jnp.full_like(memory["margin"], guard.options.margin)  # known to the compiler unless it moves
+        if guard.options.adapt:
+            adapted = guard.adapted(memory["margin"], self._was_unsafe(memory, present))
+            margin = jnp.where(memory["age"] == 0, margin, adapted)
+        found = guard.decide(present, actions, memory["last"], margin, key)
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -94,33 +96,52 @@ class Guarded(eqx.Module):
             "infeasible": found.short.any(-1),
             "strange": found.strange.any(-1),
         }
-        spec = g.world.spec
+        spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
+        unknown_costs = {name: jnp.full_like(memory[name], jnp.nan) for name in ("cost", "costs") if name in memory}
         memory = {
             **memory,
+            **unknown_costs,
             "margin": margin,
             "last": found.plan,
             "before": present,
-            **{k: jnp.full_like(memory[k], jnp.nan) for k in ("cost", "costs") if k in memory},
             "age": memory["age"] + 1,
         }
         return memory, PolicyStep(action, info)
 
-    def proposed(self, inner: PyTree, observations: Array, state: Array | None, key: Key):
+    def _was_unsafe(self, memory: PyTree, present: Array) -> Array:
+        """(B, C) bool, or (B, N, C) of agents who are alone: what the step to the present cost, or is judged by the
+        guard itself where its cost is not known."""
+        judged = self.guard.danger.now(memory["before"], present) < 0
+        if not self.guard.world.alone:
+            judged = judged.any(-2)
+        axes = (1,) * (judged.ndim - 2)
+        cost = memory["cost"].reshape(-1, *axes, 1)
+        blamed = (cost > 0) & (judged | ~judged.any(-1, keepdims=True))
+        unsafe = jnp.where(jnp.isnan(cost), judged, blamed)
+        if "costs" in memory:
+            costs = memory["costs"].reshape(-1, *axes, memory["costs"].shape[-1])
+            unsafe = jnp.where(jnp.isnan(costs), unsafe, costs > 0)
+        return unsafe
+
+    def proposed(
+        self, inner: PyTree, observations: Array, state: Array | None, key: Key
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
         """(memory, actions (B, P, K, N, A) in [−1, 1], info) of the proposal."""
-        g = self.guard
+        world = self.guard.world
+        options = self.guard.options
         if hasattr(self.proposal, "propose"):
-            return self.proposal.propose(inner, observations, state, key, g.options.plans, g.options.rows, g.world)
-        spec = g.world.spec
+            return self.proposal.propose(inner, observations, state, key, options.plans, options.rows, world)
         memory, step = self.proposal.act(inner, observations, state, key)
-        action = normalise.to_unit(step.action, spec.action_low, spec.action_high)
-        return memory, held(action, g.options.rows), {}
+        action = normalise.to_unit(step.action, world.spec.action_low, world.spec.action_high)
+        return memory, held(action, options.rows), {}
 
 
 def costs_of_one(cost: Paid) -> np.ndarray | dict[str, np.ndarray]:
     """What one environment's step cost, as `hear` takes it."""
-    one = lambda c: np.full(1, c, np.float32)  # noqa: E731
-    return {k: one(c) for k, c in cost.items()} if isinstance(cost, Mapping) else one(cost)
+    if isinstance(cost, Mapping):
+        return {name: np.full(1, c, np.float32) for name, c in cost.items()}
+    return np.full(1, cost, np.float32)
 
 
 def _of_team(cost: Array) -> Array:
@@ -129,7 +150,12 @@ def _of_team(cost: Array) -> Array:
     return cost if cost.ndim == 1 else cost.max(-1)
 
 
-def options_of(name: str, danger: str, usual: Mapping[str, dict] = MappingProxyType({}), **changes) -> dict:
+# --- options ---
+
+Named = Mapping[str, Mapping[str, Any]]  # options by a guard's name
+
+
+def options_of(name: str, danger: str, usual: Named = MappingProxyType({}), **changes: Any) -> dict[str, Any]:
     """Fields of GuardOptions that a named guard has, where `usual` holds what a task's simulator asks for by name. The
     margin, unless another is asked for, is a calibrated one of what is learned; of a formula less than its safe margin,
     which is what examples of safety have."""
@@ -137,17 +163,23 @@ def options_of(name: str, danger: str, usual: Mapping[str, dict] = MappingProxyT
     return {**GUARDS[name], **margin, **usual.get(name, {}), **changes}
 
 
-def far_sighted(world: World) -> dict[str, dict]:
-    """What guards are asked for, by name, where the rows that they foresee avoid little of the danger that could have
-    been avoided, says the World's card (braking takes longer), and the value of danger leaves nearly all safe steps
-    their margin (of logs that are mostly unsafe it calls everything lost): to judge the last row by it, too."""
-    told = world.card.told.get("barrier", {})
-    if told.get("ahead_kept", 0.0) < KEPT or "avoidable" not in told:
+def far_sighted(world: World) -> Named:
+    """Options of named guards that judge the last row by the value of danger, too: where the World's card says that
+    the predicted rows come too late, and that V leaves nearly all safe steps their margin."""
+    scores = world.card.barrier
+    if scores is None or scores.avoidable is None:
         return {}
-    shares = told["avoidable"]
-    seen = [share for rows, share in zip(shares["before"], shares["avoided"]) if rows <= GuardOptions().rows]
-    far = max(seen, default=0.0) < LITTLE * max(shares["avoided"])
-    return {name: {"future": True} for name in ("shield", "adapt", "full")} if far else {}
+    if not scores.ahead_kept >= KEPT or not _too_late(scores.avoidable):
+        return {}
+    return {name: {"future": True} for name in FAR_SIGHTED}
+
+
+def _too_late(avoidable: Avoidable) -> bool:
+    """Whether the rows that a guard predicts avoid little of the danger that could have been avoided, e.g. where
+    braking takes longer."""
+    rows = GuardOptions().rows
+    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= rows]
+    return max(seen, default=0.0) < LITTLE * max(avoidable.avoided)
 
 
 def build(
@@ -156,17 +188,16 @@ def build(
     hazard: constraints.Hazard | None,
     name: str,
     danger: str,
-    usual: Mapping[str, dict] | None = None,
-    **changes,
+    usual: Named | None = None,
+    **changes: Any,
 ) -> Guarded:
     """A policy under the named guard with changed options; `usual` as in `options_of`, by default what the World's card
     asks for."""
-    from ringfence.utils.config import build_config
-
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
     if usual is None:
-        usual = far_sighted(world) if danger == "learned" and not {"rows", "future"} & set(changes) else {}
+        looks = danger == "learned" and "rows" not in changes and "future" not in changes
+        usual = far_sighted(world) if looks else {}
     options = build_config(GuardOptions, options_of(name, danger, usual, **changes), "the guard")
     if not options.judges:
         raise UserError(

@@ -40,8 +40,8 @@ def for_guard(
         found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.
         wanted = Settings(**usual(registry.TASKS[run.config["task"]], sight)) if _made_here(run) else None
-        told = found.card["settings"]
-        same = wanted is None or (wanted.view, wanted.discount) == (told["view"], told["discount"])
+        settings = found.card.settings
+        same = wanted is None or (wanted.view, wanted.discount) == (settings.view, settings.discount)
         if same and found.alone == (sight == "own"):
             return found
     return _of_data(run, sight, quiet)
@@ -71,11 +71,11 @@ def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
 def _of_same(run: Run, world: World, sight: str) -> None:
     """Refuse a World of other data, or of another sight."""
     told = run.config
-    here, there = told["data"].get("content"), world.card["data"]
-    apart = told["task"] != there["task"] or (here is not None and here != there["content"])
+    here, there = told["data"].get("content"), world.card.data
+    apart = told["task"] != there.task or (here is not None and here != there.content)
     if apart:
         raise UserError(
-            f"The World is of '{there['task']}', the run '{run.path}' of other data ('{told['task']}'); fit one to the "
+            f"The World is of '{there.task}', the run '{run.path}' of other data ('{told['task']}'); fit one to the "
             "data that the run was trained on."
         )
     if world.alone != (sight == "own"):

@@ -12,6 +12,7 @@ from ringfence.datasets.audit import Audit
 from ringfence.report import html
 from ringfence.report.figures import INK, figure, style, to_svg
 from ringfence.world import Card
+from ringfence.world.card import BarrierScores
 
 # What is said of each number of a judgement, and of which kind it is.
 CONDUCT = {
@@ -25,8 +26,8 @@ CONDUCT = {
 def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str, Any] | None = None) -> Path:
     """Write the page of logs and their World, and of a policy that was judged by them (`judging.judge`)."""
     drawn = []
-    if "barrier" in card and "calibration" in card["barrier"]:
-        drawn.append(("What a margin means", _calibration(card["barrier"]), _said_of(card["barrier"])))
+    if card.barrier is not None and card.barrier.calibration:
+        drawn.append(("What a margin means", _calibration(card.barrier), _said_of(card.barrier)))
     if judged and judged.get("margins"):
         drawn.append(
             (
@@ -40,7 +41,7 @@ def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str,
     text = html.render(
         "judgement.html.j2",
         {
-            "title": f"{card['data']['task']}: what its logs say" + (f" of {judged['algorithm']}" if judged else ""),
+            "title": f"{card.data.task}: what its logs say" + (f" of {judged['algorithm']}" if judged else ""),
             "facts": audit.facts.items(),
             "warnings": [*audit.warnings, *audit.notes],
             "words": words,
@@ -52,27 +53,27 @@ def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str,
     return html.write(Path(out), text)
 
 
-def _calibration(barrier: dict[str, Any]) -> str:
+def _calibration(barrier: BarrierScores) -> str:
     """Unsafe steps in 1000, and safe ones kept, by margin."""
-    rows = barrier["calibration"]
-    x = [r["margin"] for r in rows]
+    rows = barrier.calibration
+    x = [row.margin for row in rows]
     with style():
         made = figure(8.2, 2.8)
         left, right = made.subplots(1, 2)
-        left.plot(x, [r["unsafe_in_1000"] for r in rows], marker="o", color=INK)
+        left.plot(x, [row.unsafe_in_1000 for row in rows], marker="o", color=INK)
         left.set_ylabel("unsafe of 1000")
         left.set_ylim(bottom=0)
-        right.plot(x, [100 * r["safe_kept"] for r in rows], marker="o", color=INK)
+        right.plot(x, [100 * row.safe_kept for row in rows], marker="o", color=INK)
         right.set_ylabel("safe steps that have it, %")
         right.set_ylim(0, 103)
         for ax in (left, right):
-            ax.axvline(barrier["margin"], color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
+            ax.axvline(barrier.margin, color=INK, linewidth=1.0, linestyle=(0, (3, 3)))
             ax.set_xlabel("margin of a held-out step, or more")
         return to_svg(made, "Unsafe steps and safe steps by margin", "calibration")
 
 
-def _said_of(barrier: dict[str, Any]) -> str:
-    return f"Dashed: the default margin, {barrier['margin']:.2g}. Held-out steps, as often unsafe as in the logs."
+def _said_of(barrier: BarrierScores) -> str:
+    return f"Dashed: the default margin, {barrier.margin:.2g}. Held-out steps, as often unsafe as in the logs."
 
 
 def _margins(margins: dict[str, list[float]]) -> str:

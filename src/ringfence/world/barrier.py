@@ -1,13 +1,13 @@
 """The barrier: danger learned from labels alone, one signed score h_i(s̃_i) per agent, h ≥ 0 is safe.
 
-    ℓ   what is dangerous now, of a step: fitted to the end, classes balanced, by held-out episodes
+    ℓ   what is dangerous now, of a step: fitted to labels, classes balanced
     V   what will be dangerous whatever one does: V = max over what the logs do of min(ℓ, V(s')), so that {V ≥ 0} is
         where logged behaviour can stay safe; h = V meets the paper's (3), sup_a h(f(s, a)) ≥ (1 − α) h(s)
 
-A team's label is explained by its *worst* agent, min_i ℓ_i, so the data itself finds out who was in danger; and an
-agent's score by its worst neighbour, ℓ_i = min(g_0(own), min_j g(own, other j)), one g for all pairs, wherever names
-tell which entries belong to whom. Without that, what is learned of few unsafe steps does not carry over to new ones.
-Agents that share a body share its danger: they are all to blame, and each looks at all it sees.
+A team's label is explained by its *worst* agent, min_i ℓ_i, so the data itself finds out who was in danger. An agent's
+score is explained by its worst neighbour, ℓ_i = min(g_0(own), min_j g(own, other j)), one g for all pairs, wherever
+names say which entries belong to whom. Without that, what few unsafe steps teach does not carry over to new ones.
+Agents that share a body share its danger: all of them answer for it, and each reads all it sees.
 
 Scores are log-odds of "safe" with both classes equally frequent: 0 is where either is as likely.
 
@@ -18,6 +18,7 @@ Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample b
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Literal
 
 import equinox as eqx
@@ -65,7 +66,7 @@ class Barrier(eqx.Module):
 
     def of_steps(self, before: Array, after: Array) -> Array:
         """ℓ (..., N) of steps from features (..., N, D) to others."""
-        return soft(_score(self.label, self.shape, self._seen(before, after), after.shape[:-1]))
+        return soft(_score(self.label, self.shape, self.standardised(before, after), after.shape[:-1]))
 
     def ahead(self, x: Array) -> Array:
         """V (..., N) of states (..., N, D)."""
@@ -79,7 +80,8 @@ class Barrier(eqx.Module):
         """V (..., N, 1) likewise."""
         return (self.ahead(x) / self.unit)[..., None]
 
-    def _seen(self, before: Array, after: Array) -> Array:
+    def standardised(self, before: Array, after: Array) -> Array:
+        """What ℓ reads of steps: where they lead, and how they move where both ends are read."""
         x = (after - self.mean) / self.scale
         if not self.shape.both_ends:
             return x
@@ -120,39 +122,68 @@ def soft(score: Array) -> Array:
     return FARTHEST * jnp.tanh(score / FARTHEST)
 
 
+# --- what is read ---
+
+
 def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = True) -> Shape:
     """The shape that a view's names tell; without `distances` pairs do not read how far apart they are. A body's danger
     is of a step (a mean speed), so both its ends are read; of agents in a plane it is of the state that a step leads
     to, unless told otherwise."""
-    names, n = map.names, map.plus.shape[0]
+    names = map.names
+    things = {} if map.joint else _things(names)
+    if not things:
+        return Shape(
+            own=tuple(range(len(names))),
+            pairs=(),
+            offsets=(),
+            both_ends=map.body if both_ends is None else both_ends,
+            groups=1 if map.joint else map.plus.shape[0],
+            joint=map.joint,
+            blame="all" if map.body else "worst",
+        )
+    # A pair is the same wherever it is: own entries but the place.
+    moving = tuple(d for d, name in enumerate(names) if _own_but_place(name))
+    pairs = tuple((kind, tuple(moving + entries for entries in each)) for kind, each in things.items())
+    inside = {d for each in things.values() for entries in each for d in entries}
+    return Shape(
+        own=tuple(d for d in range(len(names)) if d not in inside),
+        pairs=pairs,
+        offsets=tuple(_offsets(names, kind, each[0]) if distances else ((), ()) for kind, each in pairs),
+        both_ends=bool(both_ends),
+        groups=1,
+        joint=False,
+        blame="worst",
+    )
+
+
+def _own_but_place(name: str) -> bool:
+    return name.startswith("own.") and name.split(".")[1] not in ("x", "y", "z")
+
+
+def _things(names: tuple[str, ...]) -> dict[str, list[tuple[int, ...]]]:
+    """Entries of each other, obstacle or wall, by kind, in the order of their fields' names; of kinds whose things all
+    have the same fields."""
     found: dict[str, dict[int, dict[str, int]]] = {}
     for d, name in enumerate(names):
         match = re.fullmatch(r"([a-z]+)(\d+)\.(\w+)", name)
-        if match and match[1] in DANGEROUS and not map.joint:
+        if match and match[1] in DANGEROUS:
             found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
-    found = {k: who for k, who in found.items() if len({tuple(sorted(e)) for e in who.values()}) == 1}
-    if map.joint or not found:
-        ends = map.body if both_ends is None else both_ends
-        shared = 1 if map.joint else n
-        return Shape(tuple(range(len(names))), (), (), ends, shared, map.joint, "all" if map.body else "worst")
-    inside = {d for who in found.values() for entries in who.values() for d in entries.values()}
-    # A pair is the same wherever it is: own entries but the place.
-    moving = tuple(d for d, x in enumerate(names) if x.startswith("own.") and x.split(".")[1] not in ("x", "y", "z"))
-    pairs = tuple(
-        (kind, tuple(moving + tuple(entries[f] for f in sorted(entries)) for _, entries in sorted(who.items())))
-        for kind, who in found.items()
-    )
-    offsets = []
-    for kind, entries in pairs:
-        fields = [names[d].split(".")[1] for d in entries[0]]
-        is_of = [kind == re.sub(r"\d+\..*", "", names[d]) for d in entries[0]]
-        place, speed = (
-            tuple(k for k, f in enumerate(fields) if is_of[k] and re.fullmatch(word, f))
-            for word in ("d[xyz]", "dv[xyz]")
-        )
-        offsets.append((place, speed if len(speed) == len(place) else ()) if distances else ((), ()))
-    own = tuple(d for d in range(len(names)) if d not in inside)
-    return Shape(own, pairs, tuple(offsets), bool(both_ends), 1, False, "worst")
+    kinds: dict[str, list[tuple[int, ...]]] = {}
+    for kind, things in found.items():
+        if len({tuple(sorted(fields)) for fields in things.values()}) == 1:
+            kinds[kind] = [tuple(fields[f] for f in sorted(fields)) for _, fields in sorted(things.items())]
+    return kinds
+
+
+def _offsets(names: tuple[str, ...], kind: str, pair: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Which of a pair's entries are the offset (dx, ...) and the relative velocity (dvx, ...)."""
+
+    def those(field: str) -> tuple[int, ...]:
+        return tuple(k for k, d in enumerate(pair) if re.fullmatch(rf"{kind}\d+\.{field}", names[d]))
+
+    place = those("d[xyz]")
+    speed = those("dv[xyz]")
+    return place, speed if len(speed) == len(place) else ()
 
 
 def networks(key: Key, shape: Shape, width: int) -> dict[str, MLP]:
@@ -161,19 +192,22 @@ def networks(key: Key, shape: Shape, width: int) -> dict[str, MLP]:
     keys = jax.random.split(key, 1 + len(shape.pairs))
     made = {}
     if shape.own:
-        made["own"] = MLP(keys[0], (twice * len(shape.own), width, width, width, 1), groups=shape.groups)
+        own = MLP(keys[0], (twice * len(shape.own), width, width, width, 1), groups=shape.groups)
         if shape.pairs:
-            made["own"] = eqx.tree_at(lambda m: m.biases[-1], made["own"], made["own"].biases[-1] + UNSURE)
-    for k, (kind, entries), (place, speed) in zip(keys[1:], shape.pairs, shape.offsets):
-        made[kind] = MLP(k, (twice * len(entries[0]) + bool(place) + bool(speed), width, width, width, 1))
+            own = eqx.tree_at(lambda m: m.biases[-1], own, own.biases[-1] + UNSURE)
+        made["own"] = own
+    for pair_key, (kind, entries), (place, speed) in zip(keys[1:], shape.pairs, shape.offsets):
+        inputs = twice * len(entries[0]) + bool(place) + bool(speed)
+        made[kind] = MLP(pair_key, (inputs, width, width, width, 1))
     return made
 
 
 def isotropic(shape: Shape, mean: np.ndarray, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Statistics (D,) under which offsets keep their directions: one scale for all axes and all of a kind, around 0."""
-    mean, scale = mean.copy(), scale.copy()
-    for (_, entries), which in zip(shape.pairs, shape.offsets):
-        for some in which:
+    mean = mean.copy()
+    scale = scale.copy()
+    for (_, entries), fields in zip(shape.pairs, shape.offsets):
+        for some in fields:
             d = np.array([pair[k] for pair in entries for k in some], int)
             if len(d):
                 scale[d] = np.sqrt((scale[d] ** 2 + mean[d] ** 2).mean())
@@ -182,33 +216,42 @@ def isotropic(shape: Shape, mean: np.ndarray, scale: np.ndarray) -> tuple[np.nda
 
 
 def _still(shape: Shape) -> Shape:
-    return Shape(shape.own, shape.pairs, shape.offsets, False, shape.groups, shape.joint, shape.blame)
+    """The same of states instead of steps."""
+    return replace(shape, both_ends=False)
 
 
 def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
     """Scores (..., N) of standardised entries (..., N, D or 2D); `agents` is that shape."""
     half = z.shape[-1] // (2 if shape.both_ends else 1)
+    if shape.joint:
+        z = z[..., :1, :]
 
     def read(entries: np.ndarray) -> Array:
         index = np.concatenate([entries, entries + half], -1) if shape.both_ends else entries
         return z[..., index]
 
     parts = []
-    if shape.joint:
-        z = z[..., :1, :]
     if "own" in nets:
         parts.append(jnp.broadcast_to(nets["own"](read(np.array(shape.own)))[..., 0], agents))
     for (kind, entries), (place, speed) in zip(shape.pairs, shape.offsets):
-        pair = read(np.array(entries))  # (..., N, J, F)
-        if place:  # how far, and how fast nearer: what does not change when everything turns
-            offset = pair[..., np.array(place)]
-            far = jnp.sqrt((offset**2).sum(-1, keepdims=True) + 1e-9)
-            more = [far] + ([(offset * pair[..., np.array(speed)]).sum(-1, keepdims=True) / far] if speed else [])
-            pair = jnp.concatenate([pair, *more], -1)
+        pair = _with_distance(read(np.array(entries)), place, speed)
         each = nets[kind](pair.reshape(*z.shape[:-2], -1, pair.shape[-1]))[..., 0]
         each = each.reshape(*z.shape[:-1], len(entries))
         parts += [each[..., j] for j in range(len(entries))]
     return least(parts)
+
+
+def _with_distance(pair: Array, place: tuple[int, ...], speed: tuple[int, ...]) -> Array:
+    """Pairs (..., N, J, F) with how far apart they are and how fast they part, where entries tell: what does not change
+    when everything turns."""
+    if not place:
+        return pair
+    offset = pair[..., np.array(place)]
+    distance = jnp.sqrt((offset**2).sum(-1, keepdims=True) + 1e-9)
+    if not speed:
+        return jnp.concatenate([pair, distance], -1)
+    parting = (offset * pair[..., np.array(speed)]).sum(-1, keepdims=True) / distance
+    return jnp.concatenate([pair, distance, parting], -1)
 
 
 # --- fitting ---
@@ -229,45 +272,52 @@ def fit_label(
     batch: int = 512,
     quiet: bool = True,
 ) -> Barrier:
-    """ℓ fitted to the end. data: features (M, N, D), foreseen (T, N, D), row (T,), label (T,) or (T, N) bool of steps;
+    """ℓ fitted to labels. data: features (M, N, D), predicted (T, N, D), row (T,), label (T,) or (T, N) bool of steps;
     `unsafe` and `safe` index the steps to learn from. A quarter of every batch is unsafe.
 
-    A `share` of the steps is read as it was *foreseen* to end: that is what a barrier is asked about. Learned from what
-    came to be alone, it may take the rebound after a contact for the contact, which nobody foresees.
+    A `share` of the steps ends where it was *predicted* to end: that is what a barrier is asked about. Learned from
+    what came to be alone, it may take the rebound after a contact for the contact, which no model predicts.
 
     Hinges are the paper's with a margin of 1; `gradient-penalty` adds `penalty` · E(‖∇ℓ(ŝ)‖ − 1)² between the classes.
     """
-    kn, kf = jax.random.split(key)
-    shape, some = barrier.shape, batch // 4
-    bad, fine = jnp.asarray(unsafe), jnp.asarray(safe)
+    key_nets, key_fit = jax.random.split(key)
+    shape = barrier.shape
+    few = batch // 4
 
-    def objective(net: dict[str, MLP], data, pick: Array) -> Array:
-        x, foreseen, row, label, bad, fine = data
-        step = jnp.concatenate([bad[pick[:some] % len(unsafe)], fine[pick[some:] % len(safe)]])
-        before, came, told = x[row[step]], x[row[step] + 1], label[step]
-        read = (jnp.floor(jnp.arange(1, batch + 1) * share) > jnp.floor(jnp.arange(batch) * share))[:, None, None]
-        after = jnp.where(read, foreseen[step], came)
-        z = barrier._seen(before, after)
+    def objective(net: dict[str, MLP], data: tuple[Array, ...], pick: Array) -> Array:
+        x, predicted, row, label, bad, fine = data
+        step = jnp.concatenate([bad[pick[:few] % len(unsafe)], fine[pick[few:] % len(safe)]])
+        before = x[row[step]]
+        as_predicted = jnp.floor(jnp.arange(1, batch + 1) * share) > jnp.floor(jnp.arange(batch) * share)
+        after = jnp.where(as_predicted[:, None, None], predicted[step], x[row[step] + 1])
+        z = barrier.standardised(before, after)
         h = _score(net, shape, z, after.shape[:-1])
-        if told.ndim == 1 and shape.blame == "worst":
+        truth = label[step]
+        if truth.ndim == 1 and shape.blame == "worst":
             h = lowest(h)
-        elif told.ndim == 1:
-            told = jnp.broadcast_to(told[:, None], h.shape)
+        elif truth.ndim == 1:
+            truth = jnp.broadcast_to(truth[:, None], h.shape)
         if loss == "cross-entropy":
-            return optax.sigmoid_binary_cross_entropy(-h, told.astype(jnp.float32)).mean()
-        total = jnp.where(told, jax.nn.relu(1.0 + h), jax.nn.relu(1.0 - h)).mean()
+            return optax.sigmoid_binary_cross_entropy(-h, truth.astype(jnp.float32)).mean()
+        total = jnp.where(truth, jax.nn.relu(1.0 + h), jax.nn.relu(1.0 - h)).mean()
         if loss == "gradient-penalty":
-            part = jnp.linspace(0.0, 1.0, some)[:, None, None]
-            between = part * z[:some] + (1 - part) * z[some : 2 * some]
-            slope = jax.grad(lambda z: _score(net, shape, z, after[:some].shape[:-1]).sum())(between)
-            total = total + penalty * ((jnp.sqrt((slope**2).sum(-1) + 1e-9) - 1.0) ** 2).mean()
+            total = total + penalty * _steepness(net, shape, z, few, after[:few].shape[:-1])
         return total
 
-    net = networks(kn, shape, width)
-    words = "" if quiet else "barrier, what is dangerous now"
     rows = 2**31 - 1
-    found = regress(objective, net, (*data, bad, fine), rows, kf, updates, batch, 2e-3, words, decay=1e-4)
+    net = networks(key_nets, shape, width)
+    words = "" if quiet else "barrier, what is dangerous now"
+    given = (*data, jnp.asarray(unsafe), jnp.asarray(safe))
+    found = regress(objective, net, given, rows, key_fit, updates, batch, 2e-3, words, decay=1e-4)
     return eqx.tree_at(lambda b: b.label, barrier, found)
+
+
+def _steepness(net: dict[str, MLP], shape: Shape, z: Array, few: int, agents: tuple[int, ...]) -> Array:
+    """E(‖∇ℓ‖ − 1)² between the unsafe steps, the first `few` of a batch, and as many safe ones (LatentCBF)."""
+    part = jnp.linspace(0.0, 1.0, few)[:, None, None]
+    between = part * z[:few] + (1 - part) * z[few : 2 * few]
+    slope = jax.grad(lambda z: _score(net, shape, z, agents).sum())(between)
+    return ((jnp.sqrt((slope**2).sum(-1) + 1e-9) - 1.0) ** 2).mean()
 
 
 def fit_future(
@@ -288,17 +338,20 @@ def fit_future(
     what the logs did, V̄ a slow copy. It begins as ℓ, which it never exceeds, where that reads states alone. A quarter
     of every batch is of the steps `close` to danger; the rest is of all that are `picked`.
     """
-    kn, kf = jax.random.split(key)
-    shape, some = _still(barrier.shape), batch // 4 if len(close) else 0
-    width = next(iter(barrier.label.values())).weights[0].shape[-1]
-    net = networks(kn, shape, width) if barrier.shape.both_ends else barrier.label
-    near, all_of = (jnp.asarray(x if len(x) else picked) for x in (close, picked))
+    key_nets, key_fit = jax.random.split(key)
+    shape = _still(barrier.shape)
+    few = batch // 4 if len(close) else 0
+    net = barrier.label
+    if barrier.shape.both_ends:
+        width = next(iter(barrier.label.values())).weights[0].shape[-1]
+        net = networks(key_nets, shape, width)
 
-    def objective(pair, data, pick: Array) -> Array:
+    def objective(pair: tuple[dict[str, MLP], dict[str, MLP]], data: tuple[Array, ...], pick: Array) -> Array:
         net, slow = pair
         x, row, ended, near, all_of = data
-        step = jnp.concatenate([near[pick[:some] % len(near)], all_of[pick[some:] % len(all_of)]])
-        before, after = x[row[step]], x[row[step] + 1]
+        step = jnp.concatenate([near[pick[:few] % len(near)], all_of[pick[few:] % len(all_of)]])
+        before = x[row[step]]
+        after = x[row[step] + 1]
         now = barrier.of_steps(before, after)
         ahead = soft(_score(slow, shape, (after - barrier.mean) / barrier.scale, after.shape[:-1]))
         ahead = jnp.where(ended[step][:, None], now, ahead)
@@ -307,19 +360,30 @@ def fit_future(
         error = goal - value
         return (jnp.where(error > 0, expectile, 1 - expectile) * error**2).mean()
 
-    def follow(pair):
+    def follow(pair: tuple[dict[str, MLP], dict[str, MLP]]) -> tuple[dict[str, MLP], dict[str, MLP]]:
         net, slow = pair
         return net, jax.tree.map(lambda s, n: s + rate * (n - s), slow, net)
 
-    data = arrays["features"], arrays["row"], arrays["terminated"], near, all_of
+    near = jnp.asarray(close if len(close) else picked)
+    data = arrays["features"], arrays["row"], arrays["terminated"], near, jnp.asarray(picked)
     words = "" if quiet else "barrier, what will be dangerous"
     pair = net, jax.tree.map(jnp.copy, net)
-    found = regress(objective, pair, data, 2**31 - 1, kf, updates, batch, 1e-3, words, after=follow)
+    found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=follow)
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
 def blank_barrier(map: FeatureMap, width: int, both_ends: bool | None = None, distances: bool = True) -> Barrier:
     """A barrier of the right shapes that says nothing."""
-    shape, one = shape_of(map, both_ends, distances), jnp.ones(len(map.names))
-    nets = networks(jax.random.key(0), shape, width), networks(jax.random.key(0), _still(shape), width)
-    return Barrier(*nets, one, one, one, one, jnp.ones(()), shape)
+    shape = shape_of(map, both_ends, distances)
+    one = jnp.ones(len(map.names))
+    key = jax.random.key(0)
+    return Barrier(
+        label=networks(key, shape, width),
+        future=networks(key, _still(shape), width),
+        mean=one,
+        scale=one,
+        step_mean=one,
+        step_scale=one,
+        unit=jnp.ones(()),
+        shape=shape,
+    )

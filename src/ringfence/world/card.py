@@ -1,90 +1,256 @@
-"""What is known of a World, as a value and in words."""
+"""What is known of a World: typed numbers, as JSON in its file, and in words."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
+import msgspec
+
+from ringfence.utils.config import build_config
+from ringfence.utils.renamed import deprecated
+from ringfence.world.settings import Settings
+
 JUDGED = 3  # steps ahead that the margin is calibrated for
+UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
 
-def words(told: dict[str, Any]) -> list[str]:
-    """The card as a person reads it."""
-    if not told:
-        return ["an empty card"]
-    held, see, worth = told["held_out"], told["foresight"], told["values"]
-    lines = [
-        f"World of '{told['data']['task']}', seed {told['seed']}, sight {told['settings']['sight']}: "
-        f"{told['data']['episodes']} episodes, judged on {held['episodes']} that nothing was fitted to "
-        f"({held['steps']} steps)."
-    ]
-    errors = see["error_of_change"]
-    far = ", ".join(
-        f"{100 * errors[k]:.2g} % at {k + 1}" for k in sorted({0, min(2, len(errors) - 1), len(errors) - 1})
-    )
-    lines.append(f"Foresight errs by this share of what changes, steps ahead: {far}.")
-    lines.append(
-        f"Rewards of steps are explained to {100 * worth['reward_r2']:.3g} %, returns-to-go to "
-        f"{100 * worth['value_r2']:.3g} % of their variance."
-    )
-    lines.append(
-        f"It calls a place strange where its forward models are more than {told['strange']['threshold']:.2g} usual "
-        f"steps apart: {100 * told['strange']['level']:g} % of held-out episodes never are."
-    )
-    danger = told.get("barrier")
-    if danger is None:
-        return [*lines, "No barrier: guards need a formula of danger."]
-    if "warning" in danger:
-        return [*lines, f"Barrier ({told['shape']}): {danger['warning']}."]
-    lines.append(f"Barrier: {told['shape']}. {100 * danger['unsafe_share']:.3g} % of held-out steps are unsafe.")
-    lines.append(
-        f"With 1 false alarm in 100 safe steps it finds {100 * danger['recall']:.1f} % of the unsafe ones (AUROC "
-        f"{danger['auroc']:.4f}); at 0 it calls {100 * danger['false_safe']:.2g} % of unsafe steps safe and "
-        f"{100 * danger['false_unsafe']:.2g} % of safe ones unsafe."
-    )
-    for row in danger["calibration"]:
-        lines.append(
-            f"  of 1000 held-out steps with a margin of {row['margin']:g} or more, {row['unsafe_in_1000']:.2g} are "
-            f"unsafe; {100 * row['safe_kept']:.3g} % of the safe steps have it"
-        )
-    told_of, kept = danger["avoidable"], danger.get("ahead_kept")  # which older cards lack
-    shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(told_of["before"], told_of["avoided"]))
-    lines.append(
-        f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
-        f"{told_of['rows']} ahead (rows={told_of['rows']}), where foresight reaches that far"
-        + (f", or V, which leaves {100 * kept:.3g} % of the safe steps their margin." if kept is not None else ".")
-    )
-    for name, found in told.get("constraints", {}).items():
-        limit = f"Constraint '{name}', at most {told['data']['constraints'][name]:g} per episode"
-        lines.append(
-            f"{limit}: {found['warning']}."
-            if "warning" in found
-            else f"{limit}: {100 * found['unsafe_share']:.3g} % of held-out steps are unsafe, of which it finds "
-            f"{100 * found['recall']:.1f} % with 1 false alarm in 100 (AUROC {found['auroc']:.4f}); its margin is "
-            f"{found['margin']:.2g}, the unit of the lines above."
-        )
-    if "constraints" in told:
-        return lines
-    lines.append(
-        f"Default margin {danger['margin']:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} steps "
-        f"before, {1000 * danger['missed']:.2g} looked as safe as that."
-    )
-    return lines
+class Part(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A part of the card."""
 
 
-@dataclass(frozen=True, eq=False)
-class Card:
-    """What is known of a World: of which data, with which settings and seed, and how good on held-out episodes.
-    `card["barrier"]["recall"]` and the like; `print(card)` says it in words (`card.py`)."""
+class Data(Part, frozen=True):
+    """The data set that a World was fitted to."""
 
-    told: dict[str, Any]
+    task: str
+    hazard: dict[str, Any]  # constraints.to_dict
+    content: str = ""  # digest of its arrays
+    episodes: int = 0
+    constraints: dict[str, float] | None = None  # limit per episode of each one that the logs name
 
-    def __getitem__(self, name: str) -> Any:
-        return self.told[name]
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.told)
+class HeldOut(Part, frozen=True):
+    """What nothing was fitted to."""
+
+    episodes: int
+    steps: int
+
+
+class Foresight(Part, frozen=True):
+    """Errors of the forward models, rolled out along logged actions."""
+
+    steps_ahead: tuple[int, ...]
+    error_of_change: tuple[float, ...]  # root mean square error as a share of the change, by steps ahead
+    by_entry: dict[str, tuple[float, ...]]  # root mean square error in the entry's unit: 1, 3 and all steps ahead
+
+
+class ValueScores(Part, frozen=True):
+    """Shares of variance that the values explain."""
+
+    reward_r2: float
+    value_r2: float
+
+
+class Threshold(Part, frozen=True):
+    """Ensemble disagreement above which a state is out of distribution, in usual steps."""
+
+    threshold: float
+    level: float  # share of held-out episodes that stay below it throughout
+
+
+class MarginScores(Part, frozen=True):
+    """What a margin means on held-out steps."""
+
+    margin: float
+    unsafe_in_1000: float  # of the steps that have it, both classes as frequent as in the logs
+    unsafe_foreseen_above: float  # share of entries into danger that were predicted to have it
+    safe_kept: float  # share of the safe steps that have it
+
+
+class Avoidable(Part, frozen=True):
+    """How much of the danger could still be avoided, as the World predicts it."""
+
+    before: tuple[int, ...]  # steps before entering danger
+    avoided: tuple[float, ...]  # share of the entries, likewise
+    rows: int  # the horizon at which a guard avoids nearly all that can be avoided
+
+
+class BarrierScores(Part, frozen=True):
+    """How well a barrier tells danger. With a `warning` the numbers are not known."""
+
+    warning: str = ""
+    unsafe_share: float = UNKNOWN
+    auroc: float = UNKNOWN
+    recall: float = UNKNOWN  # share of the unsafe steps that are found, at `false_alarms`
+    false_alarms: float = UNKNOWN
+    false_safe: float = UNKNOWN  # share of the unsafe steps with a score of 0 or more
+    false_unsafe: float = UNKNOWN
+    foreseen_false_safe: float = UNKNOWN  # the same of entries into danger, by predicted scores
+    margin: float = UNKNOWN  # the default one, calibrated
+    missed: float = UNKNOWN  # share of entries that are predicted to have it
+    calibration: tuple[MarginScores, ...] = ()
+    ahead_kept: float = UNKNOWN  # share of the safe steps that keep the margin by V
+    avoidable: Avoidable | None = None
+
+
+class Card(msgspec.Struct, frozen=True, kw_only=True):
+    """What is known of a World: its data, settings and seed, and how good it is on held-out episodes, e.g.
+    `card.barrier.recall`. `print(card)` says it in words.
+
+    It is a static field of the World. So it is hashed and compared by content: what was compiled for a World serves
+    another one that is the same.
+    """
+
+    data: Data = Data(task="", hazard={})
+    settings: Settings = Settings()
+    seed: int = 0
+    format: int = 0
+    shape: str = ""  # of the barrier, in words
+    seconds: dict[str, float] = {}  # that fitting each part took
+    held_out: HeldOut | None = None
+    foresight: Foresight | None = None
+    values: ValueScores | None = None
+    strange: Threshold | None = None
+    barrier: BarrierScores | None = None
+    constraints: dict[str, BarrierScores] | None = None  # by name, where the logs name several
+    unread: dict[str, Any] = {}  # what else a file says of it
+
+    def __hash__(self) -> int:
+        return hash((self.data.task, self.data.content, self.seed, self.format))
 
     def __str__(self) -> str:
-        return "\n".join(words(self.told))
+        return "\n".join(summary(self))
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> Card:
+        """The card of a file. What it does not name stays in `unread`; msgspec.ValidationError where a part is none."""
+        settings = build_config(Settings, stored["settings"], "the World")
+        parts = {name: value for name, value in stored.items() if name != "settings"}
+        card = msgspec.structs.replace(msgspec.convert(parts, cls), settings=settings)
+        return msgspec.structs.replace(card, unread=_beyond(stored, card.to_json()))
+
+    def to_json(self) -> dict[str, Any]:
+        """The card as files hold it."""
+        parts = msgspec.to_builtins(self)
+        more = parts.pop("unread")
+        known = {name: value for name, value in parts.items() if value not in (None, {})}
+        return _joined(known, more)
+
+    def __getitem__(self, name: str) -> Any:
+        deprecated(f"card['{name}']", f"card.{name}")
+        return self.to_json()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.to_json())
+
+
+def _beyond(stored: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
+    """What a file holds beyond what is known of it, however deep it stands."""
+    found: dict[str, Any] = {}
+    for name, value in stored.items():
+        if name not in known:
+            found[name] = value
+        elif isinstance(value, dict) and (more := _beyond(value, known[name])):
+            found[name] = more
+    return found
+
+
+def _joined(known: dict[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    """The same with what `_beyond` found."""
+    found = dict(known)
+    for name, value in more.items():
+        found[name] = _joined(known[name], value) if name in known else value
+    return found
+
+
+# --- in words ---
+
+
+def summary(card: Card) -> list[str]:
+    """The card as a person reads it, line by line."""
+    if not card.data.task:
+        return ["an empty card"]
+    return [*_of_data(card), *_of_prediction(card), *_of_barrier(card)]
+
+
+def _of_data(card: Card) -> Iterator[str]:
+    line = (
+        f"World of '{card.data.task}', seed {card.seed}, sight {card.settings.sight}: {card.data.episodes} episodes, "
+    )
+    held_out = card.held_out
+    if held_out is None:
+        yield line + "judged on none."
+        return
+    yield f"{line}judged on {held_out.episodes} that nothing was fitted to ({held_out.steps} steps)."
+
+
+def _of_prediction(card: Card) -> Iterator[str]:
+    if card.foresight is not None:
+        errors = card.foresight.error_of_change
+        shown = sorted({0, min(2, len(errors) - 1), len(errors) - 1})
+        far = ", ".join(f"{100 * errors[k]:.2g} % at {k + 1}" for k in shown)
+        yield f"Foresight errs by this share of what changes, steps ahead: {far}."
+    if card.values is not None:
+        yield (
+            f"Rewards of steps are explained to {100 * card.values.reward_r2:.3g} %, returns-to-go to "
+            f"{100 * card.values.value_r2:.3g} % of their variance."
+        )
+    if card.strange is not None:
+        yield (
+            f"It calls a place strange where its forward models are more than {card.strange.threshold:.2g} usual "
+            f"steps apart: {100 * card.strange.level:g} % of held-out episodes never are."
+        )
+
+
+def _of_barrier(card: Card) -> Iterator[str]:
+    scores = card.barrier
+    if scores is None:
+        yield "No barrier: guards need a formula of danger."
+        return
+    if scores.warning:
+        yield f"Barrier ({card.shape}): {scores.warning}."
+        return
+    yield f"Barrier: {card.shape}. {100 * scores.unsafe_share:.3g} % of held-out steps are unsafe."
+    yield (
+        f"With 1 false alarm in 100 safe steps it finds {100 * scores.recall:.1f} % of the unsafe ones (AUROC "
+        f"{scores.auroc:.4f}); at 0 it calls {100 * scores.false_safe:.2g} % of unsafe steps safe and "
+        f"{100 * scores.false_unsafe:.2g} % of safe ones unsafe."
+    )
+    for row in scores.calibration:
+        yield (
+            f"  of 1000 held-out steps with a margin of {row.margin:g} or more, {row.unsafe_in_1000:.2g} are "
+            f"unsafe; {100 * row.safe_kept:.3g} % of the safe steps have it"
+        )
+    if scores.avoidable is not None:
+        yield _of_horizon(scores.avoidable, scores.ahead_kept)
+    if card.constraints is None:
+        yield (
+            f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} "
+            f"steps before, {1000 * scores.missed:.2g} looked as safe as that."
+        )
+        return
+    for name, found in card.constraints.items():
+        yield _of_constraint(name, (card.data.constraints or {}).get(name, UNKNOWN), found)
+
+
+def _of_horizon(avoidable: Avoidable, kept: float) -> str:
+    shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
+    line = (
+        f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
+        f"{avoidable.rows} ahead (rows={avoidable.rows}), where foresight reaches that far"
+    )
+    if math.isnan(kept):
+        return line + "."
+    return f"{line}, or V, which leaves {100 * kept:.3g} % of the safe steps their margin."
+
+
+def _of_constraint(name: str, limit: float, scores: BarrierScores) -> str:
+    line = f"Constraint '{name}', at most {limit:g} per episode"
+    if scores.warning:
+        return f"{line}: {scores.warning}."
+    return (
+        f"{line}: {100 * scores.unsafe_share:.3g} % of held-out steps are unsafe, of which it finds "
+        f"{100 * scores.recall:.1f} % with 1 false alarm in 100 (AUROC {scores.auroc:.4f}); its margin is "
+        f"{scores.margin:.2g}, the unit of the lines above."
+    )

@@ -1,9 +1,9 @@
 """What actions do: an ensemble of forward models, learned from the logs before anything is generated.
 
-Guards check by it where actions really lead, so its errors are what they have to keep in hand. Its members differ in
-their first weights and in the order of the steps they see; where they disagree, the logs have not been.
+Guards check by it where actions lead, so its errors are what their margins have to cover. Its members differ in their
+first weights and in the order of the steps they see. Where they disagree, the state is out of distribution.
 
-It is fitted long enough to learn contacts: a few thousand updates, which predict free motion well, predict no kick.
+It is fitted long enough to learn contacts. A few thousand updates predict free motion well, and no kick.
 """
 
 from __future__ import annotations
@@ -27,26 +27,27 @@ BATCH = 128  # small and often: at equal time it learns contacts that 512 at hal
 
 
 class Dynamics(eqx.Module):
-    """g_φ of E members. Agents that share a body (`FeatureMap.joint`) have one model of it, which reads everybody's
-    action and is told in the first agent's view; otherwise every agent's own entries follow from its own action, and
-    the rest from them (`FeatureMap.reconcile`).
+    """g_φ of E members. Agents that share a body (`FeatureMap.joint`) have one model of it, in the first agent's view,
+    which reads everybody's action. Otherwise every agent's own entries follow from its own action, and the rest from
+    them (`FeatureMap.reconcile`).
 
-    Who hears of nobody (`FeatureMap.guessing`) learns from everybody's view and action, and takes the others' from a
-    guess that reads its own view alone. Without that its own action would tell what it cannot see: who brakes in the
-    logs often does so because another comes, so that braking would foresee one, and a push that nobody made no one.
+    A decentralized agent (`FeatureMap.guessing`) learns from everybody's view and action. It takes the others' from a
+    model of them that reads its own view alone. Without that its own action would tell what it cannot see: agents brake
+    in the logs because another comes, so that braking would predict one, and a push that nobody made would predict
+    none.
     """
 
     net: MLP  # leaves (E, G, ...)
     guesses: MLP | None  # of what the others see and do, from own features; leaves (E, G, ...)
     mean: Array  # (D,)
     scale: Array  # (D,)
-    step_mean: Array  # (F,) of the foreseen entries
+    step_mean: Array  # (F,) of the predicted entries
     step_scale: Array  # (F,)
     map: FeatureMap = eqx.field(static=True)
 
     @property
     def foreseen(self) -> np.ndarray:
-        """(F,) the entries that the network foresees."""
+        """(F,) the entries that the network predicts."""
         return _foreseen(self.map)
 
     def step(self, before: Array, action: Array) -> tuple[Array, Array]:
@@ -58,18 +59,21 @@ class Dynamics(eqx.Module):
         return after, jnp.broadcast_to(spread, after.shape[:-1])
 
     def changes(self, before: Array, action: Array) -> Array:
-        """(E, ..., N or 1, F) standardised changes of the foreseen entries, by member."""
+        """(E, ..., N or 1, F) standardised changes of the predicted entries, by member."""
 
-        def by(net: MLP, guesses: MLP | None) -> Array:
+        def of_member(net: MLP, guesses: MLP | None) -> Array:
             read = self.read(before, action)
-            return net(read if guesses is None else jnp.concatenate([read, self.guessed(guesses, before)], -1))
+            if guesses is not None:
+                read = jnp.concatenate([read, self.guessed(guesses, before)], -1)
+            return net(read)
 
-        return jax.vmap(by)(self.net, self.guesses)
+        return jax.vmap(of_member)(self.net, self.guesses)
 
     def read(self, before: Array, action: Array) -> Array:
         """What the network reads, (..., N or 1, D + A or N A), but for what is guessed."""
         if self.map.joint:
-            before, action = before[..., :1, :], action.reshape(*action.shape[:-2], 1, -1)
+            before = before[..., :1, :]
+            action = action.reshape(*action.shape[:-2], 1, -1)
         return jnp.concatenate([(before - self.mean) / self.scale, action], -1)
 
     def guessed(self, guesses: MLP, before: Array) -> Array:
@@ -115,45 +119,55 @@ def fit_dynamics(
     """The ensemble of a data set: features (M, N, D); actions (T, N, A) of the T steps, each from row `row` (T,) to the
     next. The loss is Huber's, in standard deviations of the step: it keeps the kicks of contacts, which dwarf
     everything else, from owning the model."""
-    kn, ks, kf = jax.random.split(key, 3)
-    blank = blank_dynamics(map, actions.shape[-1], members, width)
-    some = row[jax.random.randint(ks, (min(STATES, 4 * len(row)),), 0, len(row))]
+    key_nets, key_states, key_fit = jax.random.split(key, 3)
+    some = row[jax.random.randint(key_states, (min(STATES, 4 * len(row)),), 0, len(row))]
     shown = slice(0, 1) if map.joint else slice(None)
     before = np.asarray(features[some, shown], np.float64).reshape(-1, features.shape[-1])
-    moved = np.asarray(features[some + 1, shown], np.float64).reshape(before.shape) - before
-    mean, scale = before.mean(0), varying(before.std(0), before.mean(0))
-    moved, size = moved[:, blank.foreseen], (np.abs(mean) + scale)[blank.foreseen]
-    told = dict(mean=mean, scale=scale, step_mean=moved.mean(0), step_scale=varying(moved.std(0), size))
-    told = {k: jnp.asarray(v, jnp.float32) for k, v in told.items()}
-    model = eqx.tree_at(lambda d: tuple(getattr(d, k) for k in told), blank, tuple(told.values()))
-    nets = _networks(kn, map, actions.shape[-1], members, width)
+    after = np.asarray(features[some + 1, shown], np.float64).reshape(before.shape)
+    model = _standardised(blank_dynamics(map, actions.shape[-1], members, width), before, after)
+    nets = _networks(key_nets, map, actions.shape[-1], members, width)
     whose = others(map.plus.shape[0])
+
+    def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array) -> Array:
+        net, guesses = nets
+        moved = (after - before)[:, shown, model.foreseen]
+        moved = (moved - model.step_mean) / model.step_scale
+        read = model.read(before, action)
+        wrong = 0.0
+        if guesses is not None:  # it learns from what others saw and did
+            theirs = read[:, whose].reshape(*read.shape[:2], -1)
+            wrong = ((model.guessed(guesses, before) - theirs) ** 2).mean()
+            read = jnp.concatenate([read, theirs], -1)
+        return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
 
     def loss(nets: tuple[MLP, MLP | None], data: tuple[Array, ...], pick: Array) -> Array:
         features, actions, row = data
 
         def of(nets: tuple[MLP, MLP | None], step: Array) -> Array:
-            (net, guesses), action = nets, actions[step]
-            before, after = features[row[step]], features[row[step] + 1]
-            moved = (after - before)[:, shown, model.foreseen]
-            moved = (moved - model.step_mean) / model.step_scale
-            read, wrong = model.read(before, action), 0.0
-            if guesses is not None:  # it learns from what others saw and did
-                theirs = read[:, whose].reshape(*read.shape[:2], -1)
-                wrong = ((model.guessed(guesses, before) - theirs) ** 2).mean()
-                read = jnp.concatenate([read, theirs], -1)
-            return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
+            return of_member(nets, features[row[step]], actions[step], features[row[step] + 1])
 
         return jax.vmap(of)(nets, pick.reshape(members, -1)).sum()
 
     data = features, actions, row
-    return model.by_members(regress(loss, nets, data, len(row), kf, updates, BATCH * members, 4e-3, label))
+    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * members, 4e-3, label))
+
+
+def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:
+    """The model with mean and deviation of states (M, D) and of their changes."""
+    moved = (after - before)[:, model.foreseen]
+    mean = before.mean(0)
+    scale = varying(before.std(0), mean)
+    step_scale = varying(moved.std(0), (np.abs(mean) + scale)[model.foreseen])
+    statistics = [jnp.asarray(x, jnp.float32) for x in (mean, scale, moved.mean(0), step_scale)]
+    return eqx.tree_at(lambda d: (d.mean, d.scale, d.step_mean, d.step_scale), model, statistics)
 
 
 def blank_dynamics(map: FeatureMap, action: int, members: int, width: int) -> Dynamics:
     """An ensemble of the right shapes that says nothing."""
-    one, some = jnp.ones(len(map.names)), jnp.ones(len(_foreseen(map)))
-    return Dynamics(*_networks(jax.random.key(0), map, action, members, width), one, one, some, some, map)
+    net, guesses = _networks(jax.random.key(0), map, action, members, width)
+    one = jnp.ones(len(map.names))
+    some = jnp.ones(len(_foreseen(map)))
+    return Dynamics(net, guesses, mean=one, scale=one, step_mean=some, step_scale=some, map=map)
 
 
 def _foreseen(map: FeatureMap) -> np.ndarray:
@@ -170,12 +184,15 @@ def _of_first(map: FeatureMap) -> np.ndarray:
 def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) -> tuple[MLP, MLP | None]:
     """Of what moves, and of what others see and do where that is guessed. Agents of one kind share weights: all of a
     team whose entries are named alike, and the one body of robots."""
-    n, entries = map.plus.shape[0], len(map.names)
+    n = map.plus.shape[0]
+    entries = len(map.names)
     read = n * (entries + action) if map.guessing else entries + (n if map.joint else 1) * action
     groups = 1 if map.joint or map.follows else n
     sizes = (read, width, width, len(_foreseen(map)))
-    nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(jax.random.split(key, members))
+    keys = jax.random.split(key, members)
+    nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(keys)
     if not map.guessing:
         return nets, None
     keys = jax.random.split(jax.random.fold_in(key, 1), members)
-    return nets, jax.vmap(lambda k: MLP(k, (entries, width, width, read - entries - action), groups=groups))(keys)
+    sizes = (entries, width, width, read - entries - action)
+    return nets, jax.vmap(lambda k: MLP(k, sizes, groups=groups))(keys)

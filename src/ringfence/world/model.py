@@ -13,18 +13,19 @@ from ringfence.world.values import Values
 
 
 class World(eqx.Module):
-    """What the logs tell of a team. Features are s̃_i in the view of `map`; actions are in [−1, 1]."""
+    """A learned model of a team: what actions do, what states are worth, what is dangerous. Features are s̃_i in the
+    view of `map`; actions are in [−1, 1]."""
 
     dynamics: Dynamics
     values: Values
-    barrier: Barrier | Worst | None  # None: the logs told no danger, and no formula did
-    strange: Array  # () how far apart the ensemble is where the logs have not been: a conformal quantile
+    barrier: Barrier | Worst | None  # None: the logs have no labels of danger
+    strange: Array  # () ensemble disagreement above which a state is out of distribution: a conformal quantile
     map: FeatureMap = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
-    alone: bool = eqx.field(static=True)  # of each agent's own view, for agents that hear of nobody
+    alone: bool = eqx.field(static=True)  # of each agent's own view, for decentralized execution
     card: Card = eqx.field(static=True)
 
     @property
     def limits(self) -> dict[str, float]:
         """Limit per episode of each constraint that the logs name; empty where they name none."""
-        return self.card.told.get("data", {}).get("constraints") or {}
+        return self.card.data.constraints or {}

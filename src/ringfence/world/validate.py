@@ -1,10 +1,9 @@
-"""How good a World is, on episodes that no part of it has seen; in numbers, and in words."""
+"""How good a World is, on episodes that no part of it has seen."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from typing import Any
+from dataclasses import dataclass
 
 import equinox as eqx
 import jax
@@ -14,18 +13,34 @@ import numpy as np
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
 from ringfence.world.barrier import Barrier, Worst
-from ringfence.world.card import JUDGED
+from ringfence.world.card import (
+    JUDGED,
+    Avoidable,
+    BarrierScores,
+    Foresight,
+    HeldOut,
+    MarginScores,
+    Threshold,
+    ValueScores,
+)
+from ringfence.world.dynamics import Dynamics
+from ringfence.world.logged import Logged
 from ringfence.world.model import World
+from ringfence.world.values import Values
 
-VERSION = 7  # of the judgement: cached cards of another are made again
-AHEAD = 8  # steps that foresight is judged over
-WINDOWS = 3000  # of each kind that it is judged on
-STEPS = 60_000  # held-out steps that scores are judged on
-FALSE_ALARMS = 0.01  # of the safe steps, at which recall is told
+VERSION = 7  # of the validation: cached cards of another are made again
+AHEAD = 8  # steps that predictions are validated over
+WINDOWS = 3000  # of each kind
+STEPS = 60_000  # held-out steps that are scored
+SCORED = 20_000  # of them at once
+FALSE_ALARMS = 0.01  # of the safe steps, at which recall is given
+STRANGE = 0.95  # share of held-out episodes that stay below the ensemble's threshold throughout
 # The least margin, by loss: log-odds (4: 1 in 55, with both classes equally frequent), or of the 1 that hinges ask for.
 LEAST = {"cross-entropy": 4.0, "hinges": 0.1, "gradient-penalty": 0.1}
+UNJUDGED = 5.0  # the margin of a barrier that held-out episodes say nothing of
+MARGINS = {0.0, 1.0, 2.0, 4.0, 8.0}  # that the card gives numbers of, beside the calibrated one
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
-OUTLIERS = 3  # entries that may look safe however few there are: one freak of foresight is not to set the margin
+OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
 BEFORE = (1, 2, 3, 5, 7, 10, 15)  # steps before danger at which it is asked whether it could still be avoided
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
 ENTERED = 100  # entries that are asked about
@@ -33,112 +48,112 @@ ROUNDS = 15  # of the search for actions that avoid it
 AIM = 0.01  # score that the search aims at: steps towards 0 itself end a hair below
 
 
-def judge(
-    world: World, told, level: float, missed: float, loss: str = "cross-entropy"
-) -> tuple[dict[str, Any], float, Barrier | Worst | None]:
-    """(facts, the ensemble's threshold, the barrier with the margin that calibration asks for)."""
+@dataclass(frozen=True)
+class Validation:
+    """What held-out episodes say of a World."""
+
+    held_out: HeldOut
+    foresight: Foresight
+    values: ValueScores
+    strange: Threshold
+    barrier: Barrier | Worst | None  # with the margin that calibration asks for
+    scores: BarrierScores | None
+    constraints: dict[str, BarrierScores] | None
+
+
+def validate(world: World, logged: Logged, missed: float, loss: str = "cross-entropy") -> Validation:
+    """`missed` is the share of unsafe steps that may be predicted at the default margin or above."""
     rng = np.random.default_rng(0)
-    facts: dict[str, Any] = {"held_out": {"episodes": int(told.held.sum()), "steps": int(len(told.kept))}}
-    facts["foresight"] = _foresight(world, told, rng)
-    facts["values"] = _values(world, told, rng)
-    strange = _strange(world, told, level)
-    facts["strange"] = {"threshold": strange, "level": level}
+    held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
+    foresight = _foresight(world.dynamics, logged, rng)
+    explained = _value_scores(world.values, logged, world.alone, rng)
+    strange = _threshold(world.dynamics, logged)
     barrier = world.barrier
+    scores = None
+    constraints = None
     if isinstance(barrier, Worst):
-        each = {
-            name: _barrier(_with(world, one), told.of(name), rng, missed, LEAST[loss])
-            for name, one in zip(barrier.names, barrier.each)
-        }
-        barrier = Worst(tuple(_in_units(b, each[k][1]) for k, b in zip(barrier.names, barrier.each)), barrier.names)
-        facts["barrier"], _ = _barrier(_with(world, barrier), told, rng, missed, 1.0, 1.0)
-        facts["constraints"] = {name: found for name, (found, _) in each.items()}
+        each = {}
+        constraints = {}
+        for name, one in zip(barrier.names, barrier.each):
+            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, missed, LEAST[loss])
+            constraints[name] = found
+            each[name] = _in_units(one, unit)
+        barrier = Worst(tuple(each.values()), barrier.names)
+        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, missed, 1.0, 1.0)
     elif barrier is not None:
-        facts["barrier"], unit = _barrier(world, told, rng, missed, LEAST[loss])
+        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, missed, LEAST[loss])
         barrier = _in_units(barrier, unit)
-    return facts, strange, barrier
-
-
-def _with(world: World, barrier: Barrier | Worst) -> World:
-    return dataclasses.replace(world, barrier=barrier)
+    return Validation(held_out, foresight, explained, strange, barrier, scores, constraints)
 
 
 def _in_units(barrier: Barrier, unit: float) -> Barrier:
     return eqx.tree_at(lambda b: b.unit, barrier, jnp.asarray(unit, jnp.float32))
 
 
-def _foresight(world: World, told, rng) -> dict[str, Any]:
+# --- predictions ---
+
+
+def _foresight(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> Foresight:
     """Root mean square errors of held-out windows, rolled out along the logged actions."""
-    left = np.asarray(told.arrays["last_row"] - told.arrays["row"])[told.kept]
+    held = logged.held_steps
+    left = np.asarray(logged.arrays["last_row"] - logged.arrays["row"])[held]
     ahead = int(min(AHEAD, left.max()))
-    starts = told.kept[left >= ahead]
+    starts = held[left >= ahead]
     starts = rng.choice(starts, min(WINDOWS, len(starts)), replace=False)
-    foreseen, _ = _rolled(world, told, starts, ahead)
-    row = np.asarray(told.arrays["row"])[starts]
-    x = told.arrays["features"]
-    came = np.stack([np.asarray(x[row + k]) for k in range(ahead + 1)], 1)
-    error = np.asarray(foreseen) - came[:, 1:]
-    scale = np.maximum(np.asarray(world.dynamics.scale), 1e-9)
-    rms = np.sqrt((error**2).mean((0, 2)))  # (ahead, D)
-    still = np.sqrt(((came[:, 1:] - came[:, :1]) ** 2).mean((0, 2)))
-    entries = world.dynamics.foreseen
-    share = np.sqrt(((rms / scale)[:, entries] ** 2).mean(1)) / np.maximum(
-        np.sqrt(((still / scale)[:, entries] ** 2).mean(1)), 1e-9
+    predicted, _ = _rolled(dynamics, logged, starts, ahead)
+    row = np.asarray(logged.arrays["row"])[starts]
+    came = np.stack([np.asarray(logged.arrays["features"][row + k]) for k in range(ahead + 1)], 1)
+    error = _rms(np.asarray(predicted) - came[:, 1:])
+    change = _rms(came[:, 1:] - came[:, :1])
+    scale = np.maximum(np.asarray(dynamics.scale), 1e-9)
+    entries = dynamics.foreseen
+    share = _over_entries(error / scale, entries) / np.maximum(_over_entries(change / scale, entries), 1e-9)
+    shown = sorted({0, min(2, ahead - 1), ahead - 1})
+    return Foresight(
+        steps_ahead=tuple(range(1, ahead + 1)),
+        error_of_change=tuple(round(float(v), 4) for v in share),
+        by_entry={name: tuple(float(f"{error[k, d]:.3g}") for k in shown) for d, name in enumerate(logged.map.names)},
     )
-    return {
-        "steps_ahead": list(range(1, ahead + 1)),
-        "error_of_change": [round(float(v), 4) for v in share],
-        "by_entry": {
-            name: [float(f"{rms[k, d]:.3g}") for k in sorted({0, min(2, ahead - 1), ahead - 1})]
-            for d, name in enumerate(world.map.names)
-        },
-    }
 
 
-def _rolled(world: World, told, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
+def _rms(error: np.ndarray) -> np.ndarray:
+    """(K, D) of windows (W, K, N, D)."""
+    return np.sqrt((error**2).mean((0, 2)))
+
+
+def _over_entries(error: np.ndarray, entries: np.ndarray) -> np.ndarray:
+    """(K,) root mean square of some of the entries (K, D)."""
+    return np.sqrt((error[:, entries] ** 2).mean(1))
+
+
+def _rolled(dynamics: Dynamics, logged: Logged, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
     """Rows (W, K, N, D) and disagreement (W, K, N) from the states before steps, along the logged actions."""
-    row = told.arrays["row"][starts]
-    actions = jnp.stack([told.arrays["actions"][np.minimum(starts + k, told.store.steps - 1)] for k in range(ahead)])
-
-    @jax.jit
-    def roll(world: World, x: Array, actions: Array):
-        def step(x, action):
-            after, spread = world.dynamics.step(x, action)
-            return after, (after, spread)
-
-        return jax.lax.scan(step, x, actions)[1]
-
-    rows, spread = roll(world, told.arrays["features"][row], actions)
+    row = logged.arrays["row"][starts]
+    last = logged.store.steps - 1
+    actions = jnp.stack([logged.arrays["actions"][np.minimum(starts + k, last)] for k in range(ahead)])
+    rows, spread = _roll(dynamics, logged.arrays["features"][row], actions)
     return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
 
 
-def _values(world: World, told, rng) -> dict[str, float]:
-    steps = rng.choice(told.kept, min(STEPS, len(told.kept)), replace=False)
-    row = told.arrays["row"][steps]
-    x = told.arrays["features"]
-    team = np.asarray(told.arrays["rewards"])[steps].mean(1)
-    togo = np.asarray(told.togo(world.values.discount))[steps]
+@jax.jit
+def _roll(dynamics: Dynamics, x: Array, actions: Array) -> tuple[Array, Array]:
+    """Rows (K, W, N, D) and disagreement (K, W, N) along actions (K, W, N, A)."""
 
-    @jax.jit
-    def tell(world: World, before, action, after):
-        reward, value = world.values.of_steps(before, action, after), world.values.ahead(before)
-        return (reward.mean(-1), value.mean(-1)) if world.alone else (reward, value)
+    def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
+        after, spread = dynamics.step(x, action)
+        return after, (after, spread)
 
-    reward, value = tell(world, x[row], told.arrays["actions"][steps], x[row + 1])
-    return {"reward_r2": _r2(team, np.asarray(reward)), "value_r2": _r2(togo, np.asarray(value))}
+    return jax.lax.scan(step, x, actions)[1]
 
 
-def _r2(truth: np.ndarray, told: np.ndarray) -> float:
-    return float(1 - ((truth - told) ** 2).mean() / max(truth.var(), 1e-12))
-
-
-def _strange(world: World, told, level: float) -> float:
-    """The conformal quantile, over held-out episodes, of how far apart the ensemble was at worst."""
-    steps = told.kept[:STEPS]
-    _, spread = _rolled(world, told, steps, 1)
+def _threshold(dynamics: Dynamics, logged: Logged) -> Threshold:
+    """The conformal quantile, over held-out episodes, of the ensemble's largest disagreement."""
+    steps = logged.held_steps[:STEPS]
+    _, spread = _rolled(dynamics, logged, steps, 1)
     worst = np.asarray(spread)[:, 0].max(-1)
-    episode = told.store.episode_of_step[steps]
+    episode = logged.store.episode_of_step[steps]
     most = np.array([worst[episode == e].max() for e in np.unique(episode)])
-    return conformal(most, level)
+    return Threshold(threshold=conformal(most, STRANGE), level=STRANGE)
 
 
 def conformal(values: np.ndarray, level: float) -> float:
@@ -148,118 +163,191 @@ def conformal(values: np.ndarray, level: float) -> float:
     return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
 
 
-def _barrier(
-    world: World, told, rng, missed: float, least: float, unit: float | None = None
-) -> tuple[dict[str, Any], float]:
-    """(facts, margin): calibrated, at `least` so much, unless it is known."""
-    barrier, x, row = world.barrier, told.arrays["features"], np.asarray(told.arrays["row"])
-    unsafe = told.label if told.label.ndim == 1 else told.label.any(1)
-    bad, fine = (told.kept[unsafe[told.kept] == v] for v in (True, False))
-    if not len(bad) or not len(fine):
-        said = "unsafe" if not len(bad) else "safe"
-        return {"warning": f"no held-out step is {said}, so nothing is known of how well danger is told"}, 5.0
-    steps = rng.choice(told.kept, min(STEPS, len(told.kept)), replace=False)
+# --- values ---
+
+
+def _value_scores(values: Values, logged: Logged, alone: bool, rng: np.random.Generator) -> ValueScores:
+    steps = rng.choice(logged.held_steps, min(STEPS, len(logged.held_steps)), replace=False)
+    row = logged.arrays["row"][steps]
+    x = logged.arrays["features"]
+    reward, value = _valued(values, x[row], logged.arrays["actions"][steps], x[row + 1], alone)
+    rewards = np.asarray(logged.arrays["rewards"])[steps].mean(1)
+    returns = np.asarray(logged.returns_to_go(values.discount))[steps]
+    return ValueScores(
+        reward_r2=_r2(rewards, np.asarray(reward)),
+        value_r2=_r2(returns, np.asarray(value)),
+    )
+
+
+@eqx.filter_jit
+def _valued(values: Values, before: Array, action: Array, after: Array, alone: bool) -> tuple[Array, Array]:
+    """Reward and value (W,) of the team."""
+    reward = values.of_steps(before, action, after)
+    value = values.ahead(before)
+    return (reward.mean(-1), value.mean(-1)) if alone else (reward, value)
+
+
+def _r2(truth: np.ndarray, found: np.ndarray) -> float:
+    return float(1 - ((truth - found) ** 2).mean() / max(truth.var(), 1e-12))
+
+
+# --- the barrier ---
+
+
+def _barrier_scores(
+    dynamics: Dynamics,
+    barrier: Barrier | Worst,
+    logged: Logged,
+    rng: np.random.Generator,
+    missed: float,
+    least: float,
+    unit: float | None = None,
+) -> tuple[BarrierScores, float]:
+    """(scores, margin): calibrated, at `least` so much, unless it is known."""
+    held = logged.held_steps
+    unsafe = logged.unsafe
+    bad = held[unsafe[held]]
+    if len(bad) in (0, len(held)):
+        kind = "safe" if len(bad) else "unsafe"
+        warning = f"no held-out step is {kind}, so nothing is known of how well danger is told"
+        return BarrierScores(warning=warning), UNJUDGED
+    steps = rng.choice(held, min(STEPS, len(held)), replace=False)
     steps = np.unique(np.concatenate([steps, rng.choice(bad, min(WINDOWS, len(bad)), replace=False)]))
-
-    @jax.jit
-    def score(barrier, before, after):
-        return lowest(barrier.of_steps(before, after))
-
-    @jax.jit
-    def ahead(barrier, after):
-        return lowest(barrier.ahead(after))
-
-    parts = [steps[i : i + 20_000] for i in range(0, len(steps), 20_000)]
-    h = np.concatenate([np.asarray(score(barrier, x[row[p]], x[row[p] + 1])) for p in parts])
-    v = np.concatenate([np.asarray(ahead(barrier, x[row[p] + 1])) for p in parts])
+    now, ahead = _scored(barrier, logged, steps)
     truth = unsafe[steps]
-    share = unsafe[told.kept].mean()
-    line = np.quantile(h[~truth], FALSE_ALARMS)
-    # The margin: foreseen scores, from up to three steps before, of steps that entered danger. Those that were in it
-    # already say little of where it begins: where a log is nearly all unsafe, most of them lie far beyond.
-    first = np.asarray(told.arrays["first_row"])
-    entered = bad[(row[bad] > first[bad]) & ~unsafe[np.maximum(bad - 1, 0)]]
-    entered = entered if len(entered) >= ENTRIES else bad
-    seen, ends = [], rng.choice(entered, min(WINDOWS, len(entered)), replace=False)
+    ends = _entries(logged, bad)
+    ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
+    foreseen = _foreseen(dynamics, barrier, logged, ends)
+    missed = max(missed, OUTLIERS / len(foreseen))
+    if unit is None:
+        unit = max(least, conformal(foreseen, 1 - missed))
+    share = float(unsafe[held].mean())
+    alarm = np.quantile(now[~truth], FALSE_ALARMS)
+    scores = BarrierScores(
+        unsafe_share=share,
+        auroc=_auroc(now, truth),
+        recall=float((now[truth] < alarm).mean()),
+        false_alarms=FALSE_ALARMS,
+        false_safe=float((now[truth] >= 0).mean()),
+        false_unsafe=float((now[~truth] < 0).mean()),
+        foreseen_false_safe=float((foreseen >= 0).mean()),
+        margin=float(unit),
+        missed=missed,
+        calibration=tuple(_of_margin(m, now, truth, foreseen, share) for m in sorted(MARGINS | {round(unit, 2)})),
+        ahead_kept=float((ahead[~truth] >= unit).mean()),
+        avoidable=_avoidable(dynamics, barrier, logged.arrays, ends[:ENTERED]),
+    )
+    return scores, unit
+
+
+def _scored(barrier: Barrier | Worst, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """ℓ of steps and V of where they lead, each (W,), of the agent in most danger."""
+    x = logged.arrays["features"]
+    now = []
+    ahead = []
+    for start in range(0, len(steps), SCORED):
+        row = np.asarray(logged.arrays["row"])[steps[start : start + SCORED]]
+        after = x[row + 1]
+        now.append(np.asarray(_score(barrier, x[row], after)))
+        ahead.append(np.asarray(_score_ahead(barrier, after)))
+    return np.concatenate(now), np.concatenate(ahead)
+
+
+@jax.jit
+def _score(barrier: Barrier | Worst, before: Array, after: Array) -> Array:
+    return lowest(barrier.of_steps(before, after))
+
+
+@jax.jit
+def _score_ahead(barrier: Barrier | Worst, after: Array) -> Array:
+    return lowest(barrier.ahead(after))
+
+
+def _entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
+    """Steps that entered danger, of those that are unsafe. Those that were in it already say little of where it begins:
+    where a log is nearly all unsafe, most of them lie far beyond. Few entries say nothing; then it is all of `bad`."""
+    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
+    entered = bad[(row[bad] > first[bad]) & ~logged.unsafe[np.maximum(bad - 1, 0)]]
+    return entered if len(entered) >= ENTRIES else bad
+
+
+def _foreseen(dynamics: Dynamics, barrier: Barrier | Worst, logged: Logged, ends: np.ndarray) -> np.ndarray:
+    """Scores of steps that entered danger, as they are predicted from up to `JUDGED` steps before."""
+    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
+    found = []
     for back in range(JUDGED):
         start = ends - back
         start = start[(start >= 0) & (row[ends] - back >= first[ends])]
-        if len(start):
-            rows, _ = _rolled(world, told, start, back + 1)
-            before = x[row[start]] if back == 0 else rows[:, -2]
-            seen.append(np.asarray(score(barrier, before, rows[:, -1])))
-    foreseen = np.concatenate(seen)
-    missed = max(missed, OUTLIERS / len(foreseen))
-    unit = unit or max(least, conformal(foreseen, 1 - missed))
-    table = [_of_margin(m, h, truth, foreseen, share) for m in sorted({0.0, 1.0, 2.0, 4.0, 8.0, round(unit, 2)})]
-    facts = {
-        "unsafe_share": float(share),
-        "auroc": _auroc(h, truth),
-        "recall": float((h[truth] < line).mean()),
-        "false_alarms": FALSE_ALARMS,
-        "false_safe": float((h[truth] >= 0).mean()),
-        "false_unsafe": float((h[~truth] < 0).mean()),
-        "foreseen_false_safe": float((foreseen >= 0).mean()),
-        "margin": float(unit),
-        "missed": missed,
-        "calibration": table,
-        "ahead_kept": float((v[~truth] >= unit).mean()),
-        "avoidable": _avoidable(world, told, ends[:ENTERED]),
-    }
-    return facts, unit
+        if not len(start):
+            continue
+        rows, _ = _rolled(dynamics, logged, start, back + 1)
+        before = logged.arrays["features"][row[start]] if back == 0 else rows[:, -2]
+        found.append(np.asarray(_score(barrier, before, rows[:, -1])))
+    return np.concatenate(found)
 
 
-def _avoidable(world: World, told, entered: np.ndarray) -> dict[str, Any]:
+def _of_margin(margin: float, now: np.ndarray, unsafe: np.ndarray, foreseen: np.ndarray, share: float) -> MarginScores:
+    """Of held-out steps with that margin: how many of 1000 are unsafe, weighed by how frequent the classes are."""
+    passed = float((now[~unsafe] >= margin).mean())
+    missed = float((now[unsafe] >= margin).mean())
+    both = share * missed + (1 - share) * passed
+    return MarginScores(
+        margin=float(margin),
+        unsafe_in_1000=float(1000 * share * missed / both) if both else 0.0,
+        unsafe_foreseen_above=float((foreseen >= margin).mean()),
+        safe_kept=passed,
+    )
+
+
+def _auroc(score: np.ndarray, unsafe: np.ndarray) -> float:
+    """Probability that a safe step scores higher than an unsafe one."""
+    from scipy.stats import mannwhitneyu  # slow to import, and read by fits alone
+
+    safe, bad = score[~unsafe], score[unsafe]
+    return float(mannwhitneyu(safe, bad, method="asymptotic").statistic / (len(safe) * len(bad)))
+
+
+# --- what could be avoided ---
+
+
+def _avoidable(
+    dynamics: Dynamics, barrier: Barrier | Worst, arrays: dict[str, Array], entered: np.ndarray
+) -> Avoidable:
     """How many of the steps that entered danger other actions could have avoided from so many steps before, and any
-    danger within the longest such time, as this World foresees it; `rows` is how far ahead a guard has to look to avoid
-    nearly all that can be."""
-    row, first, last = (np.asarray(told.arrays[k]) for k in ("row", "first_row", "last_row"))
-
-    @jax.jit
-    def avoided(world: World, x: Array, actions: Array) -> Array:
-        def worst(actions: Array) -> Array:
-            def step(before: Array, action: Array):
-                after, _ = world.dynamics.step(before, action)
-                h = lowest(world.barrier.of_steps(before, after))
-                return after, h
-
-            return jax.lax.scan(step, x, actions)[1].min(0)
-
-        def correct(_, carry):
-            actions, best = carry
-            h, back = jax.vjp(worst, actions)
-            slope = back(jnp.where(h < AIM, 1.0, 0.0))[0]
-            size = jnp.maximum((slope**2).sum((0, 2, 3)), 1e-6)
-            moved = actions - (jnp.minimum(h - AIM, 0.0) / size)[:, None, None] * slope
-            return jnp.clip(moved, -1.0, 1.0), jnp.maximum(best, h)
-
-        actions, best = jax.lax.fori_loop(0, ROUNDS, correct, (actions, jnp.full(len(x), -jnp.inf)))
-        return jnp.maximum(best, worst(actions)) >= 0
-
+    danger within the longest such time, as the World predicts it."""
+    row, first, last = (np.asarray(arrays[name]) for name in ("row", "first_row", "last_row"))
     asked = {k: entered[row[entered] - (k - 1) >= first[entered]] for k in BEFORE}
     asked = {k: ends for k, ends in asked.items() if len(ends)}
     start = np.concatenate([ends - (k - 1) for k, ends in asked.items()])
     left = np.minimum(np.arange(max(BEFORE))[:, None], (last - row - 1)[start][None])
-    found = np.asarray(avoided(world, told.arrays["features"][row[start]], told.arrays["actions"][start + left]))
+    found = np.asarray(_avoided(dynamics, barrier, arrays["features"][row[start]], arrays["actions"][start + left]))
     parts = np.split(found, np.cumsum([len(ends) for ends in asked.values()])[:-1])
     shares = {k: float(part.mean()) for k, part in zip(asked, parts)}
-    reached = [k for k, share in shares.items() if share >= AVOIDED * max(shares.values())]
-    return {"before": list(shares), "avoided": list(shares.values()), "rows": reached[0]}
+    most = max(shares.values())
+    enough = [k for k, share in shares.items() if share >= AVOIDED * most]
+    return Avoidable(before=tuple(shares), avoided=tuple(shares.values()), rows=enough[0])
 
 
-def _of_margin(margin: float, h, truth, foreseen, share: float) -> dict[str, float]:
-    """Of held-out steps with that margin: how many of 1000 are unsafe, weighed by how frequent the classes are."""
-    passed, missed = float((h[~truth] >= margin).mean()), float((h[truth] >= margin).mean())
-    both = share * missed + (1 - share) * passed
-    return {
-        "margin": float(margin),
-        "unsafe_in_1000": float(1000 * share * missed / both) if both else 0.0,
-        "unsafe_foreseen_above": float((foreseen >= margin).mean()),
-        "safe_kept": passed,
-    }
+@jax.jit
+def _avoided(dynamics: Dynamics, barrier: Barrier | Worst, x: Array, actions: Array) -> Array:
+    """(W,) bool: whether some actions near the logged ones (K, W, N, A) keep all scores at 0 or more, from states
+    (W, N, D)."""
 
+    def worst(actions: Array) -> Array:
+        def step(before: Array, action: Array) -> tuple[Array, Array]:
+            after, _ = dynamics.step(before, action)
+            return after, lowest(barrier.of_steps(before, after))
 
-def _auroc(h: np.ndarray, unsafe: np.ndarray) -> float:
-    order = np.argsort(np.argsort(h, kind="stable"), kind="stable") + 1.0
-    n, m = int((~unsafe).sum()), int(unsafe.sum())
-    return float((order[~unsafe].sum() - n * (n + 1) / 2) / (n * m))
+        return jax.lax.scan(step, x, actions)[1].min(0)
+
+    def correct(_, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        actions, best = carry
+        h, back = jax.vjp(worst, actions)
+        slope = back(jnp.where(h < AIM, 1.0, 0.0))[0]
+        size = jnp.maximum((slope**2).sum((0, 2, 3)), 1e-6)
+        moved = actions - (jnp.minimum(h - AIM, 0.0) / size)[:, None, None] * slope
+        return jnp.clip(moved, -1.0, 1.0), jnp.maximum(best, h)
+
+    nothing = jnp.full(len(x), -jnp.inf)
+    actions, best = jax.lax.fori_loop(0, ROUNDS, correct, (actions, nothing))
+    return jnp.maximum(best, worst(actions)) >= 0

@@ -238,6 +238,7 @@ def _dangers(told: Logs, picked: np.ndarray, found: dict, world: World, ahead: i
         rows = jnp.concatenate([x[:, None], jnp.moveaxis(rows, 0, 1)], 1)
         return danger.along(rows, jnp.moveaxis(spread, 0, 1)).min((1, 2, 3))
 
+    scores = world.card.barrier
     danger, x = Danger(world, "learned", None, False), told.x[told.row[picked]]
     by_policy = np.asarray(worst(danger, x, jnp.asarray(found["plan"])))[safe]
     by_logs = np.asarray(worst(danger, x, jnp.asarray(told.actions[later])))[safe]
@@ -248,7 +249,7 @@ def _dangers(told: Logs, picked: np.ndarray, found: dict, world: World, ahead: i
         "foreseen_unsafe_of_logs": float((by_logs < 0).mean()),
         "not_surely_safe": float((by_policy < 1).mean()),
         "not_surely_safe_of_logs": float((by_logs < 1).mean()),
-        "missed": world.card["barrier"].get("missed"),
+        "missed": None if scores is None or scores.warning else scores.missed,
         "episodes_not_surely_safe": len(doubtful) / len(np.unique(episodes)),
         "episodes_upper": statistics.upper_bound(len(doubtful), len(np.unique(episodes))),
         "margins": {"policy": _quantiles(by_policy), "logs": _quantiles(by_logs)},
