@@ -86,7 +86,7 @@ def judge(
     job, policy = load(run, planner=planner, **options)
     policy = policy.one if isinstance(policy, Each) else policy
     judging = judge_world or worlds.fit(store, seed=seed + 1, sight=options.get("sight"), quiet=quiet)
-    if not (judging.card["data"]["content"] == store.content and judging.spec.action_dim == store.actions.shape[2]):
+    if not (judging.card.data.content == store.content and judging.spec.action_dim == store.actions.shape[2]):
         raise UserError("judge_world is of other logs; leave it out, and one is fitted to these.")
     logs = job.task.logs(store)
     told = Logs(logs, judging)
