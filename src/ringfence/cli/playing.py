@@ -67,7 +67,8 @@ class Playing:
                 raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
             if name in given:
                 raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
-        PolicySpec.of(**assigned)  # an unknown name, or a value of another type
+        checked: dict[str, Any] = dict(assigned)
+        PolicySpec.of(**checked)  # an unknown name, or a value of another type
         return given | assigned
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
+from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import COUNTED, rollout
@@ -28,13 +29,16 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
     """The protocol's numbers from per-step rewards and costs (E, L), the episodes' steps and terminations (E,), and
     who started unsafe (E,). An episode that ends early costs little: `steps_mean`, `termination_rate` and `cost_rate`
     (cost per step played) tell."""
-    returns, costs = played["rewards"].sum(1, dtype=np.float64), played["costs"].sum(1, dtype=np.float64)
-    steps, terminated = played["steps"], played["terminated"]
-    n, fine = len(returns), ~hazard_at_start
+    returns = played["rewards"].sum(1, dtype=np.float64)
+    costs = played["costs"].sum(1, dtype=np.float64)
+    steps = played["steps"]
+    terminated = played["terminated"]
+    episodes = len(returns)
     violated = costs > 0
-    cost_safe_start = costs[fine] if fine.any() else np.zeros(1)
+    starts_safe = ~hazard_at_start
+    cost_safe_start = costs[starts_safe] if starts_safe.any() else np.zeros(1)
     return {
-        "episodes": n,
+        "episodes": episodes,
         "return_mean": float(returns.mean()),
         "return_std": float(returns.std()),
         "return_interval": statistics.bootstrap_mean(returns),
@@ -47,8 +51,8 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "steps_mean": float(steps.mean()),
         "termination_rate": float(terminated.mean()),
         "violation_rate": float(violated.mean()),
-        "violation_interval": statistics.clopper_pearson(int(violated.sum()), n),
-        "violation_upper": statistics.upper_bound(int(violated.sum()), n),
+        "violation_interval": statistics.clopper_pearson(int(violated.sum()), episodes),
+        "violation_upper": statistics.upper_bound(int(violated.sum()), episodes),
         **{RATES[k]: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
         # Share of (agent, episode) with a cost of the agent's own.
         **({"agent_violation_rate": float(played["violated"].any(1).mean())} if "violated" in played else {}),
@@ -89,11 +93,16 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
     view = task.feature_map("pruned")
     bound = constraints.bind(task.hazard, view.names, view.plus.shape[0])
 
+    def observed(states: Array) -> Array | None:
+        env = task.simulator
+        if view.source == "state" or isinstance(env, NativeEnv):  # a native one's view reads its state
+            return None
+        return env.observe(env.from_global_state(states))
+
     @jax.jit  # one program instead of one for every operation
     def unsafe(states: Array) -> Array:
-        seen = None if view.source == "state" else task.env.observe(task.env.from_global_state(states))
-        found, _ = bound.labels(look(view, task.alike, seen, states))
-        return found.reshape(len(states), -1).any(-1)
+        labels, _ = bound.labels(look(view, task.alike, observed(states), states))
+        return labels.reshape(len(states), -1).any(-1)
 
     return np.asarray(unsafe(jnp.asarray(states)))
 
@@ -115,8 +124,8 @@ def evaluate_policy(
             f"Task '{task.name}' exists only as data, so `ringfence eval` has nothing to play in; play in a simulator "
             "of your own: `ringfence play RUN --env FILE.py:NAME`."
         )
-    episodes, record = whole_number("episodes", episodes, 1, 10**7), whole_number("record", record)
-    record = min(record, episodes)
+    episodes = whole_number("episodes", episodes, 1, 10**7)
+    record = min(whole_number("record", record), episodes)
     begun = time.perf_counter()
     played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
     result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -16,14 +17,13 @@ from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
-from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.homogeneous import Each
 from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
 from ringfence.proposals.planner import Planner
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
-from ringfence.types import Policy, Spec
+from ringfence.types import Policy, PyTree, Spec
 from ringfence.utils.config import build_config
 from ringfence.world import World
 
@@ -100,57 +100,81 @@ def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple
     """(step, policy) of the checkpoint, without a guard."""
     read = {} if world is None else {"world": world}
 
-    def blank():
+    def blank() -> PyTree:
         state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard, **read)
         return loop.learned(state)
 
     step, state = run.load_checkpoint(jax.eval_shape(blank), spec.checkpoint)
-    if world is not None:
+    if world is not None and job.algorithm.of_world is not None:
         state |= {"world": job.algorithm.of_world(world, job.config)}
     return step, make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
 
 
 def load_job(run: Run, agents: int | None = None) -> Job:
     """The job that a run folder holds, rebuilt from its config.json; played by another number of `agents` where they
-    are alike."""
-    told = run.config
-    lacking = [name for name in ("spec", "feature_map") if name not in told]
-    if lacking:
-        raise UserError(f"'{run.path / 'config.json'}' lacks '{lacking[0]}', so nothing can be played; train it again.")
-    algorithm = algos.get(told["algorithm"])
-    config = build_config(algorithm.Config, told["config"], algorithm.name)
-    fields = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
-    if lacking := sorted(fields - set(told["spec"])):
-        raise UserError(f"'{run.path / 'config.json'}' has a spec without '{lacking[0]}'; train the run again.")
-    spec = Spec.of(told["spec"])
-    if told["feature_map"] is None:
+    are homogeneous."""
+    stored = run.config
+    _refuse_lacking(run, stored)
+    algorithm = algos.get(stored["algorithm"])
+    config = build_config(algorithm.Config, stored["config"], algorithm.name)
+    spec = Spec.of(stored["spec"])
+    hazard = constraints.from_dict(stored["hazard"])
+    if stored["feature_map"] is None:
         # Danger is what the run's data said it is, as in training.
-        task = registry.simulated(told["task"], constraints.from_dict(told["hazard"]))
+        task = registry.simulated(stored["task"], hazard)
         if task is None:
-            raise unknown("task", told["task"], registry.TASKS)
-        feature_map, team = task.feature_map(config.view), task.env.n_agents
+            raise unknown("task", stored["task"], registry.TASKS)
+        feature_map = task.feature_map(config.view)
+        team = task.simulator.n_agents
         widths = widths_of(task)
     else:
-        card = told["data"]
-        task = Task(
-            told["task"],
-            None,
-            constraints.from_dict(told["hazard"]),
-            cost_limit=float(card.get("cost_limit", 1.0)),
-            action_low=card["action_low"],
-            action_high=card["action_high"],
-            alike=spec.alike,
-        )
-        feature_map, team = features.from_dict(told["feature_map"]), told.get("team", spec.n_agents)
-        named = (card.get("observation_names"), card.get("state_names"))
-        widths = tuple(told.get("widths") or (len(names) if names else None for names in named))
-    if agents not in (None, team):
-        task, team = registry.of_team(task, agents), agents
-    hazard: BoundHazard = constraints.bind(constraints.from_dict(told["hazard"]), spec.feature_names, spec.n_agents)
-    return Job(algorithm, told["preset"], config, task, spec, feature_map, hazard, widths, team=team)
+        task = _task_of_data(stored, hazard, spec)
+        feature_map = features.from_dict(stored["feature_map"])
+        team = stored.get("team", spec.n_agents)
+        widths = _stored_widths(stored)
+    if agents is not None and agents != team:
+        task = registry.of_team(task, agents)
+        team = agents
+    bound = constraints.bind(hazard, spec.feature_names, spec.n_agents)
+    return Job(algorithm, stored["preset"], config, task, spec, feature_map, bound, widths, team=team)
 
 
-def make_policy(job: Job, state, options: dict) -> Policy:
+def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:
+    file = run.path / "config.json"
+    for name in ("spec", "feature_map"):
+        if name not in stored:
+            raise UserError(f"'{file}' lacks '{name}', so nothing can be played; train it again.")
+    needed = {f.name for f in dataclasses.fields(Spec) if f.default is dataclasses.MISSING}
+    lacking = sorted(needed - set(stored["spec"]))
+    if lacking:
+        raise UserError(f"'{file}' has a spec without '{lacking[0]}'; train the run again.")
+
+
+def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: Spec) -> Task:
+    """A task that exists only as data, as the run's card has it."""
+    card = stored["data"]
+    return Task(
+        stored["task"],
+        None,
+        hazard,
+        cost_limit=float(card.get("cost_limit", 1.0)),
+        action_low=card["action_low"],
+        action_high=card["action_high"],
+        alike=spec.alike,
+    )
+
+
+def _stored_widths(stored: Mapping[str, Any]) -> tuple[int | None, int | None]:
+    """Entries of an observation and of the state; runs of before say them by their names alone, if at all."""
+    if stored.get("widths"):
+        observation, state = stored["widths"]
+        return observation, state
+    observations = stored["data"].get("observation_names")
+    states = stored["data"].get("state_names")
+    return len(observations) if observations else None, len(states) if states else None
+
+
+def make_policy(job: Job, state: PyTree, options: Mapping[str, Any]) -> Policy:
     """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
     chosen = build_config(PlanOptions, {**plan_defaults(job.config), **options}, "the planner")
     return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)

@@ -74,15 +74,17 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     actions, rewards, costs = (np.empty(s, np.float32) for s in ((steps, acted), (steps,), (steps,)))
     terminated, truncated = np.zeros((2, len(ends)), bool)
     for k, (name, shapes) in enumerate(found.items()):
-        here, stop = f[name], int(ends[k])
+        here = _group(path, f, name)
+        stop = int(ends[k])
         now = slice(stop - shapes.steps, stop)
         observations[now.start + k : stop + k + 1] = _joined(path, here, name, shapes.observations)
         actions[now] = _joined(path, here, name, shapes.actions)
         common.within(path, f"{name}/actions", actions[now], bounds)
-        rewards[now] = common.numbers(path, f"{name}/rewards", here["rewards"])[:, 0]
+        rewards[now] = common.numbers(path, f"{name}/rewards", arrays.array(path, here, "rewards"))[:, 0]
         terminated[k], truncated[k] = _ended(path, here, name, shapes.steps)
         if first.cost:
-            costs[now] = common.numbers(path, f"{name}/infos/cost", here["infos/cost"])[-shapes.steps :, 0]
+            cost = arrays.array(path, _group(path, here, "infos"), "cost")
+            costs[now] = common.numbers(path, f"{name}/infos/cost", cost)[-shapes.steps :, 0]
     if both := int((terminated & truncated).sum()):
         notes.append(f"{both} episodes are marked as terminated and as truncated, too, and count as terminated")
     if neither := int((~terminated & ~truncated).sum()):
@@ -139,8 +141,9 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
             parts[kind][key] = array.shape[1:]
             size += array.nbytes
     infos = arrays.member(path, group, "infos", f"{name}/infos") if "infos" in group else None
-    cost = isinstance(infos, h5py.Group) and "cost" in infos
-    if cost:
+    cost = False
+    if isinstance(infos, h5py.Group) and "cost" in infos:
+        cost = True
         array = arrays.array(path, infos, "cost", f"{name}/infos/cost")
         common.vector(path, f"{name}/infos/cost", array.shape)
         if len(array) != steps:  # one of every step; the reset has told none
@@ -151,11 +154,12 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
 
 def _leaves(path: Path, group: h5py.Group, kind: str, name: str) -> Iterator[tuple[str, h5py.Dataset]]:
     """The arrays of observations or actions, of groups in the order of their names."""
-    stack, count = [kind], 0
+    stack = [kind]
+    count = 0
     while stack:
         key = stack.pop()
         holder, _, last = key.rpartition("/")
-        inside = group[holder] if holder else group
+        inside = _group(path, group, holder) if holder else group
         found = arrays.member(path, inside, last, f"{name}/{key}")
         if not isinstance(found, h5py.Group):
             yield key, arrays.array(path, inside, last, f"{name}/{key}")
@@ -163,7 +167,8 @@ def _leaves(path: Path, group: h5py.Group, kind: str, name: str) -> Iterator[tup
             raise StoreError(f"'{path}' nests '{name}/{key[:200]}' too deeply; keep {DEEP} levels at most.")
         else:
             stack += [f"{key}/{part}" for part in sorted(found, key=_place, reverse=True)]
-        if (count := count + 1) > MANY:
+        count += 1
+        if count > MANY:
             raise StoreError(f"'{path}' has more than {MANY} arrays in '{name}/{kind}'; join them into fewer.")
 
 
@@ -174,19 +179,37 @@ def _place(part: str) -> tuple[int, str]:
 
 
 def _joined(path: Path, group: h5py.Group, name: str, parts: dict[str, tuple[int, ...]]) -> np.ndarray:
-    return np.concatenate([common.numbers(path, f"{name}/{key}", group[key]) for key in parts], 1)
+    columns = [common.numbers(path, f"{name}/{key}", _array(path, group, key)) for key in parts]
+    return np.concatenate(columns, 1)
+
+
+def _group(path: Path, group: h5py.Group, name: str) -> h5py.Group:
+    """A group whose kind was looked at before."""
+    found = group[name]
+    if not isinstance(found, h5py.Group):
+        raise StoreError(f"'{path}' holds an array where the group '{name}' belongs; write the file again.")
+    return found
+
+
+def _array(path: Path, group: h5py.Group, key: str) -> h5py.Dataset:
+    """An array below a group, by its path."""
+    holder, _, last = key.rpartition("/")
+    return arrays.array(path, _group(path, group, holder) if holder else group, last, key)
 
 
 def _ended(path: Path, group: h5py.Group, name: str, steps: int) -> tuple[bool, bool]:
     """(terminated, truncated) of an episode's last step; a mark before it is refused."""
-    marks = [common.flags(path, f"{name}/{key}", group[key], steps) for key in ("terminations", "truncations")]
-    early = np.flatnonzero((marks[0] | marks[1])[:-1])
+    terminated, truncated = (
+        common.flags(path, f"{name}/{key}", arrays.array(path, group, key), steps)
+        for key in ("terminations", "truncations")
+    )
+    early = np.flatnonzero((terminated | truncated)[:-1])
     if len(early):
         raise StoreError(
             f"'{path}' marks step {early[0]} of '{name}' as an end, but {steps - 1 - early[0]} more follow; split the "
             "episode there."
         )
-    return bool(marks[0][-1]), bool(marks[1][-1])
+    return bool(terminated[-1]), bool(truncated[-1])
 
 
 def _metadata(path: Path, f: h5py.File) -> dict:
