@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence import world
+from ringfence import guards, world
 from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
@@ -37,6 +37,24 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
         worlds.load(tmp_path / "w.safetensors")
+
+
+def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):
+    """A guard of either is the same program: static fields are compared by content."""
+    file = world.save(small_world, tmp_path / "w.safetensors")
+    traced = []
+
+    @jax.jit
+    def start(guarded):
+        traced.append(guarded)
+        return guarded.start(1)
+
+    for _ in range(2):
+        loaded = worlds.load(file)
+        start(guards.policy.build(guards.wrap.Nothing(), loaded, constraints.Separation(), "shield", "both"))
+    assert len(traced) == 1
+    others = [dataclasses.replace(loaded.map, view="other"), dataclasses.replace(loaded.map, plus=loaded.map.plus + 1)]
+    assert all(loaded.map != other for other in others) and loaded.map == dataclasses.replace(loaded.map)
 
 
 class Head(eqx.Module):

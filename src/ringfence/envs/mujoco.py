@@ -20,7 +20,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -496,6 +496,7 @@ def _pruned(env: SafeMuJoCo) -> FeatureMap:
     return replace(plain, own=own, reconcile=_reconcile_shared(len(torso), 2 * joints, n))
 
 
+@cache
 def _reconcile_shared(torso: int, joints: int, n: int) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present: everybody's torso is the mean of the planned ones, and
     others' joints are where their owners plan to have them."""

@@ -15,8 +15,14 @@ from ringfence.guards.policy import Guarded, Paid, build, costs_of_one
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import Each, apart, look, together
 from ringfence.proposals.base import held
-from ringfence.types import Key, PolicyStep, PyTree
+from ringfence.types import Array, Key, PolicyStep, PyTree
 from ringfence.world import World
+
+
+@jax.jit
+def _decided(guarded: Guarded, memory: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    """One program for every guard of the same World and options."""
+    return guarded.decided(memory, present, actions, key)
 
 
 class Callback:
@@ -25,7 +31,6 @@ class Callback:
 
     def __init__(self, function: Callable, guarded: Guarded, agents: int):
         self.function, self.guarded, self.agents = function, guarded, agents
-        self._decide = jax.jit(lambda g, memory, present, action, key: g.decided(memory, present, action, key))
 
     @property
     def _team(self) -> Guarded | Each:
@@ -61,7 +66,7 @@ class Callback:
         given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
         present = look(world.map, spec.alike, *given)
         plan = held(apart(action) if spec.alike else action, self.guarded.guard.options.rows)
-        memory, step = self._decide(self.guarded, memory, present, plan, key)
+        memory, step = _decided(self.guarded, memory, present, plan, key)
         return memory, together(step, (batch, self.agents)) if spec.alike else step
 
 

@@ -42,6 +42,9 @@ class SpeedLimit:
     features: tuple[str, ...] = ("torso.vx", "torso.vy")
     safe_margin: float | None = None  # m/s; None: a fifth of the limit
 
+    def __post_init__(self):
+        object.__setattr__(self, "features", tuple(self.features))
+
 
 @dataclass(frozen=True)
 class CostColumn:
@@ -55,6 +58,9 @@ class All:
     clearance is the smallest one, in the unit of the first: metres and m/s are compared by their safe margins."""
 
     hazards: tuple[Hazard, ...]
+
+    def __post_init__(self):
+        object.__setattr__(self, "hazards", tuple(self.hazards))
 
 
 Hazard = Separation | SpeedLimit | CostColumn | All
@@ -104,6 +110,12 @@ def lowest(x: Array) -> Array:
 
 def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
     """Resolve a hazard's feature names; an absent one is refused with the nearest name."""
+    return _bound(hazard, tuple(names), n_agents)
+
+
+@functools.lru_cache(256)
+def _bound(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
+    """The same value for the same hazard and names, so that what was compiled with it serves again."""
     if isinstance(hazard, CostColumn):
         return BoundHazard(hazard, None, 0.0)
     if isinstance(hazard, Separation):

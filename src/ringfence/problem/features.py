@@ -10,9 +10,10 @@ exact, differentiable and linear in the number of entries. Three views exist, be
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar
 
 import jax.numpy as jnp
@@ -29,7 +30,10 @@ VIEWS = ("pruned", "centralized", "decentralized")
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Entry d of agent i is source[plus[i, d]] − source[minus[i, d]] (minus = −1: nothing is taken away)."""
+    """Entry d of agent i is source[plus[i, d]] − source[minus[i, d]] (minus = −1: nothing is taken away).
+
+    A map is compared by content, so that what was compiled for it serves another one that is the same.
+    """
 
     view: str
     names: tuple[str, ...]  # D
@@ -47,6 +51,18 @@ class FeatureMap:
     dt: float | None = None  # s, of a solitary map: the step that velocities are predicted by
     # D weights of the standardised entries that the critic reads; None: all alike
     critic_weight: tuple[float, ...] | None = None
+
+    def __eq__(self, other: object) -> bool:
+        return type(other) is type(self) and isinstance(other, FeatureMap) and other._content == self._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
+
+    @functools.cached_property
+    def _content(self) -> tuple[Hashable, ...]:
+        tables = [(table.shape, table.tobytes()) for table in (self.plus, self.minus, self.origin) if table is not None]
+        rest = (getattr(self, f.name) for f in fields(self) if f.name not in ("plus", "minus", "origin"))
+        return (*tables, *rest)
 
     @property
     def reads_state(self) -> bool:
@@ -136,7 +152,7 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     if not how:
         return map
     own = tuple(d for d in range(len(map.names)) if d not in how)
-    return replace(map, own=own, reconcile=_reconcile_relative(how, map.plus.shape[0]), follows=tuple(how))
+    return replace(map, own=own, reconcile=_relative(how, map.plus.shape[0]), follows=tuple(how))
 
 
 def coasting(map: FeatureMap, dt: float) -> FeatureMap:
@@ -165,7 +181,7 @@ def coasting(map: FeatureMap, dt: float) -> FeatureMap:
         follows=follows,
         solitary=True,
         dt=dt,
-        reconcile=_reconcile_coasting(np.array(rules), np.array(sorted(stays), int), dt),
+        reconcile=_reconcile_coasting(tuple(rules), tuple(sorted(stays)), dt),
     )
 
 
@@ -177,9 +193,14 @@ def solitary(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
     return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), dt)
 
 
-def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Callable[[Array], Array]:
-    """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities."""
-    place, speed, mine = rules.T
+@functools.cache
+def _reconcile_coasting(
+    rules: tuple[tuple[int, int, int], ...], stays: tuple[int, ...], dt: float
+) -> Callable[[Array], Array]:
+    """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities; the
+    same one for the same rules."""
+    place, speed, mine = np.array(rules).T
+    still = np.array(stays, int)
     relative = speed >= 0
 
     def agree(x: Array) -> Array:
@@ -189,7 +210,7 @@ def _reconcile_coasting(rules: np.ndarray, stays: np.ndarray, dt: float) -> Call
         own = later[..., mine]
         theirs = jnp.where(relative, start[..., speed] + start[..., mine], 0.0)  # their velocity, which they keep
         count = jnp.arange(1, steps + 1, dtype=x.dtype)[:, None, None]
-        later = later.at[..., stays].set(start[..., stays])
+        later = later.at[..., still].set(start[..., still])
         later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, axis=-3)))
         if relative.any():
             later = later.at[..., speed[relative]].set((theirs - own)[..., relative])
@@ -210,16 +231,22 @@ def alone(map: FeatureMap) -> FeatureMap:
     return following(replace(map, own=None, reconcile=None, follows=(), joint=False, guessing=guessing), how)
 
 
-def _reconcile_relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:
+def _relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:
+    return _reconcile_relative(tuple(how.items()), n)
+
+
+@functools.cache
+def _reconcile_relative(how: tuple[tuple[int, tuple[int, int]], ...], n: int) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that makes the agents agree: what agent i plans to see of
-    landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged.
+    landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged. It is
+    the same one for the same rules.
 
     Agents execute their own part of a plan, so danger and value have to be judged on that, not on what they imagine
     of one another; and a gradient on the result moves bodies, not images of them.
     """
-    entries = np.array(list(how))
-    sources = np.array([own for own, _ in how.values()])
-    about = np.array([other for _, other in how.values()])
+    entries = np.array([entry for entry, _ in how])
+    sources = np.array([own for _, (own, _) in how])
+    about = np.array([other for _, (_, other) in how])
     moving = about >= 0
     whose = others(n)[:, about[moving]] if moving.any() else np.zeros((n, 0), int)  # (N, entries about others)
 
@@ -342,7 +369,7 @@ def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, in
     if not how or steps is None:
         return {}
     pair = jnp.asarray(np.stack([steps.before, steps.after], 1), jnp.float32)
-    predicted = np.asarray(_reconcile_relative(how, map.plus.shape[0])(pair))[:, 1]
+    predicted = np.asarray(_relative(how, map.plus.shape[0])(pair))[:, 1]
     error = predicted - steps.after
     change = steps.after - steps.before
     return {d: rule for d, rule in how.items() if _follows(error[..., d], change[..., d])}
