@@ -324,8 +324,8 @@ def exported_in_time() -> tuple[bool, str]:
     return max(slower) <= 1.0, f"{min(slower):.2f} to {max(slower):.2f} of the controller's time"
 
 
-def judged(number: str, truth: str, least: float) -> Callable[[], tuple[bool, str]]:
-    """Spearman's correlation on every task whose policies were judged."""
+def ranks_like(number: str, truth: str, least: float) -> Callable[[], tuple[bool, str]]:
+    """Spearman's correlation on every task whose policies were evaluated by logs."""
 
     def check():
         tasks = {r["task"]: [] for r in rows_of("judging.csv")}
@@ -429,7 +429,9 @@ CLAIMS = (
         robots_kept("bc", "default+adapt-learned-own", 17, "own-sight-mujoco"),
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
-    Claim("docs/judging.md", "Danger is told well", "results/judging.csv", judged("played_danger", "true_cost", 0.8)),
+    Claim(
+        "docs/judging.md", "Danger is told well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)
+    ),
     Claim(
         "docs/attribution.md",
         "On Crossing diffusion earns more alone, and nothing more under a shield",

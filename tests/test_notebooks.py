@@ -13,7 +13,7 @@ from tests.quick import QUICK_WORLD
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"steps": 4, "width": 16}, "RUNS": 40, "EPISODES": 60, "PLAYED": 2}
-SMALL["JUDGE"] = dict(states=100, transitions=400, updates=20, members=2, episodes=8, steps=5)
+SMALL["OPE"] = dict(states=100, transitions=400, updates=20, num_ensemble=2, rollout_episodes=8, rollout_steps=5)
 
 
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda f: f.stem)

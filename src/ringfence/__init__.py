@@ -23,7 +23,7 @@ _WHERE = {
     "Controller": "ringfence.loading.controller",
     "play": "ringfence.evaluation.play",
     "record": "ringfence.logs.collect",
-    "judge": "ringfence.evaluation.ope",
+    "ope": "ringfence.evaluation.ope",
     "World": "ringfence.world",
     "fit": "ringfence.training.worlds",
     "load_world": "ringfence.training.worlds:load",
@@ -32,11 +32,16 @@ _WHERE = {
     "UserError": "ringfence.errors",
 }
 __all__ = list(_WHERE)
+# Names of 0.1.0, which warn where they are called.
+_OLD = {
+    "judge": "ringfence.evaluation.ope.judge",
+}
 moved.install()
 
 
 def __getattr__(name: str):
-    if name in _WHERE:
-        module, _, other = _WHERE[name].partition(":")
+    where = _WHERE.get(name) or _OLD.get(name)
+    if where is not None:
+        module, _, other = where.partition(":")
         return getattr(importlib.import_module(module), other or name)
     raise AttributeError(f"module 'ringfence' has no attribute '{name}'")

@@ -119,9 +119,9 @@ def fit(
         print(world.save(made, out_file))
     if report is not None:
         from ringfence.datasets.audit import audit
-        from ringfence.report.ope_page import build_judgement
+        from ringfence.report.ope_page import build_ope
 
-        print(build_judgement(report, made.card, audit(store)))
+        print(build_ope(report, made.card, audit(store)))
 
 
 def evaluate(
@@ -220,7 +220,7 @@ def play(
         at_once: simulators that are stepped side by side.
     """
     from ringfence.evaluation.play import play as run_play
-    from ringfence.evaluation.play import simulator
+    from ringfence.evaluation.simulators import simulator
 
     given = playing.arguments()
     if not runs:
@@ -301,54 +301,45 @@ def export(
     print(write(found[0], out_file, format, step, **given))
 
 
-def judge(
+def ope(
     run: Positional[Path],
     data: Positional[str],
-    guard: Literal["none", "select", "shield", "adapt", "refine", "full"] = "none",
-    danger: Literal["learned", "formula", "both"] | None = None,
-    world: Path | None = None,
-    planner: Literal["default", "value_guided", "low_temperature"] = "default",
     states: int = 3000,
     transitions: int = 20_000,
     updates: int = 3000,
     seed: int = 0,
     report: Path | None = None,
+    playing: How = AS_IT_IS,
 ) -> None:
-    """Judge a policy by logs alone, without a simulator: what it would do there, where that leads, what it is worth.
+    """Evaluate a policy by logs alone, without a simulator: what it would do there, where that leads, what it is worth.
 
     Args:
         run: folder of a trained run.
         data: a store of its task, best one that it was not trained on (or a task, whose data set is regenerated).
-        guard: as for `ringfence eval`.
-        danger: what the guard knows danger by.
-        world: the World that guards; the one that judges is fitted to `data`.
-        planner: as for `ringfence eval`.
         states: logged states that it is asked in.
-        transitions: logged steps that Q evaluation learns from.
+        transitions: logged steps that fitted Q evaluation learns from.
         updates: of the evaluation.
-        seed: of what is drawn, and of the judging World (seed + 1).
+        seed: of what is drawn, and of the World that evaluates (seed + 1), which is fitted to `data`.
         report: write an HTML page.
     """
     from ringfence.datasets.audit import audit
-    from ringfence.evaluation import ope
-    from ringfence.report.ope_page import build_judgement
+    from ringfence.evaluation import ope as evaluation
+    from ringfence.loading.spec import PolicySpec
+    from ringfence.report.ope_page import build_ope
     from ringfence.training import worlds
 
+    given = playing.arguments()
     report = None if report is None else writable(report)
-    (found,) = _runs([run])[:1]
+    found = _runs([run])[0]
     store = _store(data)
-    how = {k: v for k, v in (("danger", danger), ("world", world)) if v is not None}
-    how |= {} if guard == "none" else {"guard": guard}
-    ope.check(found, store)
-    by = worlds.fit(store, seed=seed + 1, quiet=False)
-    told = ope.judge(
-        found, store, judge_world=by, states=states, transitions=transitions, updates=updates, planner=planner,
-        seed=seed, quiet=False, **how,
-    )  # fmt: skip
-    for line in ope.words(told):
+    evaluation.check(found, store)
+    world = worlds.fit(store, seed=seed + 1, sight=PolicySpec.of(found, **given).sight, quiet=False)
+    sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
+    result = evaluation.ope(found, store, evaluation_world=world, quiet=False, **sizes, **given)
+    for line in result.summary():
         out.print(line, soft_wrap=True, markup=False)
     if report is not None:
-        print(build_judgement(report, by.card, audit(store), told))
+        print(build_ope(report, world.card, audit(store), result))
 
 
 def report(
@@ -594,7 +585,7 @@ COMMANDS = {
     "get": get,
     "export": export,
     "bench": bench,
-    "judge": judge,
+    "ope": ope,
     "report": report,
     "demo": demo,
     "doctor": doctor,

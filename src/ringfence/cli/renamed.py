@@ -7,10 +7,10 @@ import sys
 from ringfence.utils import stored
 
 # Of `ringfence data X` the command is "data X", of `ringfence bench X` it is "bench X".
-OLD_COMMANDS: dict[str, str] = {}
+OLD_COMMANDS: dict[str, str] = {"judge": "ope"}
 # By today's command; "" holds flags of every command.
 OLD_FLAGS: dict[str, dict[str, str]] = {
-    command: {"--danger": "--barrier", "--sight": "--execution"} for command in ("eval", "play", "export")
+    command: {"--danger": "--barrier", "--sight": "--execution"} for command in ("eval", "play", "export", "ope")
 }
 # By today's flag.
 OLD_VALUES: dict[str, dict[str, str]] = {

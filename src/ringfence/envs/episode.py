@@ -1,16 +1,28 @@
-"""One episode in anybody's simulator, through PettingZoo's parallel API; everything it tells is checked."""
+"""One episode in anybody's simulator, through PettingZoo's parallel API; everything that it returns is checked."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence, Sized
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ringfence.errors import UserError
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
+ByAgent = Mapping[Any, Any]
+
+
+class ParallelEnv(Protocol):
+    """What is asked of a simulator, a part of PettingZoo's parallel API. One with a global state has `state()`, too."""
+
+    @property
+    def possible_agents(self) -> Sequence[Any]: ...
+
+    def reset(self, seed: int | None = None) -> tuple[ByAgent, ByAgent]: ...
+
+    def step(self, actions: dict[Any, Any]) -> tuple[ByAgent, ...]: ...
 
 
 @dataclass(frozen=True)
@@ -34,148 +46,189 @@ class Episode:
     """An episode under way: what its agents see, and what they have earned and cost.
 
     `seen` (N, O) and `state` (S,) or None are of now, or of the step before if the end was not shown; `rewards` holds
-    (N,) of every step, `costs` a float, or (N,) where each agent is told its own, and `constraints` a dictionary of
-    these by the constraint's name, where the simulator tells costs by name.
+    (N,) of every step, `costs` a float, or (N,) where each agent has its own, and `constraints` a dictionary of these
+    by the constraint's name, where the simulator names costs.
     """
 
-    def __init__(self, env: Any, shape: Shape, seed: int, longest: int):
+    def __init__(self, env: Any, shape: Shape, seed: int, max_steps: int):
         check(env)
-        self.env, self.shape, self.agents, self.longest = env, shape, list(env.possible_agents), longest
-        if not self.agents:
-            raise UserError(f"{type(env).__name__} has no possible_agents; give at least one.")
-        if len(set(map(str, self.agents))) < len(self.agents):
-            raise UserError(f"{type(env).__name__} names an agent twice in possible_agents; give each its own name.")
-        if shape.agents not in (None, len(self.agents)):
-            remedy = f"; pass agents={len(self.agents)}" if shape.alike else ""
-            raise UserError(
-                f"{type(env).__name__} has {len(self.agents)} agents, the run was trained with {shape.agents}{remedy}."
-            )
-        if shape.state != 0 and not hasattr(env, "state"):
-            raise UserError(
-                f"The run reads a global state, which {type(env).__name__} lacks; give it a state() method."
-            )
+        self.env: ParallelEnv = env
+        self.name = type(env).__name__
+        self.shape = shape
+        self.agents = list(env.possible_agents)
+        self.max_steps = max_steps
+        self._check_agents()
+        self._read_state: Callable[[], Any] | None = getattr(env, "state", None) if shape.state != 0 else None
+        if shape.state != 0 and self._read_state is None:
+            raise UserError(f"The run reads a global state, which {self.name} lacks; give it a state() method.")
         self.rewards: list[np.ndarray] = []
         self.costs: list[float | np.ndarray] = []
         self.constraints: list[dict[str, float | np.ndarray]] = []
-        self.terminated = self.unsafe_start = False
-        self.running = self.showed_end = True
+        self.terminated = False
+        self.unsafe_start = False
+        self.running = True
+        self.showed_end = True
         begun = env.reset(seed=seed)
         if not isinstance(begun, tuple) or len(begun) != 2:
             raise UserError(
-                f"reset() of {type(env).__name__} returned a {type(begun).__name__}; a ParallelEnv's returns two "
+                f"reset() of {self.name} returned a {type(begun).__name__}; a ParallelEnv's returns two "
                 "things, observations and infos."
             )
-        self._look(begun[0])
+        self._observe(begun[0])
+
+    def _check_agents(self) -> None:
+        count = len(self.agents)
+        if not count:
+            raise UserError(f"{self.name} has no possible_agents; give at least one.")
+        if len(set(map(str, self.agents))) < count:
+            raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
+        if self.shape.agents not in (None, count):
+            remedy = f"; pass agents={count}" if self.shape.alike else ""
+            raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}{remedy}.")
 
     @property
-    def owes(self) -> bool:
-        """The last step told no cost."""
+    def lacks_cost(self) -> bool:
+        """The last step has no cost yet."""
         return len(self.costs) < len(self.rewards)
 
     def charge(self, cost: float) -> None:
-        """Set the cost of the last step, if nobody has."""
-        if self.owes:
+        """Set the cost of the last step, if nothing has."""
+        if self.lacks_cost:
             self.costs.append(cost)
 
     def step(self, action: np.ndarray, cost: Cost | None = None) -> None:
         """Act (N, A) and take note of what came of it."""
-        told, name = self.env.step(dict(zip(self.agents, action))), type(self.env).__name__
-        if not isinstance(told, tuple | list) or len(told) not in (5, 6):
-            count = len(told) if hasattr(told, "__len__") else 1
-            raise UserError(f"step() of {name} returned {count} things; a ParallelEnv's are five.")
-        if odd := [type(part).__name__ for part in told if not isinstance(part, Mapping)]:
-            raise UserError(f"step() of {name} returned a {odd[0]}; each of its five is a dict by agent.")
-        seen, rewards, *costs, terminations, truncations, infos = told
-        self._all_in("rewards", rewards, len(self.rewards) + 1)
-        ended = [bool(terminations.get(a) or truncations.get(a)) for a in self.agents]
-        if any(ended) and not all(ended):
-            gone = self.agents[ended.index(True)]
-            raise UserError(f"{gone} ended at step {len(self.rewards) + 1} before its team; agents must end together.")
-        self.rewards.append(np.array([_number(rewards[a], "reward", name) for a in self.agents]))
-        self._cost(costs[0] if costs else None, infos, cost)
-        if len(self.rewards) >= self.longest and not all(ended):
+        step = _checked(self.name, self.env.step(dict(zip(self.agents, action))))
+        number = len(self.rewards) + 1
+        self._check_all_in("rewards", step.rewards, number)
+        ended = self._ended(step, number)
+        self.rewards.append(np.array([_number(step.rewards[a], "reward", self.name) for a in self.agents]))
+        self._take_cost(step, cost)
+        if number >= self.max_steps and not ended:
             raise UserError(
-                f"An episode of {name} has not ended after {self.longest} steps; let truncations end it, or pass "
-                "longest=."
+                f"An episode of {self.name} has not ended after {self.max_steps} steps; let truncations end it, or "
+                "pass longest=."
             )
-        if not np.isfinite(np.concatenate([self.rewards[-1], *(np.ravel(c) for c in self.costs[-1:])])).all():
-            raise UserError(f"Step {len(self.rewards)} has a reward or cost that is not finite; repair the simulator.")
-        self.running = not all(ended)
-        self.terminated = all(bool(terminations.get(a)) for a in self.agents)
-        if self.running or seen:
-            self._look(seen)
-        elif self.owes:  # costs that were told need no last state
+        numbers = [self.rewards[-1], *(np.ravel(c) for c in self.costs[-1:])]
+        if not np.isfinite(np.concatenate(numbers)).all():
+            raise UserError(f"Step {number} has a reward or cost that is not finite; repair the simulator.")
+        self.running = not ended
+        self.terminated = all(bool(step.terminations.get(a)) for a in self.agents)
+        self.showed_end = bool(step.observations)
+        if self.running or self.showed_end:
+            self._observe(step.observations)
+        elif self.lacks_cost:  # a step with a cost needs no last state
             raise UserError(
                 "step() tells neither a cost nor the state that an episode ends in; return the last observations."
             )
-        self.showed_end = bool(seen)
 
-    def _cost(self, apart: Mapping | None, infos: Mapping, cost: Cost | None) -> None:
-        """The step's, if anything tells it: `cost`, what `step` tells beside rewards, or the infos."""
-        name = type(self.env).__name__
-        told_of = {a: i for a, i in infos.items() if isinstance(i, Mapping)}
-        each = apart if apart is not None else {a: i["cost"] for a, i in told_of.items() if "cost" in i}
-        told = cost(infos) if cost is not None else self._of_all(each)
-        if told is None:
+    def _ended(self, step: Step, number: int) -> bool:
+        ended = [bool(step.terminations.get(a) or step.truncations.get(a)) for a in self.agents]
+        if any(ended) and not all(ended):
+            gone = self.agents[ended.index(True)]
+            raise UserError(f"{gone} ended at step {number} before its team; agents must end together.")
+        return all(ended)
+
+    def _take_cost(self, step: Step, cost: Cost | None) -> None:
+        """The step's cost, if there is one: that of `cost`, what `step` gives beside rewards, or what infos hold."""
+        charged = cost(dict(step.infos)) if cost is not None else self._team_cost(_costs_by_agent(step))
+        if charged is None:
             return
-        if isinstance(told, Mapping):
-            self.constraints.append({str(k): self._charged(c, name) for k, c in told.items()})
-            names, now = list(self.constraints[0]), list(self.constraints[-1])
-            if not names or now != names or len(self.constraints) < len(self.rewards):
-                raise UserError(
-                    f"Step {len(self.rewards)} of {name} tells costs of {', '.join(now) or 'nothing'}, the first one "
-                    f"of {', '.join(names) or 'nothing'}; name the same constraints at every step."
-                )
-            told = np.max(np.broadcast_arrays(*self.constraints[-1].values()), 0)
+        if isinstance(charged, Mapping):
+            self._take_constraints(charged)
+            charged = np.max(np.broadcast_arrays(*self.constraints[-1].values()), 0)
         elif self.constraints:
-            raise UserError(f"Step {len(self.rewards)} of {name} tells one cost, those before several; name them all.")
-        self.costs.append(self._charged(told, "cost=" if cost is not None else name))
-        if self.costs and np.min(self.costs[-1]) < 0:
+            raise UserError(
+                f"Step {len(self.rewards)} of {self.name} tells one cost, those before several; name them all."
+            )
+        self.costs.append(self._of_agents(charged, "cost=" if cost is not None else self.name))
+        if np.min(self.costs[-1]) < 0:
             raise UserError(
                 f"Step {len(self.rewards)} has the cost {np.min(self.costs[-1]):g}; a cost is 0 or positive."
             )
 
-    def _of_all(self, each: Mapping) -> Any:
-        """What the agents' costs are together: each agent's own where all tell one, else the largest; by name where
-        they are told by name."""
-        if not each:
-            return None
-        if not any(isinstance(c, Mapping) for c in each.values()):
-            told = [_number(c, "cost", type(self.env).__name__) for c in each.values()]
-            if not all(a in each for a in self.agents):
-                return max(told)
-            return np.array([_number(each[a], "cost", type(self.env).__name__) for a in self.agents])
-        if not all(isinstance(c, Mapping) for c in each.values()):
+    def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
+        """The step's cost by each constraint's name."""
+        self.constraints.append({str(k): self._of_agents(c, self.name) for k, c in costs.items()})
+        names = list(self.constraints[0])
+        now = list(self.constraints[-1])
+        if not names or now != names or len(self.constraints) < len(self.rewards):
             raise UserError(
-                f"Step {len(self.rewards)} of {type(self.env).__name__} tells some agents' costs by name and others' "
+                f"Step {len(self.rewards)} of {self.name} tells costs of {', '.join(now) or 'nothing'}, the first one "
+                f"of {', '.join(names) or 'nothing'}; name the same constraints at every step."
+            )
+
+    def _team_cost(self, by_agent: ByAgent) -> Any:
+        """Agents' costs together: (N,) where all have one, else the largest; by constraint where they are named."""
+        if not by_agent:
+            return None
+        named = [isinstance(c, Mapping) for c in by_agent.values()]
+        if not any(named):
+            costs = {a: _number(c, "cost", self.name) for a, c in by_agent.items()}
+            everybody = all(a in costs for a in self.agents)
+            return np.array([costs[a] for a in self.agents]) if everybody else max(costs.values())
+        if not all(named):
+            raise UserError(
+                f"Step {len(self.rewards)} of {self.name} tells some agents' costs by name and others' "
                 "not; name them all."
             )
-        names = list(dict.fromkeys(k for c in each.values() for k in c))
-        return {k: self._of_all({a: c[k] for a, c in each.items() if k in c}) for k in names}
+        constraints = dict.fromkeys(k for costs in by_agent.values() for k in costs)
+        return {k: self._team_cost({a: c[k] for a, c in by_agent.items() if k in c}) for k in constraints}
 
-    def _charged(self, cost: Any, whose: str) -> float | np.ndarray:
+    def _of_agents(self, cost: Any, whose: str) -> float | np.ndarray:
+        """A number, or one of each agent."""
         if isinstance(cost, np.ndarray) and cost.shape == (len(self.agents),):
             return cost
         return _number(cost, "cost", whose)
 
-    def _all_in(self, what: str, told: dict, step: int) -> None:
-        lacking = [str(a) for a in self.agents if a not in told]
+    def _check_all_in(self, what: str, by_agent: ByAgent, step: int) -> None:
+        lacking = [str(a) for a in self.agents if a not in by_agent]
         if lacking:
             raise UserError(
-                f"{type(self.env).__name__} tells no {what} of {', '.join(lacking)} at step {step}; all "
+                f"{self.name} tells no {what} of {', '.join(lacking)} at step {step}; all "
                 "of possible_agents must take part until the episode ends."
             )
 
-    def _look(self, seen: dict) -> None:
-        self._all_in("observations", seen, len(self.rewards))
-        there = [seen[a] for a in self.agents]
-        self.seen = given_as("observations", there, (len(self.agents), self.shape.observation))
+    def _observe(self, observations: ByAgent) -> None:
+        self._check_all_in("observations", observations, len(self.rewards))
+        rows = [observations[a] for a in self.agents]
+        self.seen = given_as("observations", rows, (len(self.agents), self.shape.observation))
         self.state = None
-        if self.shape.state != 0:
-            self.state = given_as("state", self.env.state(), (self.shape.state,))
+        if self._read_state is not None:
+            self.state = given_as("state", self._read_state(), (self.shape.state,))
 
 
-def given_as(name: str, value: np.ndarray, expected: tuple[int | None, ...]) -> np.ndarray:
+class Step(NamedTuple):
+    """What a simulator's `step` returned, each by agent; costs where there are six."""
+
+    observations: ByAgent
+    rewards: ByAgent
+    costs: ByAgent | None
+    terminations: ByAgent
+    truncations: ByAgent
+    infos: ByAgent
+
+
+def _checked(name: str, returned: Any) -> Step:
+    """What `step` of the simulator of that name returned, five dictionaries or six."""
+    if not isinstance(returned, tuple | list) or len(returned) not in (5, 6):
+        count = len(returned) if isinstance(returned, Sized) else 1
+        raise UserError(f"step() of {name} returned {count} things; a ParallelEnv's are five.")
+    odd = [type(part).__name__ for part in returned if not isinstance(part, Mapping)]
+    if odd:
+        raise UserError(f"step() of {name} returned a {odd[0]}; each of its five is a dict by agent.")
+    observations, rewards, *costs, terminations, truncations, infos = returned
+    return Step(observations, rewards, costs[0] if costs else None, terminations, truncations, infos)
+
+
+def _costs_by_agent(step: Step) -> ByAgent:
+    """Costs that `step` gave beside rewards, else those of the infos; an agent without one is not there."""
+    if step.costs is not None:
+        return step.costs
+    return {a: info["cost"] for a, info in step.infos.items() if isinstance(info, Mapping) and "cost" in info}
+
+
+def given_as(name: str, value: Any, expected: tuple[int | None, ...]) -> np.ndarray:
     """What a policy is given, as numbers of the expected shape; None stands for a width that nobody knows."""
     letters = "NO" if len(expected) == 2 else "S"
     wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"

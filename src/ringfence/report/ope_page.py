@@ -2,55 +2,75 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
 from ringfence.datasets.audit import Audit
+from ringfence.evaluation.ope.result import Behaviour, OPEResult, Safety
 from ringfence.report import html
 from ringfence.report.figures import INK, figure, style, to_svg
 from ringfence.world import Card
 from ringfence.world.card import BarrierScores
 
-# What is said of each number of a judgement, and of which kind it is.
-CONDUCT = {
-    "steps_in": "states in which the guard changes the action",
-    "infeasible": "states in which it cannot do what it should",
-    "strange": "states in which the guard's World does not know",
-    "unknown": "states in which the judging World does not know where the action leads",
+# What is said of each rate of what a policy does.
+BEHAVIOUR = {
+    "intervention_rate": "states in which the guard changes the action",
+    "infeasible_rate": "states in which it cannot do what it should",
+    "guard_ood_rate": "states that are out of distribution for the guard's World",
+    "ood_rate": "states in which the action leads out of the distribution of these logs",
 }
 
 
-def build_judgement(out: str | Path, card: Card, audit: Audit, judged: dict[str, Any] | None = None) -> Path:
-    """Write the page of logs and their World, and of a policy that was judged by them (`judging.judge`)."""
-    drawn = []
-    if card.barrier is not None and card.barrier.calibration:
-        drawn.append(("What a margin means", _calibration(card.barrier), _said_of(card.barrier)))
-    if judged and judged.get("margins"):
-        drawn.append(
-            (
-                f"Margins foreseen along {judged['ahead']} steps",
-                _margins(judged["margins"]),
-                "The share of safe logged states whose worst foreseen margin is below a value. Below 0: danger is "
-                "foreseen. Below 1: not surely safe.",
-            )
-        )
-    words = str(card).splitlines()
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of the page."""
+
+    title: str
+    svg: Markup
+    said: str
+
+
+def build_ope(out: str | Path, card: Card, audit: Audit, result: OPEResult | None = None) -> Path:
+    """Write the page of logs and their World, and of a policy that was evaluated by them (`ringfence.ope`)."""
+    title = f"{card.data.task}: what its logs say"
+    if result is not None:
+        title += f" of {result.algorithm}"
     text = html.render(
-        "judgement.html.j2",
+        "ope.html.j2",
         {
-            "title": f"{card.data.task}: what its logs say" + (f" of {judged['algorithm']}" if judged else ""),
+            "title": title,
             "facts": audit.facts.items(),
             "warnings": [*audit.warnings, *audit.notes],
-            "words": words,
-            "figures": [{"title": t, "svg": Markup(svg), "said": said} for t, svg, said in drawn],
-            "judged": judged,
-            "conduct": [(CONDUCT[k], judged[k]) for k in CONDUCT if judged.get(k) is not None] if judged else [],
+            "words": str(card).splitlines(),
+            "figures": _figures(card, result),
+            "ope": result,
+            "behaviour": [] if result is None else _rates(result.behaviour),
         },
     )
     return html.write(Path(out), text)
+
+
+def _figures(card: Card, result: OPEResult | None) -> list[Drawn]:
+    drawn = []
+    barrier = card.barrier
+    if barrier is not None and barrier.calibration:
+        drawn.append(Drawn("What a margin means", Markup(_calibration(barrier)), _said_of(barrier)))
+    if result is not None and result.safety is not None:
+        said = (
+            "The share of safe logged states whose smallest predicted margin is below a value. Below 0: danger is "
+            "predicted. Below 1: the calibrated margin is not kept."
+        )
+        title = f"Margins predicted along {result.ahead} steps"
+        drawn.append(Drawn(title, Markup(_margins(result.safety)), said))
+    return drawn
+
+
+def _rates(behaviour: Behaviour) -> list[tuple[str, float]]:
+    rates = [(said, getattr(behaviour, name)) for name, said in BEHAVIOUR.items()]
+    return [(said, rate) for said, rate in rates if rate is not None]
 
 
 def _calibration(barrier: BarrierScores) -> str:
@@ -76,17 +96,18 @@ def _said_of(barrier: BarrierScores) -> str:
     return f"Dashed: the default margin, {barrier.margin:.2g}. Held-out steps, as often unsafe as in the logs."
 
 
-def _margins(margins: dict[str, list[float]]) -> str:
+def _margins(safety: Safety) -> str:
+    lines = {"policy": (safety.margins, "-"), "logs": (safety.margins_of_logs, (0, (4, 2)))}
     with style():
         made = figure(8.2, 3.0)
         ax = made.add_subplot()
-        for k, (name, quantiles) in enumerate(margins.items()):
+        for name, (quantiles, linestyle) in lines.items():
             share = np.linspace(0, 100, len(quantiles))
-            ax.plot(np.clip(quantiles, -4, 6), share, color=INK, linestyle=("-", (0, (4, 2)))[k], label=name)
+            ax.plot(np.clip(quantiles, -4, 6), share, color=INK, linestyle=linestyle, label=name)
         ax.axvspan(-4, 0, color=INK, alpha=0.07, linewidth=0)
         ax.axvline(1, color=INK, linewidth=1.0, linestyle=(0, (1, 2)))
         ax.set_xlim(-4, 6)
-        ax.set_xlabel("worst foreseen margin, in units of the calibrated one")
+        ax.set_xlabel("smallest predicted margin, in units of the calibrated one")
         ax.set_ylabel("states below it, %")
         ax.legend(frameon=False)
-        return to_svg(made, "Foreseen margins of the policy and of the logs", "margins")
+        return to_svg(made, "Predicted margins of the policy and of the logs", "margins")

@@ -1,5 +1,6 @@
-"""A policy judged by logs alone, without a simulator."""
+"""Off-policy evaluation: a policy by logs alone, without a simulator."""
 
-from ringfence.evaluation.ope.estimate import check, judge, words
+from ringfence.evaluation.ope.estimate import check, ope
+from ringfence.evaluation.ope.result import OPEResult
 
-__all__ = ["check", "judge", "words"]
+__all__ = ["OPEResult", "check", "ope"]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import t as student
 
 from ringfence.evaluation.ope.logs import Logs
+from ringfence.evaluation.ope.result import Mean, Values
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.normalise import varying
@@ -16,6 +19,15 @@ from ringfence.types import Array, Key
 
 WIDTH = 64  # units of each of the 2 hidden layers
 SLOW = 0.05  # rate at which the copy that targets are read from follows
+
+
+@dataclass(frozen=True)
+class FQE:
+    """Settings of fitted Q evaluation."""
+
+    discount: float = 0.95
+    num_ensemble: int = 5  # networks, each on episodes drawn with replacement
+    updates: int = 3000
 
 
 class Q(eqx.Module):
@@ -27,71 +39,95 @@ class Q(eqx.Module):
 
     def __call__(self, x: Array, action: Array) -> Array:
         if self.joint:
-            x, action = x[..., :1, :], action.reshape(*action.shape[:-2], 1, -1)
+            x = x[..., :1, :]
+            action = action.reshape(*action.shape[:-2], 1, -1)
         return self.net(jnp.concatenate([x, action], -1)).mean(-2)
 
 
-def worth(
-    told: Logs,
+class Steps(NamedTuple):
+    """Logged steps as Q learns from them; M members of the ensemble."""
+
+    x: Array  # (T, N, D), standardised
+    action: Array  # (T, N, A) logged
+    next_x: Array  # (T, N, D)
+    next_action: Array  # (T, N, A) of the policy that is evaluated
+    earned: Array  # (T, 2) return and cost, standardised, times 1 − γ so that Q is of the order of 1
+    goes_on: Array  # (T,) 0 where the task itself ended
+    weight: Array  # (T, M) how often a member drew the step's episode
+
+
+def fitted_q(
+    logs: Logs,
     steps: np.ndarray,
-    after: np.ndarray,
+    next_actions: np.ndarray,
     starts: np.ndarray,
-    first: np.ndarray,
-    name: str,
+    first_actions: np.ndarray,
+    settings: FQE,
     key: Key,
-    members: int,
-    updates: int,
-    discount: float,
-    quiet: bool,
-) -> dict[str, dict[str, float]]:
-    """Fitted Q evaluation (Le et al. 2019) of discounted return and cost: y = r + γ Q̄(s', a'), where a' is what is
-    judged does in s', and Q̄ follows slowly. Each member learns from episodes drawn with replacement."""
-    x = np.asarray(told.x)
-    flat = x[told.row[steps]].reshape(-1, x.shape[-1]).astype(np.float64)
-    mean, scale = flat.mean(0), varying(flat.std(0), flat.mean(0))
-    view = lambda rows: jnp.asarray((x[rows] - mean) / scale, jnp.float32)  # noqa: E731
-    earned = np.stack([told.rewards[steps], told.costs[steps]], -1).astype(np.float64)
-    usual = np.stack([earned.mean(0), np.maximum(earned.std(0), 1e-6)])
-    goal = (earned - usual[0]) / usual[1] * (1 - discount)  # so that Q is of the order of 1
-    over = told.terminated[steps]
-    n, a = after.shape[1:]
-    kn, kw, kr = jax.random.split(key, 3)
-    sizes = (x.shape[-1] + (n * a if told.joint else a), WIDTH, WIDTH, 2)
-    nets = jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), told.joint))(jax.random.split(kn, members))
-    episodes, which = np.unique(told.episode[steps], return_inverse=True)
-    weight = np.random.default_rng(int(jax.random.bits(kw))).poisson(1.0, (len(episodes), members))[which]
-    data = (
-        view(told.row[steps]),
-        jnp.asarray(told.actions[steps]),
-        view(told.row[steps] + 1),
-        jnp.asarray(after),
-        jnp.asarray(goal, jnp.float32),
-        jnp.asarray(~over, jnp.float32),
-        jnp.asarray(weight, jnp.float32),
+    label: str = "",
+) -> Values:
+    """Discounted return and cost of a policy: y = r + γ Q̄(s', a'), where a' is what the policy does in s', and Q̄
+    follows slowly.
+
+    steps (T,): logged steps that Q learns from, with the policy's `next_actions` (T, N, A) in the states that they lead
+    to; starts (S,): rows of first states, with its `first_actions` (S, N, A). Intervals are Student's over the
+    ensemble. Progress is shown under a `label`."""
+    net_key, weight_key, fit_key = jax.random.split(key, 3)
+    x = np.asarray(logs.x)
+    flat = x[logs.row[steps]].reshape(-1, x.shape[-1]).astype(np.float64)
+    location = flat.mean(0)
+    scale = varying(flat.std(0), location)
+
+    def view(rows: np.ndarray) -> Array:
+        return jnp.asarray((x[rows] - location) / scale, jnp.float32)
+
+    earned = np.stack([logs.rewards[steps], logs.costs[steps]], -1).astype(np.float64)
+    mean = earned.mean(0)
+    deviation = np.maximum(earned.std(0), 1e-6)
+    data = Steps(
+        x=view(logs.row[steps]),
+        action=jnp.asarray(logs.actions[steps]),
+        next_x=view(logs.row[steps] + 1),
+        next_action=jnp.asarray(next_actions),
+        earned=jnp.asarray((earned - mean) / deviation * (1 - settings.discount), jnp.float32),
+        goes_on=jnp.asarray(~logs.terminated[steps], jnp.float32),
+        weight=jnp.asarray(_bootstrap(logs.episode[steps], settings.num_ensemble, weight_key), jnp.float32),
     )
+    nets = _networks(data, logs.joint, settings.num_ensemble, net_key)
+    # What ends for good earns nothing more, and nothing is −mean in these units.
+    fast = _fitted(nets, data, jnp.asarray(-mean / deviation, jnp.float32), settings, fit_key, label)
+    at_starts = jax.jit(lambda nets, x, action: jax.vmap(lambda q: q(x, action).mean(0))(nets))
+    found = np.asarray(at_starts(fast, view(starts), jnp.asarray(first_actions)), np.float64)  # (M, 2)
+    found = (found * deviation + mean) / (1 - settings.discount)
+    return Values(Mean.of_bootstrap(found[:, 0]), Mean.of_bootstrap(found[:, 1]))
 
-    def loss(both, data, pick: Array) -> Array:
+
+def _bootstrap(episode_of_step: np.ndarray, members: int, key: Key) -> np.ndarray:
+    """(T, M): how often each member drew the episode of a step."""
+    episodes, which = np.unique(episode_of_step, return_inverse=True)
+    rng = np.random.default_rng(int(jax.random.bits(key)))
+    return rng.poisson(1.0, (len(episodes), members))[which]
+
+
+def _networks(data: Steps, joint: bool, members: int, key: Key) -> Q:
+    agents, actions = data.next_action.shape[1:]
+    sizes = (data.x.shape[-1] + (agents * actions if joint else actions), WIDTH, WIDTH, 2)
+    return jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), joint))(jax.random.split(key, members))
+
+
+def _fitted(nets: Q, data: Steps, nothing: Array, settings: FQE, key: Key, label: str) -> Q:
+    """The ensemble after training; `nothing` (2,) is what is earned where nothing is."""
+
+    def loss(both: tuple[Q, Q], data: Steps, pick: Array) -> Array:
         fast, slow = both
-        now, acted, then, next_action, earned, goes_on, weight = (d[pick] for d in data)
-        q = jax.vmap(lambda f: f(now, acted))(fast)  # (members, batch, 2)
-        ahead = jax.lax.stop_gradient(jax.vmap(lambda f: f(then, next_action))(slow))
-        # What ends for good earns nothing more, and nothing is −mean in these units.
-        nothing = jnp.asarray(-usual[0] / usual[1], jnp.float32)
-        target = earned + discount * jnp.where(goes_on[:, None] > 0, ahead, nothing)
-        return (weight.T[..., None] * (q - target) ** 2).mean()
+        some = Steps(*(rows[pick] for rows in data))
+        q = jax.vmap(lambda net: net(some.x, some.action))(fast)  # (M, batch, 2)
+        ahead = jax.lax.stop_gradient(jax.vmap(lambda net: net(some.next_x, some.next_action))(slow))
+        target = some.earned + settings.discount * jnp.where(some.goes_on[:, None] > 0, ahead, nothing)
+        return (some.weight.T[..., None] * (q - target) ** 2).mean()
 
-    def follow(both):
+    def follow(both: tuple[Q, Q]) -> tuple[Q, Q]:
         fast, slow = both
         return fast, jax.tree.map(lambda f, s: s + SLOW * (f - s), fast, slow)
 
-    label = "" if quiet else f"what {'the logs are' if name else 'the policy is'} worth"
-    fast, _ = regress(loss, (nets, nets), data, len(steps), kr, updates, 256, 1e-3, label, after=follow)
-    of = jax.jit(lambda fast, x, a: jax.vmap(lambda f: f(x, a).mean(0))(fast))
-    told_of = np.asarray(of(fast, view(starts), jnp.asarray(first)), np.float64)  # (members, 2)
-    value = (told_of * usual[1] + usual[0]) / (1 - discount)
-    out = {}
-    for k, what in enumerate(("return", "cost")):
-        half = student.ppf(0.975, members - 1) * value[:, k].std(ddof=1)
-        middle = float(value[:, k].mean())
-        out[what + name] = {"mean": middle, "low": middle - float(half), "high": middle + float(half)}
-    return out
+    return regress(loss, (nets, nets), data, len(data.x), key, settings.updates, 256, 1e-3, label, after=follow)[0]

@@ -1,4 +1,4 @@
-"""Logs as the World that judges sees them."""
+"""Logs in the view of the World that evaluates."""
 
 from __future__ import annotations
 
@@ -10,15 +10,30 @@ from ringfence.world import World
 
 
 class Logs:
-    """The logs in the judging World's view: actions in [−1, 1], rewards and costs of the team."""
+    """A store in a World's view: T steps in E episodes, actions in [−1, 1], rewards and costs of the team.
 
-    def __init__(self, logs: EpisodeStore, world: World):
-        arrays = WindowData(logs, world.map).arrays
-        self.x, self.actions = arrays["features"], np.asarray(arrays["actions"])
-        self.row = np.arange(logs.steps) + logs.episode_of_step  # of the state that a step begins in
-        self.rewards, self.costs = logs.rewards.mean(1), logs.team_costs.astype(np.float32)
-        self.terminated, self.episode = logs.terminated, logs.episode_of_step
-        self.step_of_start = np.concatenate([[0], logs.episode_ends[:-1]])
-        self.starts = self.step_of_start + np.arange(logs.episodes)
+    `x` (T + E, N, D) holds an episode's last state, too, so `row` (T,) says where a step begins.
+    """
+
+    def __init__(self, store: EpisodeStore, world: World):
+        arrays = WindowData(store, world.map).arrays
+        self.store = store
+        self.x = arrays["features"]
+        self.actions = np.asarray(arrays["actions"])
+        self.row = np.arange(store.steps) + store.episode_of_step
+        self.rewards = store.rewards.mean(1)
+        self.costs = store.team_costs.astype(np.float32)
+        self.terminated = store.terminated
+        self.episode = store.episode_of_step
+        self.step_of_start = np.concatenate([[0], store.episode_ends[:-1]])  # (E,)
+        self.starts = self.step_of_start + np.arange(store.episodes)  # (E,) rows
+        self.last_step = np.repeat(store.episode_ends - 1, store.lengths)  # of each step's episode
         self.joint = world.map.joint
-        self.last_step = np.repeat(logs.episode_ends - 1, logs.lengths)
+
+    @property
+    def steps(self) -> int:
+        return self.store.steps
+
+    @property
+    def episodes(self) -> int:
+        return self.store.episodes

@@ -1,8 +1,8 @@
-"""How well logs alone tell what a simulator would: every policy of a suite, judged by logs that it was not trained on,
-beside what it did in the simulator.
+"""How well logs alone tell what a simulator would: every policy of a suite, evaluated by logs that it was not trained
+on, beside what it did in the simulator.
 
     ringfence bench guards --out DIR         # policies with their checkpoints
-    python benchmarks/judge.py DIR           # writes results/judging.csv and docs/judging.md; 30 s a policy and guard
+    python benchmarks/ope.py DIR             # writes results/judging.csv and docs/judging.md; 30 s a policy and guard
 """
 
 from __future__ import annotations
@@ -17,26 +17,35 @@ from scipy.stats import spearmanr
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
-from ringfence.evaluation.ope import estimate
+from ringfence.evaluation.ope import OPEResult, ope
 from ringfence.training import worlds
 from ringfence.training.runs import Run
+from ringfence.utils import stored
 from ringfence.utils.files import whole
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "judging.csv"
-EPISODES, LOGS_SEED = 2000, 7  # of the logs that judge
-NUMBERS = ("foreseen_unsafe", "not_surely_safe", "return", "cost", "unknown", "apart")
-PLAYED = {"played_return": "return", "played_danger": "danger"}
-HEAD = ("task", "algorithm", "variant", "seed", "true_return", "true_cost", *PLAYED, *NUMBERS)
+EPISODES, LOGS_SEED = 2000, 7  # of the logs that evaluate
+NUMBERS = {
+    "played_return": lambda result: result.rollout.returns.mean,
+    "played_danger": lambda result: result.rollout.unsafe_steps.mean,
+    "predicted_violation_rate": lambda result: result.safety.predicted_violation_rate,
+    "margin_violation_rate": lambda result: result.safety.margin_violation_rate,
+    "return": lambda result: result.values.returns.mean,
+    "cost": lambda result: result.values.costs.mean,
+    "ood_rate": lambda result: result.behaviour.ood_rate,
+    "action_rmse": lambda result: result.behaviour.action_rmse,
+}
+HEAD = ("task", "algorithm", "variant", "seed", "true_return", "true_cost", *NUMBERS)
 # What each number is to tell, and whether more of it is to mean more of that.
 TELLS = {
     "played_return": ("true_return", "return, played in the World of the logs"),
     "played_danger": ("true_cost", "dangerous steps, played in the World of the logs"),
-    "foreseen_unsafe": ("true_cost", "share of states from which danger is foreseen"),
-    "not_surely_safe": ("true_cost", "share of states that are not surely safe"),
+    "predicted_violation_rate": ("true_cost", "share of states from which danger is predicted"),
+    "margin_violation_rate": ("true_cost", "share of states whose predicted margin is below the calibrated one"),
     "cost": ("true_cost", "fitted Q evaluation of cost"),
     "return": ("true_return", "fitted Q evaluation of return"),
-    "unknown": ("true_cost", "share of states where the World does not know"),
-    "apart": ("true_cost", "distance from the logged actions"),
+    "ood_rate": ("true_cost", "share of states where the World does not know"),
+    "action_rmse": ("true_cost", "distance from the logged actions"),
 }
 
 
@@ -47,7 +56,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--without", default="", help="variants that hold this word, e.g. full, which takes minutes")
     args = parser.parse_args()
-    rows = list(csv.DictReader(OUT.open())) if OUT.exists() else []
+    rows = stored.table(OUT) if OUT.exists() else []
     done = {tuple(r[k] for k in HEAD[:4]) for r in rows}
     for cell in sorted((args.folder / "cells").glob("*/*/seed-*")) if args.folder else []:
         run = Run(cell)
@@ -66,17 +75,19 @@ def main() -> None:
             how = {"planner": result["planner"]}
             if result["guard"] != "none":
                 how |= {"guard": result["guard"], "barrier": result["barrier"], **result["guard_options"]}
-            found = estimate(run, store, judge_world=world, compare=False, **how)
-            numbers = [v["mean"] if isinstance(v := found[name], dict) else v for name in NUMBERS]
-            numbers = [found["played"][k]["mean"] for k in PLAYED.values()] + numbers
-            truth = [result["return_mean"], result["cost_safe_start"]]
-            rows.append(dict(zip(HEAD, map(str, (*key, *(f"{v:.5g}" for v in (*truth, *numbers)))))))
+            found = ope(run, store, evaluation_world=world, compare=False, **how)
+            numbers = [result["return_mean"], result["cost_safe_start"], *_numbers(found)]
+            rows.append(dict(zip(HEAD, [*key, *(f"{v:.5g}" for v in numbers)])))
             print(*rows[-1].values(), flush=True)
             with whole(OUT) as temporary, temporary.open("w") as f:
                 writer = csv.DictWriter(f, HEAD, lineterminator="\n")
                 writer.writeheader()
                 writer.writerows(rows)
     put("docs/judging.md", "ranks", ranks(rows))
+
+
+def _numbers(result: OPEResult) -> list[float]:
+    return [of(result) for of in NUMBERS.values()]
 
 
 def ranks(rows: list[dict]) -> str:

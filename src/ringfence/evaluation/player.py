@@ -1,0 +1,117 @@
+"""Who plays in somebody else's simulator: a trained run, or a function under guard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+from ringfence.datasets.task import Task
+from ringfence.envs.episode import Shape
+from ringfence.errors import UserError
+from ringfence.evaluation import evaluate
+from ringfence.guards import Pilot
+from ringfence.guards.wrap import Callback
+from ringfence.loading.resolve import Resolved, resolve
+from ringfence.loading.spec import PLAIN, PolicySpec
+from ringfence.problem.constraints import CostColumn
+from ringfence.problem.homogeneous import look
+from ringfence.proposals.base import act_with
+from ringfence.training.job import Job
+from ringfence.training.runs import Run
+from ringfence.types import Key, Policy, PolicyStep, PyTree
+
+Unsafe = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Player:
+    """Who plays, and what is known of it."""
+
+    name: str
+    policy: Policy  # of the whole team
+    act: Callable[..., tuple[PyTree, PolicyStep]]  # proposals.base.act_with, compiled where the policy can be
+    task: Task
+    shape: Shape
+    episode_length: int  # of the longest logged one
+    unsafe: Unsafe | None  # (B,) of observations and states, where a formula says what is unsafe
+    about: dict[str, Any]  # what a result says of it
+    limits: Mapping[str, float]  # per episode, of constraints that the data names
+
+
+@dataclass(frozen=True, eq=False)
+class RunPlayer(Player):
+    """A run, whose folder can keep the result under the variant's name."""
+
+    run: Run
+    variant: str
+
+
+def player_of(policy: Run | str | Pilot, planner: str, split: str, options: dict[str, Any]) -> Player:
+    """A run as planner and options say, or a function under guard, which takes neither."""
+    if isinstance(policy, Pilot):
+        return _of_function(policy, planner, options)
+    return _of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split)
+
+
+def _of_run(resolved: Resolved, split: str) -> RunPlayer:
+    job = resolved.job
+    run = Run.of(resolved.spec.run)
+    observation, state = job.widths
+    return RunPlayer(
+        name=job.algorithm.name,
+        policy=resolved.team,
+        act=jax.jit(act_with),
+        task=job.task,
+        shape=Shape(job.team, observation, state or 0, job.task.alike),
+        episode_length=job.spec.episode_length,
+        unsafe=_unsafe_by_formula(job) if job.hazard.has_formula else None,
+        about={"step": resolved.step} | evaluate.about(resolved),
+        limits=run.config["data"].get("constraints") or {},
+        run=run,
+        variant=resolved.variant(split),
+    )
+
+
+def _unsafe_by_formula(job: Job) -> Unsafe:
+    @jax.jit
+    def unsafe(observations, state):
+        found, _ = job.hazard.labels(look(job.feature_map, job.task.alike, observations, state))
+        return found.reshape(len(observations), -1).any(-1)
+
+    return lambda observations, state: np.asarray(unsafe(observations, state))
+
+
+def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:
+    if options or planner != PLAIN:
+        raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
+    world = pilot.policy.guarded.guard.world
+    spec = world.spec
+    return Player(
+        name="a function under guard",
+        policy=_OneByOne(pilot.policy),
+        act=act_with,
+        task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
+        shape=Shape(pilot.policy.agents, None, None if world.map.reads_state else 0, spec.alike),
+        episode_length=spec.episode_length,
+        unsafe=None,
+        about={"guard": "own"},
+        limits=world.limits,
+    )
+
+
+class _OneByOne:
+    """A function under guard that is asked for each simulator by itself, as by its pilot; the guard filters all."""
+
+    def __init__(self, policy: Callback):
+        self.policy = policy
+        self.start = policy.start
+        self.hear = policy.hear
+
+    def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
+        function = self.policy.function
+        wanted = [function(x, None if state is None else state[k]) for k, x in enumerate(observations)]
+        return self.policy.decided(memory, observations, state, wanted, key)

@@ -1,0 +1,59 @@
+"""Simulators that are named on a command line."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from ringfence.errors import UserError
+
+
+@dataclass(frozen=True)
+class NamedSimulator:
+    """What makes a simulator, and the name that it was given by."""
+
+    name: str
+    make: Callable[[], Any]
+
+    def __call__(self) -> Any:
+        return self.make()
+
+
+def simulator(name: str) -> NamedSimulator:
+    """What makes the simulator named FILE.py:NAME or MODULE:NAME, a class or a function without arguments."""
+    where, _, attribute = name.rpartition(":")
+    if not where or not attribute.isidentifier():
+        raise UserError(f"'{name}' names no simulator; write FILE.py:NAME or MODULE:NAME of what makes a ParallelEnv.")
+    make = getattr(_imported(where, attribute), attribute, None)
+    if not callable(make):
+        raise UserError(
+            f"'{where}' has no {attribute} that can be called; name the class, or the function, that makes one."
+        )
+    return NamedSimulator(name, make)
+
+
+def name_of(make_env: Callable[[], Any], env: Any) -> str:
+    """The name a simulator was given by, else that of its class."""
+    if isinstance(make_env, NamedSimulator):
+        return make_env.name
+    return f"{type(env).__module__}:{type(env).__qualname__}"
+
+
+def _imported(where: str, attribute: str) -> ModuleType:
+    """The module of a file, or of a name that is found from the working folder."""
+    file = Path(where)
+    is_file = file.suffix == ".py"
+    if is_file and not file.is_file():
+        raise UserError(f"'{where}' is no file; give the one that holds {attribute}.")
+    sys.path.insert(0, str(file.resolve().parent if is_file else Path.cwd()))
+    try:
+        return importlib.import_module(file.stem if is_file else where)
+    except Exception as error:  # it is anybody's code
+        raise UserError(f"'{where}' cannot be imported ({type(error).__name__}: {error}); repair it first.") from error
+    finally:
+        sys.path.pop(0)
