@@ -430,7 +430,7 @@ CLAIMS = (
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
     Claim(
-        "docs/judging.md", "Danger is told well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)
+        "docs/ope.md", "Danger is told well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)
     ),
     Claim(
         "docs/attribution.md",

@@ -2,7 +2,7 @@
 on, beside what it did in the simulator.
 
     ringfence bench guards --out DIR         # policies with their checkpoints
-    python benchmarks/ope.py DIR             # writes results/judging.csv and docs/judging.md; 30 s a policy and guard
+    python benchmarks/ope.py DIR             # writes results/judging.csv and docs/ope.md; 30 s a policy and guard
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def main() -> None:
                 writer = csv.DictWriter(f, HEAD, lineterminator="\n")
                 writer.writeheader()
                 writer.writerows(rows)
-    put("docs/judging.md", "ranks", ranks(rows))
+    put("docs/ope.md", "ranks", ranks(rows))
 
 
 def _numbers(result: OPEResult) -> list[float]:

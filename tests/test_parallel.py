@@ -40,12 +40,12 @@ class Watched(SimpleSpreadParallel):
         return super().reset(seed, options)
 
     def step(self, actions):
-        told = super().step(actions)
-        self.kept.append((np.mean(list(told[1].values())), told[4]["agent_0"]["cost"]))
-        return told
+        step = super().step(actions)
+        self.kept.append((np.mean(list(step[1].values())), step[4]["agent_0"]["cost"]))
+        return step
 
 
-def test_what_is_summed_is_what_the_simulator_told(run):
+def test_what_is_summed_is_what_the_simulator_gave(run):
     Watched.books = []
     result = play(run, Watched, episodes=3, at_once=2)
     books = np.array(Watched.books)  # (E, L, 2)
@@ -60,14 +60,14 @@ def test_what_is_summed_is_what_the_simulator_told(run):
 
     class Apart(SimpleSpreadParallel):
         def step(self, actions):
-            seen, reward, *told = super().step(actions)
-            return seen, reward, {a: 0.5 * k for k, a in enumerate(reward)}, *told
+            seen, reward, *rest = super().step(actions)
+            return seen, reward, {a: 0.5 * k for k, a in enumerate(reward)}, *rest
 
     assert play(run, Apart, episodes=1)["cost_mean"] == 25  # the largest of costs that step() tells beside rewards
 
 
 class Own(SimpleSpreadParallel):
-    """Agents see what they see, costs are not told, and the task may end by itself."""
+    """Agents see what they see, nothing says what a step costs, and the task may end by itself."""
 
     end = 25
 
@@ -90,9 +90,9 @@ def test_the_hazard_counts_where_the_simulator_does_not(own_store, tmp_path):
 
     class Counted(Own):
         def step(self, actions):
-            told = super().step(actions)
+            step = super().step(actions)
             counted.append(max(self.said))
-            return told
+            return step
 
     result = play(run, Counted, episodes=40, at_once=20)
     assert 0 < result["cost_mean"] * 40 == pytest.approx(sum(counted))
@@ -105,8 +105,8 @@ def test_the_hazard_counts_where_the_simulator_does_not(own_store, tmp_path):
 
     class Mute(Own):
         def step(self, actions):
-            seen, *told = super().step(actions)
-            return (seen if self.agents else {}), *told
+            seen, *rest = super().step(actions)
+            return (seen if self.agents else {}), *rest
 
     with pytest.raises(UserError, match="neither a cost nor the state that an episode ends in"):
         play(run, Mute, episodes=1)
@@ -117,19 +117,19 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         return type("Odd", (SimpleSpreadParallel,), names)
 
     def early(self, actions):
-        told = SimpleSpreadParallel.step(self, actions)
-        return (*told[:2], {**told[2], "agent_1": True}, *told[3:])
+        step = SimpleSpreadParallel.step(self, actions)
+        return (*step[:2], {**step[2], "agent_1": True}, *step[3:])
 
     def silent(self, actions):
         return (*SimpleSpreadParallel.step(self, actions)[:4], dict.fromkeys(self.possible_agents, {}))
 
     def broken(self, actions):
-        told = SimpleSpreadParallel.step(self, actions)
-        return (told[0], dict.fromkeys(told[1], float("nan")), *told[2:])
+        step = SimpleSpreadParallel.step(self, actions)
+        return (step[0], dict.fromkeys(step[1], float("nan")), *step[2:])
 
     def gone(self, actions):
-        told = SimpleSpreadParallel.step(self, actions)
-        return tuple({k: v for k, v in part.items() if k != "agent_1"} for part in told)
+        step = SimpleSpreadParallel.step(self, actions)
+        return tuple({k: v for k, v in part.items() if k != "agent_1"} for part in step)
 
     cases = (
         (lambda: object(), "without possible_agents; give a PettingZoo ParallelEnv"),
@@ -160,9 +160,9 @@ class Odd(SimpleSpreadParallel):
     place, value = 0, None
 
     def step(self, actions):
-        told = list(super().step(actions))
-        told[self.place] = self.value(told[self.place]) if callable(self.value) else self.value
-        return tuple(told)
+        parts = list(super().step(actions))
+        parts[self.place] = self.value(parts[self.place]) if callable(self.value) else self.value
+        return tuple(parts)
 
 
 @pytest.mark.parametrize(
@@ -203,12 +203,12 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     for split in ("test", "validation"):
         app.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
     assert "violations/" in capsys.readouterr().out
-    told = Run(folder).results
-    assert [*told] == ["default", "default@validation"]
-    assert told["default"]["simulator"] == "theirs.py:Theirs" and told["default"]["guard"] == "none"
+    results = Run(folder).results
+    assert [*results] == ["default", "default@validation"]
+    assert results["default"]["simulator"] == "theirs.py:Theirs" and results["default"]["guard"] == "none"
     again = play(folder, SimpleSpreadParallel, episodes=2)
-    assert again["per_episode"] == told["default"]["per_episode"]
-    assert told["default@validation"]["per_episode"] != told["default"]["per_episode"]
+    assert again["per_episode"] == results["default"]["per_episode"]
+    assert results["default@validation"]["per_episode"] != results["default"]["per_episode"]
     app.main(["report", str(folder), "--out", "page.html"])
     assert f"play {folder} --env theirs.py:Theirs --episodes 2" in html.unescape((tmp_path / "page.html").read_text())
     for env, said in (
@@ -228,8 +228,8 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
 def test_anybodys_function_under_guard_is_played(small_world):
     """With what the guard could not do; there is no run to keep results in."""
     still = guard(lambda seen, state: np.zeros((3, 2)), small_world, rows=1, shield=1)
-    told = play(still, SimpleSpreadParallel, episodes=2)
-    assert told["episodes"] == 2 and 0 <= told["infeasible_rate"] <= 1 and 0 <= told["ood_rate"] <= 1
+    result = play(still, SimpleSpreadParallel, episodes=2)
+    assert result["episodes"] == 2 and 0 <= result["infeasible_rate"] <= 1 and 0 <= result["ood_rate"] <= 1
     with pytest.raises(UserError, match="a function under guard has none"):
         play(still, SimpleSpreadParallel, episodes=2, keep=True)
     with pytest.raises(UserError, match="rows was said to ringfence.guard"):

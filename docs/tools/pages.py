@@ -37,11 +37,12 @@ REFERENCE = {
         "ringfence.evaluation.evaluate",
         "ringfence.evaluation.protocol",
         "ringfence.evaluation.play",
+        "ringfence.evaluation.simulators",
         "ringfence.logs.collect",
         "ringfence.evaluation.reference",
         "ringfence.deploy.zoo",
     ),
-    "Judging": ("ringfence.evaluation.ope.estimate",),
+    "Off-policy evaluation": ("ringfence.evaluation.ope.estimate", "ringfence.evaluation.ope.result"),
     "Export": ("ringfence.deploy.export",),
     "World": ("ringfence.training.worlds", "ringfence.world"),
     "Parts of a World": (

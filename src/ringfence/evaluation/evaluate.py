@@ -58,7 +58,7 @@ def evaluate_spec(
     whole_number("episodes", episodes, 1, 10**7)
     whole_number("record", record)
     resolved = resolve(spec)
-    run = Run.of(resolved.spec.run)
+    run = resolved.run
     job = resolved.job
     # What cannot be kept is refused before anything is played.
     _ = run.results
@@ -79,7 +79,7 @@ def evaluate_spec(
 def about(resolved: Resolved) -> dict[str, Any]:
     """What a result says of who played: algorithm, planner, guard, with all their options."""
     spec = resolved.spec
-    run = Run.of(spec.run)
+    run = resolved.run
     guard = resolved.guard
     options = resolved.plan_options
     return {

@@ -9,11 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.envs.base import NativeEnv
+from ringfence.envs.base import Env, NativeEnv
 from ringfence.types import Array, Policy
 
+WARM_UP = 10  # calls that are not counted
 
-def _first(env) -> tuple[Array, Array]:
+
+def _first(env: Env | NativeEnv) -> tuple[Array, Array]:
     """What a policy sees at the start of an episode: (1, N, O), (1, S)."""
     if isinstance(env, NativeEnv):
         sim = env.simulate(1)
@@ -25,13 +27,13 @@ def _first(env) -> tuple[Array, Array]:
 
 def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
     """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
-    seen = _first(task.env)
+    seen = _first(task.simulator)
     act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, *seen, key)[1].action)
-    memory, keys = policy.start(1), jax.random.split(jax.random.key(1), calls + 10)
+    memory = policy.start(1)
     took = []
-    for key in keys:
+    for key in jax.random.split(jax.random.key(1), calls + WARM_UP):
         begun = time.perf_counter()
         act(policy, memory, seen, key).block_until_ready()
         took.append((time.perf_counter() - begun) * 1e3)
-    p50, p99 = np.percentile(took[10:], [50, 99])
+    p50, p99 = np.percentile(took[WARM_UP:], [50, 99])
     return {"plan_ms_p50": float(p50), "plan_ms_p99": float(p99)}

@@ -59,7 +59,6 @@ def player_of(policy: Run | str | Pilot, planner: str, split: str, options: dict
 
 def _of_run(resolved: Resolved, split: str) -> RunPlayer:
     job = resolved.job
-    run = Run.of(resolved.spec.run)
     observation, state = job.widths
     return RunPlayer(
         name=job.algorithm.name,
@@ -70,8 +69,8 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         episode_length=job.spec.episode_length,
         unsafe=_unsafe_by_formula(job) if job.hazard.has_formula else None,
         about={"step": resolved.step} | evaluate.about(resolved),
-        limits=run.config["data"].get("constraints") or {},
-        run=run,
+        limits=resolved.run.config["data"].get("constraints") or {},
+        run=resolved.run,
         variant=resolved.variant(split),
     )
 

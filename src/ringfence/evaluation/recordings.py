@@ -7,6 +7,7 @@ features of P drawn plans of H steps, and chosen (R, L) or (R, L, N), which of t
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,8 @@ def write(folder: Path, variant: str, played: Recording, episodes: int) -> None:
         (folder / f"rollout-{variant}.{kind}").unlink(missing_ok=True)
     if episodes:
         with whole(folder / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, **{k: v[:episodes] for k, v in played.items()})
+            first: dict[str, Any] = {name: array[:episodes] for name, array in played.items()}
+            np.savez_compressed(file, **first)
 
 
 def read(folder: Path, variant: str) -> Recording | None:
@@ -40,14 +42,18 @@ def read(folder: Path, variant: str) -> Recording | None:
 
 def _check(arrays: Recording) -> None:
     """Whoever shows a recording relies on its shapes."""
-    axes = {"states": 3, "costs": 2, "rewards": 2} | ({"plans": 6} if "plans" in arrays else {})
+    axes = {"states": 3, "costs": 2, "rewards": 2}
+    if "plans" in arrays:
+        axes["plans"] = 6
     for name, wanted in axes.items():
         if name not in arrays or arrays[name].ndim != wanted:
             raise ValueError(f"it holds no '{name}' of {wanted} axes")
     episodes, steps = arrays["costs"].shape
     if not episodes or not steps:
         raise ValueError("it holds no episode")
-    for name in (*axes, *(["chosen"] if "chosen" in arrays else [])):
-        told = (episodes, steps + (name == "states"))
-        if arrays[name].shape[:2] != told:
-            raise ValueError(f"'{name}' begins with {arrays[name].shape[:2]}, not with {told}")
+    wanted_sizes = {name: (episodes, steps) for name in axes} | {"states": (episodes, steps + 1)}
+    if "chosen" in arrays:
+        wanted_sizes["chosen"] = (episodes, steps)
+    for name, sizes in wanted_sizes.items():
+        if arrays[name].shape[:2] != sizes:
+            raise ValueError(f"'{name}' begins with {arrays[name].shape[:2]}, not with {sizes}")

@@ -14,6 +14,7 @@ from ringfence.problem import constraints
 from ringfence.problem.homogeneous import Each
 from ringfence.proposals.base import Constant
 from ringfence.training.runs import write_json
+from ringfence.types import Policy
 from ringfence.utils import schemas, stored
 
 FILE = "reference.json"
@@ -26,23 +27,33 @@ def read(file: Path) -> dict[str, dict[str, Any]]:
     return stored.results(schemas.read(file, schemas.References, damaged))
 
 
-def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict:
+def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict[str, Any]:
     """The protocol's numbers of the logged episodes themselves (their own resets, not the test resets), or of those
     that `kept` (E,) names."""
-    length = int(store.lengths.max())
-    pad = np.arange(length) < store.lengths[:, None]
-    rewards, costs = np.zeros(pad.shape), np.zeros(pad.shape)
-    rewards[pad], costs[pad] = store.rewards.mean(1), store.team_costs
-    if store.state is not None and task.env is not None:
-        first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
-        starts = unsafe_starts(task, store.state[first])
-    else:
-        starts = np.zeros(store.episodes, bool)
-    kept = np.ones(store.episodes, bool) if kept is None else kept
-    told = {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
-    result = summarise({k: v[kept] for k, v in told.items()}, task, starts[kept])
+    if kept is None:
+        kept = np.ones(store.episodes, bool)
+    played = _played(store)
+    result = summarise({name: array[kept] for name, array in played.items()}, task, _unsafe_starts(store, task)[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
+
+
+def _played(store: EpisodeStore) -> dict[str, np.ndarray]:
+    """Logged episodes as `rollout` gives played ones: rewards and costs (E, L), 0 after an episode's end."""
+    there = np.arange(int(store.lengths.max())) < store.lengths[:, None]
+    rewards = np.zeros(there.shape)
+    rewards[there] = store.rewards.mean(1)
+    costs = np.zeros(there.shape)
+    costs[there] = store.team_costs
+    return {"rewards": rewards, "costs": costs, "steps": store.lengths, "terminated": store.episode_terminated}
+
+
+def _unsafe_starts(store: EpisodeStore, task: Task) -> np.ndarray:
+    """(E,) whether a logged episode starts unsafe; False where no simulator says so."""
+    if store.state is None or task.env is None:
+        return np.zeros(store.episodes, bool)
+    first = np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)
+    return unsafe_starts(task, store.state[first])
 
 
 def there(task: Task, out: str | Path, episodes: int, transitions: int | None = None) -> bool:
@@ -51,20 +62,25 @@ def there(task: Task, out: str | Path, episodes: int, transitions: int | None = 
     file = Path(out) / task.name / FILE
     if not file.exists():
         return False
-    known = read(file)
-    if not all(complete(r, task) for r in known.values()):
+    rows = read(file)
+    if not _are_complete(rows, task, episodes):
         return False
-    card = known.get("behaviour data", {}).get("data", {})
-    if known.get("do-nothing", {}).get("episodes") != episodes or card.get("hazard") != constraints.to_dict(
-        task.hazard
-    ):
+    card = rows.get("behaviour data", {}).get("data", {})
+    if card.get("hazard") != constraints.to_dict(task.hazard):
         return False
     wanted = task.transitions if transitions is None else transitions
     # A card without the size that was asked for tells that of its whole episodes.
     return card.get("size") == wanted or ("size" not in card and wanted <= card.get("transitions", 0) < 1.01 * wanted)
 
 
-def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True) -> dict[str, dict]:
+def _are_complete(rows: dict[str, dict[str, Any]], task: Task, episodes: int) -> bool:
+    """Whether rows say all that the protocol asks for, and of as many episodes."""
+    return rows.get("do-nothing", {}).get("episodes") == episodes and all(complete(r, task) for r in rows.values())
+
+
+def make(
+    task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, quiet: bool = True
+) -> dict[str, dict[str, Any]]:
     """Reference rows of a task, kept in `out`/<task>/reference.json and reused for the same number of episodes.
 
     The data's safe part is made of the episodes within the cost limit that did not end early: one that falls over at
@@ -74,18 +90,24 @@ def make(task: Task, store: EpisodeStore, out: str | Path, episodes: int = 200, 
     safe = (store.episode_costs <= task.cost_limit) & ~store.episode_terminated
     if file.exists():
         known = read(file)
-        same = known.get("do-nothing", {}).get("episodes") == episodes and (SAFE in known) == safe.any()
-        if same and all(complete(r, task) for r in known.values()) and known["behaviour data"]["data"] == store.card:
+        same = (SAFE in known) == safe.any() and _are_complete(known, task, episodes)
+        if same and known["behaviour data"]["data"] == store.card:
             return known
-    spec = task.spec(task.feature_map("pruned"))
-    policies = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
-    if task.alike:
-        policies = {name: Each(policy, task.env.n_agents) for name, policy in policies.items()}
-    policies |= task.recipe.references(task) if task.recipe is not None else {}
     rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)
-    for name, policy in policies.items():
+    for name, policy in _policies(task).items():
         rows[name], _ = evaluate_policy(policy, task, episodes, label=name, quiet=quiet)
     write_json(file, rows)
     return rows
+
+
+def _policies(task: Task) -> dict[str, Policy]:
+    """Doing nothing, acting at random, and the references of the task's own recipe."""
+    spec = task.spec(task.feature_map("pruned"))
+    policies: dict[str, Policy] = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
+    if task.alike:
+        policies = {name: Each(policy, task.simulator.n_agents) for name, policy in policies.items()}
+    if task.recipe is not None:
+        policies |= task.recipe.references(task)
+    return policies

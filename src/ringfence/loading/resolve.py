@@ -38,6 +38,12 @@ class Resolved:
     step: int  # of the checkpoint
 
     @property
+    def run(self) -> Run:
+        run = self.spec.run
+        assert run is not None  # `resolve` refuses a spec without one
+        return run
+
+    @property
     def team(self) -> Policy:
         """The policy as the whole team plays it."""
         return Each(self.policy, self.job.team) if self.job.task.alike else self.policy

@@ -2,7 +2,7 @@
 
 What it would do in logged states, where that leads as a World of these logs predicts it, and what it is worth, by
 fitted Q evaluation and played in that World. This World is fitted to the logs that are given, with a seed of its own,
-and is not the one that guards. How far to believe each number, where the truth is known: docs/judging.md.
+and is not the one that guards. How far to believe each number, where the truth is known: docs/ope.md.
 """
 
 from __future__ import annotations

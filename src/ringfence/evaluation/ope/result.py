@@ -99,7 +99,7 @@ class ModelRollout:
 
 @dataclass(frozen=True)
 class OPEResult:
-    """What logs say of a policy. How far to believe each number: docs/judging.md."""
+    """What logs say of a policy. How far to believe each number: docs/ope.md."""
 
     task: str
     algorithm: str
