@@ -48,7 +48,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     "features": ("problem.features",),
     "files": ("utils.files",),
     "hazards": ("problem.constraints",),
-    "judging": ("evaluation.ope",),
+    "judging": ("evaluation.ope.judge", "evaluation.ope"),
     "normalise": ("problem.normalise",),
     "optim": ("nets.optim",),
     "parallel": ("evaluation.play",),
