@@ -9,10 +9,12 @@ from typing import Annotated, Literal
 import tyro
 from rich import box
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Column, Table
 
+from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
+from ringfence.cli.console import complain
+from ringfence.cli.doctor import doctor
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError, whole_number
@@ -255,7 +257,7 @@ def _told(table: Table, refused: dict[str, list], many: int) -> None:
         out.print(table)
     for message, those in refused.items():
         unsaid = [str(run.path) for run in those if str(run.path) not in message]
-        _complain(", ".join(unsaid) + ": " * bool(unsaid) + message if many > 1 else message)
+        complain(", ".join(unsaid) + ": " * bool(unsaid) + message if many > 1 else message)
     if refused:
         sys.exit(2)
 
@@ -360,40 +362,6 @@ def report(
     print(build_board(boards[0], out_file) if boards else build_report(_runs(runs), out_file))
 
 
-def doctor() -> None:
-    """Versions, devices, what is missing and how to get it."""
-    import importlib.metadata as metadata
-
-    from ringfence.utils.cache import cache_dir
-    from ringfence.utils.environment import environment
-
-    told = environment()
-    for name in ("ringfence", "python", "system", "processor", "cores", "git"):
-        out.print(f"{name:12} {escape(str(told[name]))}")
-    for name, version in told["packages"].items():
-        out.print(f"{name:12} {version}")
-    out.print(f"{'devices':12} {', '.join(told['devices'])}")
-    out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
-    from ringfence.report import video
-
-    try:
-        out.print(f"{'films':12} drawn by {video.backend()}")
-    except UserError as error:
-        out.print(f"{'films':12} [yellow]missing[/], {escape(str(error))}", soft_wrap=True)
-    for package, extra, use in (
-        ("tensorboardX", "tensorboard", "TensorBoard logs"),
-        ("tensorstore", "vault", "OG-MARL's Vaults"),
-        ("minari", "minari", "Minari's data sets by their names"),
-        ("ray", "ray", "benchmarks on a cluster"),
-        ("jax2onnx", "export", "policies as ONNX files"),
-        ("mpe2", "test", "parity tests"),
-    ):
-        try:
-            out.print(f"{package:12} {metadata.version(package)}")
-        except metadata.PackageNotFoundError:
-            out.print(f"{package:12} [yellow]missing[/], for {use}: pip install 'ringfence\\[{extra}]'")
-
-
 def demo(
     out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("demo"), tier: str = "expert", quick: bool = False
 ) -> None:
@@ -409,173 +377,6 @@ def demo(
     run(out_dir, tier, quick)
 
 
-def bench(
-    suite: Positional[str],
-    seeds: int = 5,
-    episodes: int | None = None,
-    out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-    tasks: Names = [],  # noqa: B006
-    algorithms: Names = [],  # noqa: B006
-    steps: int | None = None,
-    engine: Literal["local", "ray"] = "local",
-    workers: int | None = None,
-    threads: int = 1,
-    memory: float | None = None,
-    address: str | None = None,
-) -> None:
-    """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
-
-    Of a results folder: `ringfence bench status FOLDER`, `bench results FOLDER`, `bench export FOLDER`; of two,
-    `bench paper-table`.
-
-    Args:
-        suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites. Under
-            guard: guards, guards-mujoco, crossing, crossing-guards, all four of them as attribution; own-sight,
-            own-sight-mujoco, crossing-teams, spread-teams.
-        seeds: per algorithm and task.
-        episodes: test episodes per run; the suite's number by default.
-        out_dir: folder of results, results/SUITE by default; of paper and attribution, the folder that holds theirs.
-        tasks: these alone.
-        algorithms: these alone, as algorithm or algorithm:preset.
-        steps: updates of every algorithm, for a quick trial.
-        engine: processes on this machine, or Ray tasks.
-        workers: local processes; one per `threads` cores by default.
-        threads: per worker; cores that Ray sets aside per task.
-        memory: GiB that a local process may hold before it is stopped.
-        address: of the Ray cluster, e.g. auto; without it a local one is started.
-    """
-    from ringfence.bench import COLLECTIONS, collected, make_grid, make_grids, pack, paper
-
-    only_tasks, only = sum(tasks, []), sum(algorithms, [])
-    if steps is not None and out_dir is None:
-        raise UserError(
-            f"--steps {steps} makes other rows than the suite's own; give a folder of their own with --out."
-        )
-    root, sizes = out_dir or Path("results"), dict(seeds=seeds, episodes=episodes, steps=steps)
-    if suite == "paper":
-        grids = paper.grids(root, only_tasks, only, **sizes)
-    elif suite in COLLECTIONS:
-        grids = make_grids(collected(suite, only_tasks), root, only, **sizes)
-    else:
-        root = out_dir or root / suite
-        grids = [make_grid(suite, root, only_tasks=only_tasks, only=only, **sizes)]
-    for grid in grids:  # what is wrong with the last one is said before the first begins
-        grid.check()
-    complete, idle = True, True
-    for grid in grids:
-        idle = idle and not grid.groups()
-        try:
-            counts = _run_grid(grid, engine, workers, threads, memory, address)
-        finally:
-            pack(grid.out)
-        out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
-        if counts["done"] and suite != "paper":
-            bench_results(grid.out)
-        if lacking := grid.references():
-            _complain(f"The reference rows of {', '.join(lacking)} could not be made; see above.")
-        if counts["failed"] or counts["to do"]:
-            bench_status(grid.out)
-        complete = complete and not (lacking or counts["failed"] or counts["to do"])
-    if suite == "paper":
-        bench_paper(root)
-    if idle:
-        out.print(
-            f"All cells were there already, nothing was made; to make them yourself, give another --out than {root}."
-        )
-    if not complete:
-        sys.exit(1)
-
-
-def _run_grid(grid, engine: str, workers: int | None, threads: int, memory: float | None, address: str | None) -> dict:
-    """Cells by state after the run."""
-    if engine == "ray":
-        for name, value in (("workers", workers), ("memory", memory)):
-            if value is not None:
-                raise UserError(f"--{name} is about local processes, Ray divides its cluster itself; leave it out.")
-        from ringfence.bench.cluster import run_ray
-
-        return run_ray(grid, address=address, threads=threads)
-    from ringfence.bench import run_local
-
-    return run_local(grid, workers=workers, threads=threads, memory=memory)
-
-
-def bench_status(folder: Positional[Path]) -> None:
-    """What a results folder holds: finished cells, and failed ones with the reason."""
-    from ringfence.bench.cells import statuses
-
-    table = Table("task", "run", "state", "train s", "eval s", "why")
-    for s in statuses(folder):
-        seconds = [f"{s[k]:.0f}" if k in s else "" for k in ("train_seconds", "eval_seconds")]
-        table.add_row(*map(terminal, (s["task"], s["run"], s["state"], *seconds, s.get("error", ""))))
-    out.print(table)
-
-
-def bench_results(folder: Positional[Path]) -> None:
-    """Rank the methods of every task and write FOLDER/table.csv."""
-    from ringfence.bench import write_csv
-    from ringfence.report import board, standings
-
-    for task, rows in standings.standings(board.read(folder)).items():
-        table = Table(
-            "", "method", "seeds", "return", "norm", "cost", "safe starts", "unsafe (95 % ≤)", title=terminal(task)
-        )
-        for r in rows:
-            low, high = r.returns_interval
-            table.add_row(
-                str(r.rank),
-                terminal(r.label),
-                str(len(r.seeds)),
-                f"{r.returns:.1f} [{low:.1f}, {high:.1f}]",
-                f"{r.returns_norm:.3f}",
-                f"{r.cost:.3f}" + ("" if r.safe else " over"),
-                f"{r.cost_safe_start:.4f}",
-                f"{r.violation_rate:.3f} (≤ {r.violation_upper:.3f})",
-            )
-        out.print(table)
-    print(write_csv(folder))
-
-
-def bench_paper(folder: Positional[Path] = Path("results")) -> None:
-    """The paper's 13 tasks, printed values beside ours, from FOLDER/simple_spread and FOLDER/mujoco.
-
-    Writes FOLDER/paper.csv. The printed values are on other data.
-    """
-    from ringfence.bench import paper
-
-    lines = paper.lines(folder / name for name in paper.FOLDERS)
-    table = Table(Column("reward/cost", no_wrap=True), box=box.SIMPLE, padding=(0, 0, 0, 1))
-    for method in paper.OURS:
-        for whose in (f"{method}\npaper", "\nours"):
-            table.add_column(whose, justify="right", no_wrap=True)
-    for task, (name, _) in paper.PRINTED.items():
-        cells = []
-        for x in (x for x in lines if x.task == task):
-            cells += [f"{x.printed[0]:.2f}/{x.printed[2]:.2f}", paper.brief(x).replace(" / ", "/")]
-        table.add_row(name, *cells)
-    Console(highlight=False, width=max(out.width, 100)).print(table)
-    print(paper.write(lines, folder / "paper.csv"))
-
-
-def bench_export(
-    folder: Positional[Path],
-    format: Literal["csv", "markdown", "markdown-short", "latex"] = "markdown",
-    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
-) -> None:
-    """Write the ranked tables of a results folder.
-
-    Args:
-        folder: the --out of `ringfence bench`.
-        format: csv, markdown, markdown-short (return and cost alone) or latex (booktabs).
-        out_file: where to; FOLDER/ranked.EXT by default.
-    """
-    from ringfence.report import export_board
-
-    kind = {"csv": "csv", "latex": "tex"}.get(format, "md")
-    print(export_board(folder, format, out_file or folder / f"ranked.{kind}"))
-
-
-BENCH = {"status": bench_status, "results": bench_results, "paper-table": bench_paper, "export": bench_export}
 COMMANDS = {
     "tasks": tasks,
     "fit": fit,
@@ -584,7 +385,7 @@ COMMANDS = {
     "play": play,
     "get": get,
     "export": export,
-    "bench": bench,
+    "bench": bench_commands.bench,
     "ope": ope,
     "report": report,
     "demo": demo,
@@ -606,9 +407,12 @@ def main(arguments: list[str] | None = None) -> None:
                 description="Episode stores: make, import, inspect.",
                 args=arguments[1:],
             )
-        elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in BENCH:
+        elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in bench_commands.COMMANDS:
             tyro.extras.subcommand_cli_from_dict(
-                BENCH, prog="ringfence bench", description="Look into a results folder.", args=arguments[1:]
+                bench_commands.COMMANDS,
+                prog="ringfence bench",
+                description="Look into a results folder.",
+                args=arguments[1:],
             )
         else:
             tyro.extras.subcommand_cli_from_dict(
@@ -618,7 +422,7 @@ def main(arguments: list[str] | None = None) -> None:
                 args=arguments,
             )
     except UserError as error:
-        _complain(str(error))
+        complain(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
@@ -627,12 +431,8 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(1)
     except OSError as error:  # of a path that nobody looked at before
         what = f"'{error.filename}': {error.strerror}" if error.filename else str(error)
-        _complain(f"{what}; check that the path is what you mean and that you may use it.")
+        complain(f"{what}; check that the path is what you mean and that you may use it.")
         sys.exit(2)
-
-
-def _complain(message: str) -> None:
-    Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
 
 
 def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:

@@ -1,0 +1,44 @@
+"""`ringfence doctor`."""
+
+from __future__ import annotations
+
+import importlib.metadata as metadata
+
+from rich.console import Console
+from rich.markup import escape
+
+from ringfence.errors import UserError
+
+out = Console(highlight=False)
+
+
+def doctor() -> None:
+    """Versions, devices, what is missing and how to get it."""
+    from ringfence.utils.cache import cache_dir
+    from ringfence.utils.environment import environment
+
+    told = environment()
+    for name in ("ringfence", "python", "system", "processor", "cores", "git"):
+        out.print(f"{name:12} {escape(str(told[name]))}")
+    for name, version in told["packages"].items():
+        out.print(f"{name:12} {version}")
+    out.print(f"{'devices':12} {', '.join(told['devices'])}")
+    out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
+    from ringfence.report import video
+
+    try:
+        out.print(f"{'films':12} drawn by {video.backend()}")
+    except UserError as error:
+        out.print(f"{'films':12} [yellow]missing[/], {escape(str(error))}", soft_wrap=True)
+    for package, extra, use in (
+        ("tensorboardX", "tensorboard", "TensorBoard logs"),
+        ("tensorstore", "vault", "OG-MARL's Vaults"),
+        ("minari", "minari", "Minari's data sets by their names"),
+        ("ray", "ray", "benchmarks on a cluster"),
+        ("jax2onnx", "export", "policies as ONNX files"),
+        ("mpe2", "test", "parity tests"),
+    ):
+        try:
+            out.print(f"{package:12} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            out.print(f"{package:12} [yellow]missing[/], for {use}: pip install 'ringfence\\[{extra}]'")
