@@ -20,6 +20,7 @@ from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import Direct
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.utils.config import BatchSize, Count, Depth, Natural, NonNegative, Positive, Rows, Share, Width
 
 
 @dataclass(frozen=True)
@@ -27,17 +28,17 @@ class Config:
     """Behaviour cloning: L = E ‖a_i − π_i(s̃_i)‖² with a tanh-bounded deterministic π_i."""
 
     view: features.View = "decentralized"  # what an agent sees: its own observation, as in OMAR's study
-    cost_limit: float | None = None  # keep episodes with cost ≤ this; None keeps all
-    horizon: int = 2  # rows of a window: now and next
-    history: int = 0  # rows of the past; cloning looks at the present alone
-    width: int = 128  # units of each hidden layer
-    depth: int = 2  # hidden layers
-    steps: int = 4_000  # updates
-    batch: int = 256  # windows per update
-    lr: float = 1e-3  # Adam
-    warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm; 0: no bound
-    ema: float = 0.995  # of the parameters
+    cost_limit: NonNegative | None = None  # keep episodes with cost ≤ this; None keeps all
+    horizon: Rows = 2  # rows of a window: now and next
+    history: Natural = 0  # rows of the past; cloning looks at the present alone
+    width: Width = 128  # units of each hidden layer
+    depth: Depth = 2  # hidden layers
+    steps: Count = 4_000  # updates
+    batch: BatchSize = 256  # windows per update
+    lr: Positive = 1e-3  # Adam
+    warmup: Natural = 100  # updates
+    grad_clip: NonNegative = 1.0  # global norm; 0: no bound
+    ema: Share = 0.995  # of the parameters
 
 
 def init(

@@ -15,11 +15,13 @@ rewards scaled by their deviation.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec import Meta
 
 from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
@@ -33,10 +35,12 @@ from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
+from ringfence.utils.config import AtLeastOne, BatchSize, Count, Natural, NonNegative, Positive, Rows, Share, Width
 
 DANGER = 25.0  # h of an unsafe state; a safe one has −1
 LEVEL_WIDTH = 16  # entries of the embedding of k
 WEIGHT_MAX = 100.0  # bound on w
+Expectile = Annotated[float, Meta(ge=0.5, lt=1, description="lie in [0.5, 1); FISOR uses 0.9")]
 
 
 @dataclass(frozen=True)
@@ -44,33 +48,28 @@ class Config:
     """FISOR's values where it prints them; sizes and updates are for a CPU."""
 
     view: features.View = "decentralized"  # what an agent sees: its own observation
-    horizon: int = 2  # rows of a window: now and next
-    history: int = 0  # rows of the past; none is read
-    discount: float = 0.99  # γ
-    expectile_reward: float = 0.9  # of Q^r that V^r follows
-    expectile_danger: float = 0.9  # of −Q^h that −V^h follows
-    temperature_reward: float = 3.0  # β_r
-    temperature_danger: float = 5.0  # β_h
-    diffusion_steps: int = 5  # K of the actor
-    candidates: int = 16  # actions proposed per agent and step
-    target_rate: float = 0.005  # τ
-    width: int = 64  # units of both hidden layers
-    steps: int = 5_000  # updates
-    batch: int = 512  # transitions per update
-    lr: float = 1e-3  # Adam, cosine decay to a tenth
-    warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm, per network; 0: no bound
+    horizon: Rows = 2  # rows of a window: now and next
+    history: Natural = 0  # rows of the past; none is read
+    discount: Share = 0.99  # γ
+    expectile_reward: Expectile = 0.9  # of Q^r that V^r follows
+    expectile_danger: Expectile = 0.9  # of −Q^h that −V^h follows
+    temperature_reward: NonNegative = 3.0  # β_r
+    temperature_danger: NonNegative = 5.0  # β_h
+    diffusion_steps: Width = 5  # K of the actor
+    candidates: AtLeastOne = 16  # actions proposed per agent and step
+    target_rate: Share = 0.005  # τ
+    width: Width = 64  # units of both hidden layers
+    steps: Count = 5_000  # updates
+    batch: BatchSize = 512  # transitions per update
+    lr: Positive = 1e-3  # Adam, cosine decay to a tenth
+    warmup: Natural = 100  # updates
+    grad_clip: NonNegative = 1.0  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     if config.history or config.horizon != 2:
         raise UserError("fisor learns from single transitions; leave history=0 and horizon=2.")
-    for name in ("expectile_reward", "expectile_danger"):
-        if not 0.5 <= getattr(config, name) < 1.0:
-            raise UserError(f"{name}={getattr(config, name)} must lie in [0.5, 1); FISOR uses 0.9.")
-    if config.candidates < 1:
-        raise UserError(f"candidates={config.candidates} must be at least 1.")
     diffusion.cosine_schedule(config.diffusion_steps)
 
 

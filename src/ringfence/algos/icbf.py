@@ -32,6 +32,7 @@ from ringfence.proposals import conditions, diffusion
 from ringfence.proposals import retention as cbf
 from ringfence.proposals.planner import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.utils.config import BatchSize, Count, Depth, Natural, NonNegative, Positive, Rows, Share, Width
 from ringfence.world import World
 from ringfence.world.barrier import Barrier
 
@@ -42,54 +43,54 @@ class Config:
 
     # --- plan ---
     view: features.View = "pruned"  # what s̃_i is: pruned, centralized, decentralized
-    horizon: int = 8  # H, rows of a plan, the present one included
-    history: int = 0  # rows of the past that are in-painted, too
+    horizon: Rows = 8  # H, rows of a plan, the present one included
+    history: Natural = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
     condition: conditions.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
-    discount: float = 0.9  # of the value that plans are conditioned on and ranked by
+    discount: Share = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
     # --- denoiser ---
     net: Literal["attention", "unet"] = "attention"  # agent attention over flat windows, or MADIFF's temporal U-Net
-    width: int = 128  # channels
-    depth: int = 3  # blocks (attention) or resolutions (unet)
-    diffusion_steps: int = 200  # K, cosine schedule
+    width: Width = 128  # channels
+    depth: Depth = 3  # blocks (attention) or resolutions (unet)
+    diffusion_steps: Width = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
-    snr_floor: float = 0.5  # x0-prediction: least weight of a noise level
-    snr_ceiling: float = 5.0  # x0-prediction: largest weight of a noise level
-    clip: float = 5.0  # bound on clean estimates, in standard deviations
-    condition_dropout: float = 0.25  # p, share of plans that do not see the return
+    snr_floor: NonNegative = 0.5  # x0-prediction: least weight of a noise level
+    snr_ceiling: NonNegative = 5.0  # x0-prediction: largest weight of a noise level
+    clip: Positive = 5.0  # bound on clean estimates, in standard deviations
+    condition_dropout: Share = 0.25  # p, share of plans that do not see the return
 
     # --- barrier ---
     barrier: bool = True  # L^C at all
-    barrier_weight: float = 3.0  # λ of the generator's share of L^C
-    barrier_start: float = 0.3  # share of training at which λ starts to rise from 0
-    barrier_full: float = 0.5  # share of training at which λ is reached
+    barrier_weight: NonNegative = 3.0  # λ of the generator's share of L^C
+    barrier_start: Share = 0.3  # share of training at which λ starts to rise from 0
+    barrier_full: Share = 0.5  # share of training at which λ is reached
     routing: Literal["split", "paper"] = "split"  # who gets which gradient
-    delta: float = 1.0  # δ, margin of the hinges; of the World's barrier in calibrated margins
-    retention: float = 0.9  # m, largest share of h that must be kept from step to step
+    delta: NonNegative = 1.0  # δ, margin of the hinges; of the World's barrier in calibrated margins
+    retention: Share = 0.9  # m, largest share of h that must be kept from step to step
     relaxation: cbf.Relaxation = "signal"  # how retention is relaxed at noisy levels
     two_sided: bool = True  # relax the unsafe side towards "do not get worse"
     scaled_margin: bool = True  # margin (1−α)δ in the retention hinge instead of δ
     weigh_by_signal: bool = True  # weight ᾱ_k on the generator's hinges
     gradient: str = "x0"  # depth of ∂s̃^θ/∂θ: x0, ddim:n (whole n-step sample) or chain:n (n steps from x_k)
-    gradient_batch: int = 32  # windows per update for ddim:n and chain:n
-    barrier_batch: int = 64  # windows per update that L^C works on
+    gradient_batch: Count = 32  # windows per update for ddim:n and chain:n
+    barrier_batch: Count = 64  # windows per update that L^C works on
     scope: Literal["individual", "shared"] = "individual"  # joint training: one h per agent, or one for all
-    barrier_width: int = 128  # joint training: units of each of h's 3 hidden layers
+    barrier_width: Width = 128  # joint training: units of each of h's 3 hidden layers
 
     # --- inverse dynamics ---
-    inverse_width: int = 128  # units of each of 2 hidden layers
-    inverse_noise: float = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
+    inverse_width: Width = 128  # units of each of 2 hidden layers
+    inverse_noise: NonNegative = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
     # --- optimisation ---
-    steps: int = 1500  # updates
-    batch: int = 128  # windows per update
-    lr: float = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
-    warmup: int = 100  # updates
-    grad_clip: float = 1.0  # global norm, per network; 0: no bound
-    ema: float = 0.995  # of all parameters; the policy uses the averages
+    steps: Count = 1500  # updates
+    batch: BatchSize = 128  # windows per update
+    lr: Positive = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
+    warmup: Natural = 100  # updates
+    grad_clip: NonNegative = 1.0  # global norm, per network; 0: no bound
+    ema: Share = 0.995  # of all parameters; the policy uses the averages
 
 
 INVERSE_STEPS = 3  # steps of every window that inverse dynamics learns from

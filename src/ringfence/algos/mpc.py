@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from ringfence.algos import actor_critic as ac
 from ringfence.problem import features
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
+from ringfence.utils.config import BatchSize, Count, Natural, Rows
 from ringfence.world import World
 
 
@@ -21,10 +22,10 @@ class Config:
     """There is nothing to choose: one update that changes nothing makes the run folder."""
 
     view: features.View = "decentralized"  # nobody looks
-    horizon: int = 2  # rows of a window
-    history: int = 0  # rows of the past
-    steps: int = 1  # updates
-    batch: int = 1  # windows per update
+    horizon: Rows = 2  # rows of a window
+    history: Natural = 0  # rows of the past
+    steps: Count = 1  # updates
+    batch: BatchSize = 1  # windows per update
 
 
 class Rest(eqx.Module):

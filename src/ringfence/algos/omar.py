@@ -11,10 +11,11 @@ is c = 0. Coefficients are per data set; presets carry those of the study.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
+from msgspec import Meta
 
 from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
@@ -23,6 +24,9 @@ from ringfence.nets.optim import Optimiser
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.utils.config import AtLeastOne, BatchSize, Count, Natural, NonNegative, Positive, Rows, Share, Width
+
+Coefficient = Annotated[float, Meta(ge=0, le=1, description="lie between 0 (MA-CQL) and 1 (search alone)")]
 
 
 @dataclass(frozen=True)
@@ -30,35 +34,33 @@ class Config:
     """Defaults: the study's setting for Simple Spread (expert, medium), and a penalty that keeps actors alive."""
 
     view: features.View = "decentralized"  # what an agent sees: its own observation
-    horizon: int = 2  # rows of a window: now and next
-    history: int = 0  # rows of the past; none is read
-    coefficient: float = 1.0  # c, weight of the searched action; 0: policy gradient alone, MA-CQL
+    horizon: Rows = 2  # rows of a window: now and next
+    history: Natural = 0  # rows of the past; none is read
+    coefficient: Coefficient = 1.0  # c, weight of the searched action; 0: policy gradient alone, MA-CQL
     search: Literal["softmax", "elites"] = "softmax"  # softmax-weighted refit (MPE), or cross-entropy with elites
-    search_iterations: int = 3  # rounds of the search
-    search_samples: int = 10  # actions per round
-    search_deviation: float = 2.0  # of the first round, around 0
+    search_iterations: AtLeastOne = 3  # rounds of the search
+    search_samples: AtLeastOne = 10  # actions per round
+    search_deviation: NonNegative = 2.0  # of the first round, around 0
     elites: int = 5  # kept from round to round, and refitted to
-    cql_weight: float = 5.0  # α of the conservative term
+    cql_weight: NonNegative = 5.0  # α of the conservative term
     cql_actions: Literal["uniform", "policy"] = "uniform"  # policy adds the actors' actions here and ahead
-    cql_samples: int = 10  # actions per state of each kind
-    cql_noise: float = 0.2  # deviation of the noise on the actors' actions
-    discount: float = 0.95  # γ
-    target_rate: float = 0.01  # τ
-    action_penalty: float = 1e-3  # weight of E π²
-    logit_penalty: float = 1e-3  # weight of E (π before tanh)², beside the policy gradient in units of E |Q|
-    width: int = 64  # units of both hidden layers
-    steps: int = 2_000  # updates
-    batch: int = 1024  # transitions per update
-    lr: float = 0.01  # Adam, constant
-    grad_clip: float = 0.5  # global norm, per network; 0: no bound
+    cql_samples: AtLeastOne = 10  # actions per state of each kind
+    cql_noise: NonNegative = 0.2  # deviation of the noise on the actors' actions
+    discount: Share = 0.95  # γ
+    target_rate: Share = 0.01  # τ
+    action_penalty: NonNegative = 1e-3  # weight of E π²
+    logit_penalty: NonNegative = 1e-3  # weight of E (π before tanh)², beside the policy gradient in units of E |Q|
+    width: Width = 64  # units of both hidden layers
+    steps: Count = 2_000  # updates
+    batch: BatchSize = 1024  # transitions per update
+    lr: Positive = 0.01  # Adam, constant
+    grad_clip: NonNegative = 0.5  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     if config.history or config.horizon != 2:
         raise UserError("omar learns from single transitions; leave history=0 and horizon=2.")
-    if not 0.0 <= config.coefficient <= 1.0:
-        raise UserError(f"coefficient={config.coefficient} must lie between 0 (MA-CQL) and 1 (search alone).")
     if config.search == "elites" and not 1 < config.elites <= config.search_samples:
         raise UserError(
             f"elites={config.elites} must be 2 to {config.search_samples}, the samples of a round: one has no spread."

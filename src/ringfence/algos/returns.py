@@ -23,6 +23,7 @@ from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions
 from ringfence.proposals.base import Direct
 from ringfence.types import Algorithm, Array, Key, PyTree, Spec
+from ringfence.utils.config import AtLeastOne, Share
 from ringfence.world import World
 
 
@@ -48,8 +49,8 @@ class Config(bc.Config):
 
     view: features.View = "pruned"  # the planner's
     condition: conditions.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
-    discount: float = 0.9  # of what y scores
-    ahead: int = 8  # rows, of the advantage
+    discount: Share = 0.9  # of what y scores
+    ahead: AtLeastOne = 8  # rows, of the advantage
     target: float = 1.5  # y when it acts, as a normal score: the best 7 %
 
 

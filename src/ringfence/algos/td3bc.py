@@ -28,6 +28,7 @@ from ringfence.nets.optim import Optimiser
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.utils.config import AtLeastOne, BatchSize, Count, Natural, NonNegative, Positive, Rows, Share, Width
 
 
 @dataclass(frozen=True)
@@ -35,33 +36,31 @@ class Config:
     """The learner of OMAR's study (networks, γ, τ, rates) with TD3+BC's actor."""
 
     view: features.View = "decentralized"  # what an agent sees: its own observation
-    horizon: int = 2  # rows of a window: now and next
-    history: int = 0  # rows of the past; none is read
+    horizon: Rows = 2  # rows of a window: now and next
+    history: Natural = 0  # rows of the past; none is read
     centralised_critic: bool = False  # critics read everybody's observations and actions
-    alpha: float = 2.5  # α, weight of Q against imitation (TD3+BC)
-    discount: float = 0.95  # γ
-    target_rate: float = 0.01  # τ
-    target_noise: float = 0.0  # deviation of the noise on target actions; TD3 has 0.2, OMAR's study none
-    target_noise_clip: float = 0.5  # bound on that noise
-    delay: int = 1  # actors and targets move every so many updates; TD3 has 2, OMAR's study 1
-    action_penalty: float = 1e-3  # weight of E π²
-    width: int = 64  # units of both hidden layers
+    alpha: NonNegative = 2.5  # α, weight of Q against imitation (TD3+BC)
+    discount: Share = 0.95  # γ
+    target_rate: Share = 0.01  # τ
+    target_noise: NonNegative = 0.0  # deviation of the noise on target actions; TD3 has 0.2, OMAR's study none
+    target_noise_clip: NonNegative = 0.5  # bound on that noise
+    delay: AtLeastOne = 1  # actors and targets move every so many updates; TD3 has 2, OMAR's study 1
+    action_penalty: NonNegative = 1e-3  # weight of E π²
+    width: Width = 64  # units of both hidden layers
     lagrange: bool = False  # learn cost critics and a multiplier
     limit: float = 1.0  # l, cost per episode that the multiplier allows
-    multiplier_rate: float = 0.01  # η
-    multiplier_max: float = 100.0  # bound on λ
-    steps: int = 2_000  # updates
-    batch: int = 1024  # transitions per update
-    lr: float = 0.01  # Adam, constant
-    grad_clip: float = 0.5  # global norm, per network; 0: no bound
+    multiplier_rate: NonNegative = 0.01  # η
+    multiplier_max: NonNegative = 100.0  # bound on λ
+    steps: Count = 2_000  # updates
+    batch: BatchSize = 1024  # transitions per update
+    lr: Positive = 0.01  # Adam, constant
+    grad_clip: NonNegative = 0.5  # global norm, per network; 0: no bound
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     if config.history or config.horizon != 2:
         raise UserError("ma-td3bc learns from single transitions; leave history=0 and horizon=2.")
-    if config.delay < 1:
-        raise UserError(f"delay={config.delay} must be at least 1.")
     if config.limit <= 0:
         raise UserError(
             f"limit={config.limit} must be positive; it is a cost per episode, that of the data's card (cost_limit) "

@@ -3,53 +3,43 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from ringfence.errors import UserError
+from ringfence.utils.config import NonNegative, check_bounds
 
-CONDITIONS = ("margin", "retain")
+Samples = Annotated[int, Meta(ge=1, le=10_000)]
+Rounds = Annotated[int, Meta(ge=0, le=10**6)]
+Fall = Annotated[float, Meta(gt=0, le=1, description="lie in (0, 1]: at 0 a barrier could never fall")]
+CostRate = Annotated[float, Meta(gt=0, lt=1, description="be a share of steps between 0 and 1")]
+Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions lie in [-1, 1]")]
 
 
 @dataclass(frozen=True)
 class GuardOptions:
     """Every choice of a guard. Margins are in the unit of the danger's source (danger.py)."""
 
-    plans: int = 1  # proposals that are asked for
+    plans: Samples = 1  # proposals that are asked for
     select: bool = False  # among them; else the first is followed
-    refine: int = 0  # Adam steps that climb the value; 0: none
-    starts: int = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
-    noise: float = 0.5  # deviation of noisy copies
-    reach: float = 2.0  # how far refining may take an action from its proposal; 2: anywhere
-    care: float = 10.0  # weight of danger in what is climbed, in deviations of value per margin
-    shield: int = 0  # rounds of correction; 0: none
-    bound: float = 2.0  # how far the shield may take an action from what it was; 2: anywhere
-    rows: int = 3  # predicted rows that are judged
+    refine: Rounds = 0  # Adam steps that climb the value; 0: none
+    starts: Samples = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
+    noise: NonNegative = 0.5  # deviation of noisy copies
+    reach: Distance = 2.0  # how far refining may take an action from its proposal; 2: anywhere
+    care: NonNegative = 10.0  # weight of danger in what is climbed, in deviations of value per margin
+    shield: Rounds = 0  # rounds of correction; 0: none
+    bound: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
+    rows: Samples = 3  # predicted rows that are judged
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
-    alpha: float = 0.5  # share of what is left of the distance that one step may use up
+    alpha: Fall = 0.5  # share of what is left of the distance that one step may use up
     margin: float = 0.6  # distance that is kept
     future: bool = False  # judge the last row by the value of danger, where it is learned
-    adapt: float = 0.0  # step of the margin after a cost; 0: it stays
-    rate: float = 0.0125  # share of steps with a cost at which an adapting margin settles
+    adapt: NonNegative = 0.0  # step of the margin after a cost; 0: it stays
+    rate: CostRate = 0.0125  # share of steps with a cost at which an adapting margin settles
 
     def __post_init__(self):
-        for name, least in (("plans", 1), ("starts", 1), ("rows", 1), ("refine", 0), ("shield", 0)):
-            value = getattr(self, name)
-            if value < least:
-                raise UserError(f"{name}={value} must be at least {least}.")
-        for name in ("noise", "care", "adapt"):
-            value = getattr(self, name)
-            if value < 0:
-                raise UserError(f"{name}={value} must not be negative.")
-        for name in ("reach", "bound"):
-            value = getattr(self, name)
-            if not 0 < value <= 2:
-                raise UserError(f"{name}={value} must lie in (0, 2]: actions lie in [-1, 1].")
-        if not 0 < self.rate < 1:
-            raise UserError(f"rate={self.rate} must be a share of steps between 0 and 1.")
-        if not 0 < self.alpha <= 1:
-            raise UserError(f"alpha={self.alpha} must lie in (0, 1]: at 0 a barrier could never fall.")
-        if self.condition not in CONDITIONS:
-            raise UserError(f"condition='{self.condition}' is unknown; choose margin or retain.")
+        check_bounds(self)
         if self.plans > 1 and not self.select and not self.refine:
             raise UserError(f"plans={self.plans} are drawn, but none is selected; set select=true, or plans=1.")
         if self.starts > 1 and not self.refine:

@@ -16,7 +16,7 @@ from ringfence.guards import DANGERS, GUARDS, GuardOptions
 from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils import stored
-from ringfence.utils.config import parse_as
+from ringfence.utils.config import fields_of, read_text
 from ringfence.world import World
 
 SIGHTS = ("all", "own")
@@ -174,7 +174,7 @@ def _options(kind: type, given: Mapping[str, Any]) -> Options:
 
 def _typed(kind: type, name: str, value: Any, default: Any) -> Any:
     if isinstance(value, str):
-        return parse_as(kind, {name: value})[name]
+        return read_text(fields_of(kind)[name], value)
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value

@@ -5,36 +5,28 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ringfence.errors import UserError, unknown
+from ringfence.errors import UserError
 from ringfence.proposals import diffusion
+from ringfence.utils.config import AtLeastOne, Count, NonNegative, check_bounds
 
 
 @dataclass(frozen=True)
 class PlanOptions:
     """Evaluation-time choices of how plans are drawn."""
 
-    steps: int = 5  # sampler steps
+    steps: Count = 5  # sampler steps
     sampler: diffusion.Sampler = "ddim"
     guidance: float = 1.2  # ω of classifier-free guidance; 1 switches it off
     target: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
-    temperature: float = 1.0  # scale of the first noise
-    ascent: float = 0.0  # gradient guidance: steps of x̂0 along the plan's value, in units of its deviation
-    persist: float = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
+    temperature: NonNegative = 1.0  # scale of the first noise
+    ascent: NonNegative = 0.0  # gradient guidance: steps of x̂0 along the plan's value, in units of its deviation
+    persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
-    replan: int = 1  # steps that a plan is followed for
+    replan: AtLeastOne = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
     def __post_init__(self):
-        for name in ("steps", "replan"):
-            if getattr(self, name) < 1:
-                raise UserError(f"{name}={getattr(self, name)} must be at least 1.")
-        for name in ("temperature", "ascent", "persist"):
-            if getattr(self, name) < 0:
-                raise UserError(f"{name}={getattr(self, name)} must not be negative.")
-        if self.sampler not in diffusion.SAMPLERS:
-            raise unknown("sampler", self.sampler, diffusion.SAMPLERS)
-        if self.execution not in ("centralized", "decentralized"):
-            raise UserError(f"execution='{self.execution}' is unknown; choose centralized or decentralized.")
+        check_bounds(self)
         if self.persist != 1.0 and not self.ascent:
             raise UserError(f"persist={self.persist} is read by nothing that was asked for; set ascent.")
 

@@ -24,7 +24,6 @@ from safetensors.numpy import save_file
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
 from ringfence.utils import schemas, stored
-from ringfence.utils.config import RANGES
 from ringfence.utils.files import alone, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 
@@ -148,26 +147,3 @@ def write_json(path: Path, data: Any) -> None:
     """Whole or not at all."""
     with whole(path) as temporary:
         temporary.write_text(json.dumps(data, indent=1))
-
-
-RANGES |= {"plans": (1, 10_000), "starts": (1, 10_000), "rows": (1, 10_000), "refine": (0, 10**6), "shield": (0, 10**6)}
-RANGES |= dict.fromkeys(("diffusion_steps", "inverse_width"), (1, 10**5))
-RANGES |= dict.fromkeys(("barrier_batch", "gradient_batch", "barrier_updates"), (1, 10**9))
-RANGES |= {"barrier_width": (1, 10**5)}
-RANGES |= dict.fromkeys(("value_updates", "future_updates", "dynamics_updates"), (1, 10**9))
-RANGES |= {"dynamics_width": (1, 10**5)}
-RANGES |= {
-    "members": (1, 20),
-    "future_discount": (0, 0.999),
-    "expectile": (0.5, 1),
-    "foreseen": (0, 1),
-    "penalty": (0, None),
-}
-RANGES |= dict.fromkeys(("search_iterations", "search_samples", "cql_samples"), (1, None))
-RANGES |= dict.fromkeys(("discount", "ema", "target_rate", "condition_dropout", "retention"), (0, 1))
-RANGES |= dict.fromkeys(("barrier_start", "barrier_full"), (0, 1))
-RANGES |= dict.fromkeys(("history", "warmup", "barrier_weight", "delta", "cql_weight", "cql_noise"), (0, None))
-RANGES |= dict.fromkeys(("alpha", "multiplier_rate", "multiplier_max", "action_penalty", "logit_penalty"), (0, None))
-RANGES |= dict.fromkeys(("search_deviation", "target_noise", "target_noise_clip", "inverse_noise"), (0, None))
-RANGES |= dict.fromkeys(("temperature_reward", "temperature_danger", "snr_floor", "snr_ceiling"), (0, None))
-RANGES |= {"grad_clip": (0, None), "cost_limit": (0, None)}
