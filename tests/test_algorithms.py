@@ -184,7 +184,7 @@ def test_gradient_depths(small_store, small_world, gradient):
 )
 def test_planner_options(trained, options):
     run = trained["icbf"]
-    result = evaluate(run, **QUICK, record=2, **options)
+    result = evaluate(run, **QUICK, num_recorded=2, **options)
     assert result["episodes"] == 4 and np.isfinite(result["return_mean"])
     assert len(run.results) >= 1
 
@@ -549,13 +549,13 @@ def test_damaged_run_folders_are_refused(tmp_path):
 
 
 def test_no_more_is_recorded_than_was_played(trained):
-    with pytest.raises(UserError, match="record=-1 must be a whole number"):
-        evaluate(trained["madiff"], episodes=2, record=-1)
-    evaluate(trained["madiff"], episodes=2, steps=2, record=4)
+    with pytest.raises(UserError, match="num_recorded=-1 must be a whole number"):
+        evaluate(trained["madiff"], episodes=2, num_recorded=-1)
+    evaluate(trained["madiff"], episodes=2, steps=2, num_recorded=4)
     with np.load(trained["madiff"].path / "rollout-default+steps2.npz") as kept:
         assert {len(kept[k]) for k in kept} == {2}
     _, policy = load(trained["madiff"], steps=2)  # more than are played in one batch
-    played = rollout.rollout(policy, registry.get("simple_spread-random").env, rollout.CHUNK + 3, record=51)
+    played = rollout.rollout(policy, registry.get("simple_spread-random").env, rollout.CHUNK + 3, num_recorded=51)
     assert len(played["plans"]) == 51 and len(played["states"]) == rollout.CHUNK + 3
 
 
@@ -583,7 +583,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
         (["--steps", "3", "--set", "steps=2"], "--steps 3 and --set steps=2 both set steps"),
         (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
         (["--set", "steps=3", "--set", "plans=2", "rows=x"], "rows='x' cannot be read as int"),
-        (["--record", "-1"], "record=-1 must be a whole number"),
+        (["--record", "-1"], "num_recorded=-1 must be a whole number"),
         (["--step", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],
 )

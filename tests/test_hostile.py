@@ -69,7 +69,7 @@ def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
     (run.path / "config.json").write_text(json.dumps(told | {"preset": "/../../../../victim"}))
     for record in (0, 1):
         with pytest.raises(UserError, match="no run folder that can be read"):
-            evaluate(run, episodes=2, record=record)
+            evaluate(run, episodes=2, num_recorded=record)
     assert victim.read_text() == "mine"
 
 
@@ -274,7 +274,7 @@ def test_numbers_of_strangers(trained_run, value, tmp_path):
     store = corpus.small_store()
     for attempt in (
         lambda: evaluate(trained_run, episodes=value),
-        lambda: evaluate(trained_run, record=value),
+        lambda: evaluate(trained_run, num_recorded=value),
         lambda: load(value),
         lambda: Controller(trained_run, seed=value),
         lambda: Controller(trained_run, agents=value or -1),

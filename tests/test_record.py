@@ -141,5 +141,5 @@ def test_simulators_and_policies_that_cannot_be_recorded(tmp_path):
         with pytest.raises(UserError, match=said):
             ringfence.record(make_env, policy, episodes=2, out=tmp_path / "x.h5")
     with pytest.raises(UserError, match="has not ended after 2 steps"):
-        ringfence.record(Drift, lean, episodes=2, longest=2)
+        ringfence.record(Drift, lean, episodes=2, max_episode_steps=2)
     assert not list(tmp_path.iterdir())

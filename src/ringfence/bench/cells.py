@@ -381,8 +381,8 @@ class _Group:
         cell = self.left[0]
         trained = time.perf_counter() - self.begun
         for _, name in cell.missing(self.out, self.episodes):
-            record = 4 if cell.seed == 0 else 0
-            evaluate_spec(PolicySpec.parse(name, run), episodes=self.episodes, record=record)
+            num_recorded = 4 if cell.seed == 0 else 0
+            evaluate_spec(PolicySpec.parse(name, run), episodes=self.episodes, num_recorded=num_recorded)
         played = time.perf_counter() - self.begun - trained
         _record(cell, self.out, "done", self._took(cell, trained, played))
         self.tell("done", self.left.pop(0))

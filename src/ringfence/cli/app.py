@@ -130,7 +130,7 @@ def evaluate(
     runs: Positional[list[Path]],
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
-    record: int = 4,
+    num_recorded: int = 4,
     step: int | None = None,
     video: bool = False,
     playing: How = AS_IT_IS,
@@ -141,7 +141,7 @@ def evaluate(
         runs: run folders, or folders that hold some.
         episodes: at least 200 for a table.
         split: test resets, or validation resets for choosing settings.
-        record: episodes kept for the animation of the report.
+        num_recorded: episodes kept for the animation of the report.
         step: of the checkpoint that is played; the last one by default.
         video: make a GIF of the first episode (robots).
     """
@@ -168,8 +168,8 @@ def evaluate(
 
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
-        record = record or 1
-    given |= {"episodes": episodes, "split": split, "record": record, "step": step, "quiet": False}
+        num_recorded = num_recorded or 1
+    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "step": step, "quiet": False}
     refused: dict[str, list] = {}  # what several runs are refused for is said once
     for run in found:
         try:

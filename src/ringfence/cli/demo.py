@@ -34,7 +34,7 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     cloned = loop.train("bc", store, out=out / "runs", changes={"steps": 60} if quick else {})[0]
     planner = loop.train("icbf", store, **shared)[0]
     rows = dict(reference.make(task, store, out / "runs", episodes))
-    protocol: dict[str, Any] = {"episodes": episodes, "record": 4, "quiet": False}
+    protocol: dict[str, Any] = {"episodes": episodes, "num_recorded": 4, "quiet": False}
     fewer: dict[str, Any] = {"steps": 2} if quick else {}
     world = run_worlds.of_run(planner)
     console.print(str(world.card), soft_wrap=True, markup=False)

@@ -61,10 +61,11 @@ class Playing:
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
         given = {name: value for name, value in given.items() if value is not None}
         assigned = assignments(self.set)
-        flags = {"episodes", "split", "record", "step", *_FLAGS_ALONE}
+        flags = {"episodes", "split", "num_recorded", "step", *_FLAGS_ALONE}
         for name, value in assigned.items():
             if name in flags:
-                raise UserError(f"--set {name}={value} is no option of planner or guard; write --{name} {value}.")
+                flag = f"--{name.replace('_', '-')}"
+                raise UserError(f"--set {name}={value} is no option of planner or guard; write {flag} {value}.")
             if name in given:
                 raise UserError(f"--{name} {given[name]} and --set {name}={value} both set {name}; give one of them.")
         checked: dict[str, Any] = dict(assigned)

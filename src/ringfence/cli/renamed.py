@@ -12,6 +12,7 @@ OLD_COMMANDS: dict[str, str] = {"judge": "ope"}
 OLD_FLAGS: dict[str, dict[str, str]] = {
     command: {"--danger": "--barrier", "--sight": "--execution"} for command in ("eval", "play", "export", "ope")
 }
+OLD_FLAGS["eval"]["--record"] = "--num-recorded"
 # By today's flag.
 OLD_VALUES: dict[str, dict[str, str]] = {
     "--barrier": stored.BARRIERS,

@@ -107,7 +107,7 @@ class Episode:
         if number >= self.max_steps and not ended:
             raise UserError(
                 f"An episode of {self.name} has not ended after {self.max_steps} steps; let truncations end it, or "
-                "pass longest=."
+                "pass max_episode_steps=."
             )
         numbers = [self.rewards[-1], *(np.ravel(c) for c in self.costs[-1:])]
         if not np.isfinite(np.concatenate(numbers)).all():

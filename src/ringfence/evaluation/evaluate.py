@@ -19,10 +19,12 @@ from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
+from ringfence.utils.renamed import renamed
 
 _log = logging.getLogger(__name__)
 
 Split = Literal["test", "validation"]
+OLD_ARGUMENTS = {"record": "num_recorded"}
 
 
 def evaluate(
@@ -31,32 +33,35 @@ def evaluate(
     episodes: int = 200,
     split: Split = "test",
     planner: str = "plain",
-    record: int = 0,
+    num_recorded: int = 0,
     quiet: bool = True,
     step: int | None = None,
-    **options,
-) -> dict:
+    **options: Any,
+) -> dict[str, Any]:
     """Evaluate a run folder and add the result to its results.json, under the variant's name.
 
-    `planner`, `guard`, `danger`, `sight`, `world` and other options are as in `load`. The result tells the `step` of
-    the checkpoint that was played; where training is unfinished, a line on stderr says so.
+    The first `num_recorded` episodes are kept for films. `planner`, `guard`, `danger`, `sight`, `world` and other
+    options are as in `load`. The result tells the `step` of the checkpoint that was played; where training is
+    unfinished, a line on stderr says so.
     """
+    options = renamed(options, OLD_ARGUMENTS, "evaluate")
+    num_recorded = options.pop("num_recorded", num_recorded)
     return evaluate_spec(
         PolicySpec.of(run, checkpoint=step, planner=planner, **options),
         episodes=episodes,
         split=split,
-        record=record,
+        num_recorded=num_recorded,
         quiet=quiet,
     )
 
 
 def evaluate_spec(
-    spec: PolicySpec, *, episodes: int = 200, split: Split = "test", record: int = 0, quiet: bool = True
+    spec: PolicySpec, *, episodes: int = 200, split: Split = "test", num_recorded: int = 0, quiet: bool = True
 ) -> dict[str, Any]:
     """`evaluate` of what a spec names."""
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
-    whole_number("record", record)
+    whole_number("num_recorded", num_recorded)
     resolved = resolve(spec)
     run = resolved.run
     job = resolved.job
@@ -69,10 +74,10 @@ def evaluate_spec(
     variant = resolved.variant(split)
     seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
-    result, played = evaluate_policy(resolved.team, job.task, episodes, split, seed, record, label, quiet)
+    result, played = evaluate_policy(resolved.team, job.task, episodes, split, seed, num_recorded, label, quiet)
     result |= {"variant": variant, "step": resolved.step} | about(resolved)
     run.add_result(variant, result)
-    recordings.write(run.path, variant, played, record)
+    recordings.write(run.path, variant, played, num_recorded)
     return result
 
 

@@ -22,7 +22,9 @@ from ringfence.types import Array, Key
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
+from ringfence.utils.renamed import renamed
 
+OLD_ARGUMENTS = {"longest": "max_episode_steps"}
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
 
 
@@ -36,7 +38,7 @@ def play(
     seed: int = 0,
     cost: Cost | None = None,
     at_once: int = 16,
-    longest: int | None = None,
+    max_episode_steps: int | None = None,
     keep: bool = False,
     quiet: bool = True,
     **options: Any,
@@ -47,9 +49,9 @@ def play(
     whose agents, in the order of `possible_agents`, are those of the data, and who begin and end together. `at_once` of
     them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
     7 000 001 + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
-    `longest` steps (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's noise.
-    `planner` and `options` (guard, danger, sight, world, ...) are as in `evaluate.load`. `keep` adds the result to the
-    run's results.json, as `ringfence eval` does, for reports.
+    `max_episode_steps` (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's
+    noise. `planner` and `options` (guard, danger, sight, world, ...) are as in `evaluate.load`. `keep` adds the result
+    to the run's results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -59,16 +61,18 @@ def play(
     The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
     """
     keep_programs()
+    options = renamed(options, OLD_ARGUMENTS, "play")
+    max_episode_steps = options.pop("max_episode_steps", max_episode_steps)
     whole_number("episodes", episodes, 1)
     whole_number("at_once", at_once, 1)
-    if longest is not None:
-        whole_number("longest", longest, 1)
+    if max_episode_steps is not None:
+        whole_number("max_episode_steps", max_episode_steps, 1)
     if split not in rollout.RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     player = player_of(run, planner, split, options)
     if keep:
         _check_kept(player)
-    max_steps = longest or max(10_000, 20 * player.episode_length)
+    max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
     envs = _made(make_env, min(at_once, episodes))
     begun = time.perf_counter()
     key = jax.random.key(seed)

@@ -113,7 +113,7 @@ def evaluate_policy(
     episodes: int = 200,
     split: str = "test",
     seed: int = 0,
-    record: int = 0,
+    num_recorded: int = 0,
     label: str = "",
     quiet: bool = True,
 ) -> tuple[dict, dict[str, np.ndarray]]:
@@ -125,9 +125,9 @@ def evaluate_policy(
             "of your own: `ringfence play RUN --env FILE.py:NAME`."
         )
     episodes = whole_number("episodes", episodes, 1, 10**7)
-    record = min(whole_number("record", record), episodes)
+    num_recorded = min(whole_number("num_recorded", num_recorded), episodes)
     begun = time.perf_counter()
-    played = rollout(policy, task.env, episodes, split, seed, record, label, quiet)
+    played = rollout(policy, task.env, episodes, split, seed, num_recorded, label, quiet)
     result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
     result |= {"protocol": PROTOCOL, "task": task.name, "split": split, "seed": seed}
     return result | {"eval_seconds": time.perf_counter() - begun}, played

@@ -28,27 +28,27 @@ def rollout(
     episodes: int,
     split: str = "test",
     seed: int = 0,
-    record: int = 0,
+    num_recorded: int = 0,
     label: str = "",
     quiet: bool = True,
 ) -> Played:
     """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
     whether the task itself `terminated` (E,) it, and who was `violated` (E, L, N) where agents have costs of their own;
-    the first `record` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's noise,
-    never the resets."""
+    the first `num_recorded` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's
+    noise, never the resets."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     root = RESETS[split]
     act_key = jax.random.fold_in(jax.random.key(root + 1), seed)
     label = label or "evaluating"
     if isinstance(env, NativeEnv):
-        return _rollout_native(policy, env, episodes, root, act_key, record, label, quiet)
+        return _rollout_native(policy, env, episodes, root, act_key, num_recorded, label, quiet)
     if _foreign(policy):
         raise UserError(
             f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
             "act() uses jax.numpy."
         )
-    played = _in_chunks(_compiled(env, jax.random.key(root), act_key), policy, episodes, record, label, quiet)
+    played = _in_chunks(_compiled(env, jax.random.key(root), act_key), policy, episodes, num_recorded, label, quiet)
     _refuse_lost(played)
     return {
         "rewards": played.pop("reward"),
@@ -91,7 +91,7 @@ def _in_chunks(
     play: Callable[[Policy, int, int, int], dict[str, Array]],
     policy: Policy,
     episodes: int,
-    record: int,
+    num_recorded: int,
     label: str,
     quiet: bool,
 ) -> Played:
@@ -99,7 +99,7 @@ def _in_chunks(
     chunks: list[Played] = []
     with Progress(label, episodes, 0, quiet) as bar:
         for first in range(0, episodes, CHUNK):
-            keep = min(max(record - first, 0), CHUNK)
+            keep = min(max(num_recorded - first, 0), CHUNK)
             chunks.append(jax.device_get(play(policy, first // CHUNK, CHUNK, keep)))
             bar.advance(min(CHUNK, episodes - first))
     played = {name: np.concatenate([c[name] for c in chunks if name in c]) for name in chunks[0]}
@@ -118,7 +118,7 @@ def _refuse_lost(played: Played) -> None:
 
 
 def _rollout_native(
-    policy: Policy, env: NativeEnv, episodes: int, root: int, key: Key, record: int, label: str, quiet: bool
+    policy: Policy, env: NativeEnv, episodes: int, root: int, key: Key, num_recorded: int, label: str, quiet: bool
 ) -> Played:
     """`rollout` on a simulator that steps outside JAX: all episodes side by side. After an episode's end its rewards
     and costs are 0 and its state stays."""
@@ -143,8 +143,8 @@ def _rollout_native(
             states.append(simulation.state().astype(np.float32))
             memory = heard(policy, memory, outcomes[-1].cost)
             counted.append({name: np.asarray(value) & running for name, value in _counted(decided).items()})
-            if record:
-                drawn.append({name: np.asarray(value[:record]) for name, value in _drawn(decided).items()})
+            if num_recorded:
+                drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})
             bar.advance(1)
     per_step = {
         "rewards": np.stack([o.reward for o in outcomes], 1),

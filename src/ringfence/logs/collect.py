@@ -15,6 +15,7 @@ from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
+from ringfence.utils.renamed import deprecated
 
 EACH = 100  # episodes after which what is there is kept
 KEPT = ("observations", "actions", "rewards", "costs")
@@ -28,9 +29,10 @@ def record(
     out: str | os.PathLike | None = None,
     seed: int = 0,
     cost: Cost | None = None,
-    longest: int = 100_000,
+    max_episode_steps: int = 100_000,
     card: dict | None = None,
     quiet: bool = True,
+    longest: int | None = None,
 ) -> EpisodeStore:
     """The logs of `episodes` episodes of `make_env()`, a PettingZoo `ParallelEnv` whose agents begin and end together.
 
@@ -41,9 +43,14 @@ def record(
     dictionary they are those of constraints, whose limits per episode `card["constraints"]` tells (0 by default).
 
     With `out` a store's file is written every hundred episodes, and a recording of the same simulator, policy's name
-    and seed goes on from there. `longest` steps without an end are refused. `card` adds fields to the store's.
+    and seed goes on from there. `max_episode_steps` without an end are refused. `card` adds fields to the store's.
     """
-    whole_number("episodes", episodes, 1), whole_number("seed", seed, 0, 2**31), whole_number("longest", longest, 1)
+    if longest is not None:
+        deprecated("longest of record", "max_episode_steps")
+        max_episode_steps = longest
+    whole_number("episodes", episodes, 1)
+    whole_number("seed", seed, 0, 2**31)
+    whole_number("max_episode_steps", max_episode_steps, 1)
     if not callable(make_env):
         raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
     file = None if out is None else writable(out)
@@ -65,7 +72,7 @@ def record(
             if hasattr(policy, "reset"):
                 policy.reset()
             chance = np.random.default_rng((seed, k))
-            made.append(_played(env, shown, act, seed + k, cost, longest, low, high, width, chance))
+            made.append(_played(env, shown, act, seed + k, cost, max_episode_steps, low, high, width, chance))
             bar.advance(1)
             if file is not None and (len(made) == EACH or k + 1 == episodes):
                 done, made = _grown(done, made, told, (low, high), env, card), []
@@ -73,9 +80,11 @@ def record(
     return done if not made else _grown(done, made, told, (low, high), env, card)
 
 
-def _played(env, shown: Shape, act, seed: int, cost, longest: int, low: float, high: float, width: int, chance) -> dict:
+def _played(
+    env, shown: Shape, act, seed: int, cost, max_episode_steps: int, low: float, high: float, width: int, chance
+) -> dict:
     """Arrays of one episode of L steps: observations (L+1, N, O), actions (L, N, A), ..."""
-    episode = Episode(env, shown, seed, longest)
+    episode = Episode(env, shown, seed, max_episode_steps)
     seen, states, acted = [episode.seen], [episode.state], []
     while episode.running:
         shape = (len(episode.agents), width)

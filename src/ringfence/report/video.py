@@ -77,7 +77,7 @@ def recorded(run: Run, variant: str) -> recordings.Recording:
     """An evaluation's recording; `UserError` where it kept none."""
     kept = recordings.read(run.path, variant)
     if kept is None:
-        raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --record 1 or more.")
+        raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --num-recorded 1 or more.")
     return kept
 
 
