@@ -81,7 +81,7 @@ def by_simulator(world: World) -> World:
 def unguessed():
     """While it lasts, Worlds of own sight foresee by the own view and action alone."""
     usual = features.alone
-    return mock.patch.object(features, "alone", lambda map: replace(usual(map), guessing=False))
+    return mock.patch.object(features, "alone", lambda map: replace(usual(map), models_others=False))
 
 
 @dataclass(frozen=True)

@@ -54,8 +54,8 @@ def half(run: Run, variant: str) -> tuple[list[Image.Image], int]:
     states, costs, rewards = kept["states"][0], kept["costs"][0], kept["rewards"][0]
     called = [part for part in variant.split("+")[1:] if not part.startswith("agents")]
     name = ", ".join([NAMES[run.config["algorithm"]].removesuffix(" (no barrier)"), *called])
-    over = f"{int(costs.sum())} of {len(costs)} steps " + ("with contact" if task.alike else "over")
-    title = f"{name}: return {rewards.sum():.{1 if task.alike else 0}f}, {over}"
+    over = f"{int(costs.sum())} of {len(costs)} steps " + ("with contact" if task.homogeneous else "over")
+    title = f"{name}: return {rewards.sum():.{1 if task.homogeneous else 0}f}, {over}"
     made = []
     for frame in task.env.frames(states[: STEPS + 1], video.moments(costs[:STEPS])):
         frame.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)

@@ -70,7 +70,7 @@ def main() -> None:
             key = (config["task"], config["algorithm"], variant, str(config["seed"]))
             if args.without and args.without in variant:
                 continue
-            if key in done or (result.get("execution") == "decentralized" and not task.alike):
+            if key in done or (result.get("execution") == "decentralized" and not task.homogeneous):
                 continue
             how = {"planner": result["planner"]}
             if result["guard"] != "none":

@@ -153,7 +153,7 @@ def record(episodes: int, blind: int) -> EpisodeStore:
         "simulator": f"ir-sim {irsim.__version__}",
         "observation_names": list(Crossing().observation_names),
         "hazard": Separation(0.30),
-        "alike": True,
+        "homogeneous": True,
     }
     return EpisodeStore.from_episodes(*(np.array(kept[k], np.float32) for k in kept), card=card)
 

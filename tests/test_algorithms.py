@@ -426,7 +426,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
         with pytest.raises(UserError, match=said):
             pilot.act(seen, state)
     told = json.loads((run.path / "config.json").read_text())
-    del told["widths"], told["team"], told["spec"]["alike"]  # as older versions wrote it
+    del told["widths"], told["team"], told["spec"]["homogeneous"]  # as older versions wrote it
     del told["data"]["observation_names"]
     (run.path / "config.json").write_text(json.dumps(told))
     pilot = Controller(run, steps=2)

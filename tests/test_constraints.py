@@ -89,7 +89,7 @@ def test_costs_by_name_are_kept_through_everything(logs, tmp_path):
     some = again.select(np.arange(250) % 5 == 0)
     both = some.followed_by(some)
     np.testing.assert_array_equal(both.constraints[: some.steps], some.constraints)
-    apart = logs.apart()
+    apart = logs.split_agents()
     np.testing.assert_array_equal(apart.of_constraint("fast")[: logs.steps], logs.of_constraint("fast")[:, 0])
     fact = audit(logs).facts["constraint wall"]
     within = 100 * (logs.episode_costs_of("wall") == 0).mean()

@@ -125,7 +125,7 @@ def test_what_is_foreseen_of_others_who_coast_is_exact():
     plan = jnp.repeat(came[:, :1], 5, 1).at[..., :2].set(came[..., :2])
     error = np.abs(np.asarray(view.reconcile(plan) - came))
     # But for who comes to be seen, is another than before, or has a new goal.
-    assert np.quantile(error, 0.9) < 1e-5 and view.own == (0, 1) and view.solitary
+    assert np.quantile(error, 0.9) < 1e-5 and view.own == (0, 1) and view.decentralized
 
 
 def test_certificates_keep_apart_who_would_touch():
@@ -227,7 +227,7 @@ def test_it_keeps_pettingzoos_api(logs, tmp_path):
 
 
 def test_logs_are_taken_apart(logs):
-    each = logs.apart()
+    each = logs.split_agents()
     assert each.n_agents == 1 and each.episodes == 160 and each.state is None
     i, e = 5, 7  # agent, episode
     mine = each.episode_ends[i * 20 + e - 1] + np.arange(100)
@@ -238,7 +238,7 @@ def test_logs_are_taken_apart(logs):
     out = held_out(each, 0).reshape(8, 20)
     assert (out == out[0]).all() and out[0].sum() == 2  # who were together are held out together
     with pytest.raises(UserError, match="costs are the team's"):
-        dataclasses.replace(logs, costs=logs.costs.max(1)).apart()
+        dataclasses.replace(logs, costs=logs.costs.max(1)).split_agents()
 
 
 @pytest.mark.parametrize(
@@ -251,14 +251,14 @@ def test_rooms_that_cannot_be_are_refused(room, said):
 
 def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     """The card says so, and what was learned of eight plays five."""
-    card = {k: logs.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
+    card = {k: logs.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "homogeneous": True}
     mine = dataclasses.replace(logs, state=None, card=card)
     run = loop.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(mine, **QUICK_WORLD)
-    assert world.map.solitary and world.map.dt == pytest.approx(0.1)  # as names and steps tell
+    assert world.map.decentralized and world.map.dt == pytest.approx(0.1)  # as names and steps tell
     assert world.map.own == Crossing().feature_map("pruned").own
     world = worlds.load(save(world, tmp_path / "fleet.world"))
-    assert world.map.solitary
+    assert world.map.decentralized
     seen = np.asarray(logs.observations[40, :5])
     pilot = Controller(run, guard="shield", world=world, agents=5)
     assert pilot.act(seen).shape == (5, 2)

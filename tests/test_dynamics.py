@@ -17,7 +17,7 @@ def view(joint: bool) -> FeatureMap:
     """The points as they are; of a body, each point's entries in its own order."""
     table = np.array([[0, 1, 2, 3], [2, 3, 0, 1]]) if joint else np.tile([0, 1], (AGENTS, 1))
     names = ("x", "v", "other.x", "other.v")[: table.shape[1]]
-    return FeatureMap("pruned", names, "state", table, np.full_like(table, -1), body=joint, joint=joint)
+    return FeatureMap("pruned", names, "state", table, np.full_like(table, -1), shared_body=joint, joint=joint)
 
 
 def log(joint: bool):
@@ -64,8 +64,8 @@ def test_agents_that_do_not_share_a_body_do_not_read_each_other():
     assert (moved != 0).any(-1).all()
 
 
-@pytest.mark.parametrize("guessing", [True, False])
-def test_who_guesses_what_others_see_does_not_take_its_own_action_for_the_cause(guessing):
+@pytest.mark.parametrize("models_others", [True, False])
+def test_who_guesses_what_others_see_does_not_take_its_own_action_for_the_cause(models_others):
     """The first agent acts roughly as a wind blows that only the second sees, and the wind alone moves it: it foresees
     nothing of its own action, unless it has nothing else to tell the wind by."""
     rng = np.random.default_rng(0)
@@ -76,10 +76,10 @@ def test_who_guesses_what_others_see_does_not_take_its_own_action_for_the_cause(
     actions = jnp.asarray(acts[..., None], jnp.float32)
     table = np.array([[0], [1]])
     map = FeatureMap("decentralized", ("seen",), "observations", table, np.full_like(table, -1))
-    map = replace(map, guessing=guessing)
+    map = replace(map, models_others=models_others)
     row = jnp.arange(len(wind) - 1)
     sizes = dict(members=2, updates=1500, width=16)
     dynamics = fit_dynamics(features, actions[:-1], row, map, jax.random.key(0), **sizes)
     pushed, pulled = (dynamics.step(features[:-1], actions[:-1].at[:, 0].set(a))[0][:, 0] for a in (1.0, -1.0))
     effect = jnp.abs(pushed - pulled).mean() / (2 / 20)  # of what the wind does
-    assert effect < 0.2 if guessing else effect > 0.5
+    assert effect < 0.2 if models_others else effect > 0.5

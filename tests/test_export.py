@@ -164,7 +164,7 @@ def test_a_followed_plan_is_remembered(planner, small_store, tmp_path):
 
 def test_agents_who_are_alike(own_store, tmp_path):
     """Learned of three of them, without states; a file is of as many as are asked for."""
-    card = {k: own_store.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "alike": True}
+    card = {k: own_store.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "homogeneous": True}
     costs = np.repeat(own_store.costs[:, None], 3, 1)
     store = dataclasses.replace(own_store, costs=costs, card=card)
     run = loop.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]

@@ -211,7 +211,7 @@ CARDS = {
     "observation_names": [["x", "x", "y"], ["x"], "xyz", [1, 2, 3], ["a\nb", "b", "c"]],
     "action_low": [float("nan"), "x", None, 2.0, [0]],
     "cost_limit": [-1, float("inf"), "x", [1]],
-    "alike": ["yes", 3],
+    "homogeneous": ["yes", 3],
 }
 
 

@@ -1,4 +1,4 @@
-"""Simple Spread in views that any number of agents have alike."""
+"""Simple Spread in views of homogeneous agents, any number of them."""
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +76,7 @@ def test_the_same_play_told_otherwise(logs):
     np.testing.assert_array_equal(logs.actions, plain.actions)
     np.testing.assert_array_equal(logs.costs.max(1), plain.costs)
     assert logs.costs.any() and logs.card["agents"] == ["agent0", "agent1", "agent2"]
-    each = logs.apart()
+    each = logs.split_agents()
     hazard = constraints.bind(TASK.hazard, TASK.feature_map("pruned").names, 1)
     ends = np.arange(1, 26) + 26 * np.arange(each.episodes)[:, None]  # rows that steps lead to
     unsafe = hazard.labels(jnp.asarray(each.observations[ends.ravel()]))[0]
@@ -86,7 +86,7 @@ def test_the_same_play_told_otherwise(logs):
 def test_one_checkpoint_plays_teams_of_another_size(logs, tmp_path):
     run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
-    assert world.map.solitary
+    assert world.map.decentralized
     for agents in (2, 6):
         found = evaluate(run, episodes=4, agents=agents, guard="shield", world=world)
         assert found["agents"] == agents and found["episodes"] == 4

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from ringfence.logs.schema import complete_card
 from ringfence.training.runs import Run
 from ringfence.utils import schemas, stored
 
@@ -109,3 +110,9 @@ def test_no_committed_table_has_a_name_twice():
 def test_every_new_name_is_checked_where_results_are_read():
     known = schemas.Result.__annotations__
     assert set(stored.COLUMNS) <= set(known) and set(stored.COLUMNS.values()) <= set(known)
+
+
+def test_homogeneous_agents_of_older_files_are_known():
+    spec = {"alike": True, "n_agents": 1}
+    assert stored.config({"task": "x", "spec": spec})["spec"] == {"homogeneous": True, "n_agents": 1}
+    assert complete_card({"task": "fleet", "alike": True})["homogeneous"] is True

@@ -160,7 +160,7 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
     told = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
     table = fleet(agents=5, steps=20) | {"gx": np.full(600, 1.5), "gy": np.full(600, -0.5)}
     store = EpisodeStore.from_table(table, **told, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
-    assert store.n_agents == 1 and store.card["alike"] and store.costs.any() and (store.lengths <= 10).all()
+    assert store.n_agents == 1 and store.card["homogeneous"] and store.costs.any() and (store.lengths <= 10).all()
     far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
     seen = entry(store, "other0.seen") > 0
     assert (far[~seen] == 2.5).all() and (far[seen] <= 2.5).all() and 0 < seen.mean() < 1

@@ -43,7 +43,7 @@ class Spec:
     action_low: float
     action_high: float
     episode_length: int
-    alike: bool = False  # of agents who are alike and see for themselves: of a team of one (each.py)
+    homogeneous: bool = False  # agents that share all that is learned: the spec of a team of one
     action_sizes: tuple[int, ...] | None = None  # entries that each agent's action has, where not all have action_dim
 
     @classmethod

@@ -123,7 +123,7 @@ SUITES = {
         ),
         episodes=20,
     ),
-    # Agents who are alike, each by itself; danger that is decided ten steps ahead.
+    # Homogeneous agents, each by itself; danger that is decided ten steps ahead.
     "crossing": Suite(
         _CROSSING + tuple(f"crossing_unicycle-{tier}" for tier in _TIERS),
         (Entry("bc", evaluations=("plain", "shield-learned")),),

@@ -105,7 +105,7 @@ def fit(
         data: a task (its data set is regenerated if need be) or a store's file.
         seed: of the fit, and of which episodes are held out.
         sight: all for guards that see the team (default), own for agents that each guard their own action by their
-            own view (always so of agents who are alike).
+            own view (always so of homogeneous agents).
         set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
         out_file: keep the World in a file, too, for `ringfence eval --world`.
         report: write the card as an HTML page: are these logs enough?

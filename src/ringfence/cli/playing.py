@@ -28,7 +28,7 @@ class Playing:
     """centralized: one guard sees the team; decentralized: every agent guards its own action by its own view. Without
     a guard: how a planner plans."""
     agents: int | None = None
-    """who play, where they are alike (Crossing); as many as in the logs by default."""
+    """who play, where they are homogeneous (Crossing); as many as in the logs by default."""
     world: Path | None = None
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
     planner: Literal["default", "value_guided", "low_temperature"] = "default"

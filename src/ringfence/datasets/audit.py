@@ -11,7 +11,7 @@ from ringfence.datasets.task import Task, first_rows
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.problem.homogeneous import look
+from ringfence.problem.homogeneous import local_features
 
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
 COARSE = 0.01  # of an entry's deviation: the distance of neighbouring numbers above which it is coarse
@@ -172,7 +172,7 @@ def _labels(store: EpisodeStore, task: Task, rows: np.ndarray) -> np.ndarray | N
     if not bound.has_formula:
         return None
     state = None if store.state is None else store.state[rows]
-    unsafe, _ = bound.labels(look(view, task.alike, store.observations[rows], state))
+    unsafe, _ = bound.labels(local_features(view, task.homogeneous, store.observations[rows], state))
     return np.any(np.asarray(unsafe).reshape(len(rows), -1), axis=-1)
 
 

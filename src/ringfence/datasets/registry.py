@@ -52,7 +52,7 @@ def _spread_alike(tier: str) -> Task:
         tier=tier,
         transitions=333_350,
         recipe=spread_alike.RECIPE,
-        alike=True,
+        homogeneous=True,
         **_SPREAD,
     )
 
@@ -128,7 +128,7 @@ def _crossing(tier: str, body: Body = "disc") -> Task:
         return_max=_CERTIFIED[body],
         transitions=125_000,
         recipe=crossing.RECIPE,
-        alike=True,
+        homogeneous=True,
     )
 
 
@@ -156,8 +156,8 @@ def get(name: str) -> Task:
 
 
 def of_team(task: Task, agents: int) -> Task:
-    """The task with another number of agents, at the same density; refused where they are not alike."""
-    if not task.alike:
+    """The task with another number of agents, at the same density; refused where they are heterogeneous."""
+    if not task.homogeneous:
         raise UserError(
             f"'{task.name}' has agents of its own kinds, each with weights of its own, so agents={agents} cannot play; "
             "leave it out."
@@ -236,7 +236,7 @@ def from_store(store: EpisodeStore) -> Task:
         presets=("mujoco",) if robot else (),
         action_low=float(card["action_low"]),
         action_high=float(card["action_high"]),
-        alike=card.get("alike") is True,
+        homogeneous=card.get("homogeneous") is True,
     )
 
 

@@ -68,7 +68,7 @@ class Task:
     action_low: float = -1.0
     action_high: float = 1.0
     recipe: Recipe | None = None  # how its data sets are regenerated; None: they cannot be
-    alike: bool = False  # its agents are alike and see for themselves (problem/homogeneous.py)
+    homogeneous: bool = False  # its agents are homogeneous and see for themselves (problem/homogeneous.py)
 
     @property
     def simulator(self) -> Env | NativeEnv:
@@ -97,7 +97,7 @@ class Task:
 
     def logs(self, store: EpisodeStore) -> EpisodeStore:
         """What is learned from: the store, or every agent's own part of it."""
-        return store.apart() if self.alike and store.n_agents > 1 else store
+        return store.split_agents() if self.homogeneous and store.n_agents > 1 else store
 
     def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
         """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
@@ -116,7 +116,7 @@ class Task:
             tuple(state_names),
             first_rows=first_rows(store),
             keep=constraints.reads(self.hazard, store.n_agents, tuple(names)),
-            alike=self.alike,
+            homogeneous=self.homogeneous,
             dt=store.card.get("dt"),
         )
 
@@ -136,13 +136,13 @@ class Task:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
         return Spec(
             task=self.name,
-            n_agents=1 if self.alike else agents,
+            n_agents=1 if self.homogeneous else agents,
             action_dim=action_dim,
             feature_names=feature_map.names,
             action_low=self.action_low,
             action_high=self.action_high,
             episode_length=episode_length,
-            alike=self.alike,
+            homogeneous=self.homogeneous,
             action_sizes=tuple(action_sizes) if action_sizes else None,
         )
 

@@ -34,7 +34,7 @@ from ringfence.errors import UserError, unknown
 from ringfence.guards import Guarded
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.problem.homogeneous import Each
+from ringfence.problem.homogeneous import agent_policy
 from ringfence.proposals.base import heard
 from ringfence.training import worlds
 from ringfence.training.job import Job
@@ -96,14 +96,9 @@ def export(
     return file
 
 
-def _inner(policy: Policy) -> Policy:
-    """The policy of each, where agents are alike."""
-    return policy.one if isinstance(policy, Each) else policy
-
-
 def _constraints(policy: Policy) -> list[str]:
     """The named ones that a guard's margins follow apart."""
-    inner = _inner(policy)
+    inner = agent_policy(policy)
     return list(inner.guard.danger.limits) if isinstance(inner, Guarded) else []
 
 

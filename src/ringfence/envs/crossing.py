@@ -22,7 +22,7 @@ from ringfence.envs import discs
 from ringfence.envs.base import Defaults
 from ringfence.envs.sight import approaches
 from ringfence.errors import UserError
-from ringfence.problem.features import FeatureMap, solitary
+from ringfence.problem.features import FeatureMap, decentralized
 from ringfence.types import Array, Key, Transition
 
 if TYPE_CHECKING:
@@ -140,7 +140,7 @@ class Crossing(Defaults):
 
     def feature_map(self, view: str) -> FeatureMap:
         """s̃_i: what the agent sees. There is no other view, or work would grow with the square of the team."""
-        return solitary(view, self.observation_names, DT)
+        return decentralized(view, self.observation_names, DT)
 
     def frames(self, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
         """Pictures of an episode (discs.py)."""

@@ -32,7 +32,7 @@ class Shape:
     agents: int | None = None
     observation: int | None = None
     state: int | None = 0  # entries of the global state, 0: it is not asked for
-    alike: bool = False  # any number of agents could play
+    homogeneous: bool = False  # any number of agents could play
 
 
 def check(env: Any, *names: str) -> None:
@@ -83,7 +83,7 @@ class Episode:
         if len(set(map(str, self.agents))) < count:
             raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
         if self.shape.agents not in (None, count):
-            remedy = f"; pass agents={count}" if self.shape.alike else ""
+            remedy = f"; pass agents={count}" if self.shape.homogeneous else ""
             raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}{remedy}.")
 
     @property

@@ -467,7 +467,7 @@ def views(view: str, env: SafeMuJoCo) -> FeatureMap:
 def _body(view: str, names: tuple[str, ...], source: Source, table: np.ndarray, origin: np.ndarray) -> FeatureMap:
     """A map of agents that are limbs of one body, whose entries are those of the source as they are."""
     minus = np.full_like(table, -1)
-    return FeatureMap(view, names, source, table, minus, body=True, joint=True, origin=origin)
+    return FeatureMap(view, names, source, table, minus, shared_body=True, joint=True, origin=origin)
 
 
 def _observed_names(env: SafeMuJoCo) -> tuple[str, ...]:

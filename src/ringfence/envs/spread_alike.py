@@ -18,7 +18,7 @@ from ringfence.envs.base import Defaults
 from ringfence.envs.sight import approaches
 from ringfence.envs.simple_spread import DT, SimpleSpread, SpreadState, in_contact
 from ringfence.errors import UserError
-from ringfence.problem.features import FeatureMap, solitary
+from ringfence.problem.features import FeatureMap, decentralized
 from ringfence.types import Array, Key, Transition
 
 SIGHT = 1.5  # m: in a room of 2 m a side, one thing in six is farther away, so what is not there is nothing new
@@ -70,7 +70,7 @@ class SpreadAlike(Defaults):
 
     def feature_map(self, view: str) -> FeatureMap:
         """s̃_i: what the agent sees. There is no other view."""
-        return solitary(view, self.observation_names, DT)
+        return decentralized(view, self.observation_names, DT)
 
     def reset(self, key: Key, batch: int) -> SpreadState:
         """As Simple Spread's: starts in contact are part of the task."""

@@ -18,7 +18,7 @@ from ringfence.guards.wrap import Callback
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PLAIN, PolicySpec
 from ringfence.problem.constraints import CostColumn
-from ringfence.problem.homogeneous import look
+from ringfence.problem.homogeneous import local_features
 from ringfence.proposals.base import act_with
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
@@ -65,7 +65,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         policy=resolved.team,
         act=jax.jit(act_with),
         task=job.task,
-        shape=Shape(job.team, observation, state or 0, job.task.alike),
+        shape=Shape(job.team, observation, state or 0, job.task.homogeneous),
         episode_length=job.spec.episode_length,
         unsafe=_unsafe_by_formula(job) if job.hazard.has_formula else None,
         about={"step": resolved.step} | evaluate.about(resolved),
@@ -78,7 +78,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
 def _unsafe_by_formula(job: Job) -> Unsafe:
     @jax.jit
     def unsafe(observations, state):
-        found, _ = job.hazard.labels(look(job.feature_map, job.task.alike, observations, state))
+        found, _ = job.hazard.labels(local_features(job.feature_map, job.task.homogeneous, observations, state))
         return found.reshape(len(observations), -1).any(-1)
 
     return lambda observations, state: np.asarray(unsafe(observations, state))
@@ -94,7 +94,7 @@ def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:
         policy=_OneByOne(pilot.policy),
         act=act_with,
         task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
-        shape=Shape(pilot.policy.agents, None, None if world.map.reads_state else 0, spec.alike),
+        shape=Shape(pilot.policy.agents, None, None if world.map.reads_state else 0, spec.homogeneous),
         episode_length=spec.episode_length,
         unsafe=None,
         about={"guard": "own"},

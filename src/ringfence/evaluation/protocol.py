@@ -18,7 +18,7 @@ from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import COUNTED, rollout
 from ringfence.problem import constraints
-from ringfence.problem.homogeneous import look
+from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy
 
 RATES = {"infeasible": "infeasible_rate", "strange": "ood_rate"}  # columns of what is counted in steps
@@ -101,7 +101,7 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
 
     @jax.jit  # one program instead of one for every operation
     def unsafe(states: Array) -> Array:
-        labels, _ = bound.labels(look(view, task.alike, observed(states), states))
+        labels, _ = bound.labels(local_features(view, task.homogeneous, observed(states), states))
         return labels.reshape(len(states), -1).any(-1)
 
     return np.asarray(unsafe(jnp.asarray(states)))

@@ -11,7 +11,7 @@ from ringfence.datasets.task import Task
 from ringfence.evaluation.protocol import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.problem.homogeneous import Each
+from ringfence.problem.homogeneous import PerAgent
 from ringfence.proposals.base import Constant
 from ringfence.training.runs import write_json
 from ringfence.types import Policy
@@ -106,8 +106,8 @@ def _policies(task: Task) -> dict[str, Policy]:
     """Doing nothing, acting at random, and the references of the task's own recipe."""
     spec = task.spec(task.feature_map("pruned"))
     policies: dict[str, Policy] = {"do-nothing": Constant(spec), "random actions": Constant(spec, random=True)}
-    if task.alike:
-        policies = {name: Each(policy, task.simulator.n_agents) for name, policy in policies.items()}
+    if task.homogeneous:
+        policies = {name: PerAgent(policy, task.simulator.n_agents) for name, policy in policies.items()}
     if task.recipe is not None:
         policies |= task.recipe.references(task)
     return policies

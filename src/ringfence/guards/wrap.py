@@ -13,7 +13,7 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.guards.policy import Guarded, Paid, build, costs_of_one
 from ringfence.problem import constraints, normalise
-from ringfence.problem.homogeneous import Each, apart, look, together
+from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, PyTree
 from ringfence.world import World
@@ -33,9 +33,9 @@ class Callback:
         self.function, self.guarded, self.agents = function, guarded, agents
 
     @property
-    def _team(self) -> Guarded | Each:
+    def _team(self) -> Any:
         """Who hears of costs: one guard, or that of each agent."""
-        return Each(self.guarded, self.agents) if self.guarded.guard.world.spec.alike else self.guarded
+        return team_policy(self.guarded, self.agents, self.guarded.guard.world.spec.homogeneous)
 
     def start(self, batch: int) -> PyTree:
         return self._team.start(batch)
@@ -64,10 +64,10 @@ class Callback:
             raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
         action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
         given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
-        present = look(world.map, spec.alike, *given)
-        plan = held(apart(action) if spec.alike else action, self.guarded.guard.options.rows)
+        present = local_features(world.map, spec.homogeneous, *given)
+        plan = held(split_agents(action) if spec.homogeneous else action, self.guarded.guard.options.rows)
         memory, step = _decided(self.guarded, memory, present, plan, key)
-        return memory, together(step, (batch, self.agents)) if spec.alike else step
+        return memory, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
 
 
 class Pilot:
@@ -125,14 +125,14 @@ def guard(
 
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Pilot`, for a team of `agents` where the World is of agents who are alike. `guard` is a name in
+    which gives a `Pilot`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
     GUARDS, `danger` formula, learned or both, `options` fields of GuardOptions; `hazard` is the formula's definition,
     where one is to be used.
     """
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
-    if isinstance(policy, Each):
-        return Each(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
+    if isinstance(policy, PerAgent):
+        return PerAgent(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
     if hasattr(policy, "start") and hasattr(policy, "act"):
         return build(policy, world, hazard, guard, danger, **options)
     if not callable(policy):
@@ -140,9 +140,9 @@ def guard(
             f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
         )
     spec = world.spec
-    if agents is None and spec.alike:
-        raise UserError("The World is of agents who are alike; say with agents= how many of them there are.")
-    if agents not in (None, spec.n_agents) and not spec.alike:
-        raise UserError(f"The World is of {spec.n_agents} agents who are not alike; leave agents={agents} out.")
+    if agents is None and spec.homogeneous:
+        raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
+    if agents not in (None, spec.n_agents) and not spec.homogeneous:
+        raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
     guarded = build(Nothing(), world, hazard, guard, danger, **options)
     return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)

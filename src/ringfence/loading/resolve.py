@@ -17,7 +17,7 @@ from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
-from ringfence.problem.homogeneous import Each
+from ringfence.problem.homogeneous import team_policy
 from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
 from ringfence.proposals.planner import Planner
 from ringfence.training import loop, worlds
@@ -46,7 +46,7 @@ class Resolved:
     @property
     def team(self) -> Policy:
         """The policy as the whole team plays it."""
-        return Each(self.policy, self.job.team) if self.job.task.alike else self.policy
+        return team_policy(self.policy, self.job.team, self.job.task.homogeneous)
 
     @property
     def proposal(self) -> Any:
@@ -72,9 +72,9 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
 
     `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards
     (guards.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
-    agent guards its own action by its own view ("own", the only one of agents who are alike), `world` the World it
-    reads (default: that of the run's data and seed), `agents` how many play, where they are alike. Other options are
-    fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
+    agent guards its own action by its own view ("own", the only one of homogeneous agents), `world` the World it
+    reads (default: that of the run's data and seed), `agents` how many play, where they are homogeneous. Other options
+    are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """
     found = resolve(PolicySpec.of(run, checkpoint=step, planner=planner, **options))
@@ -98,7 +98,7 @@ def resolve(spec: PolicySpec) -> Resolved:
         policy = build(policy, world, job.hazard.hazard, spec.guard, spec.danger, usual, **options)
     spec = spec if plans else spec.without_plans()
     # Homogeneous agents see for themselves anyway.
-    spec = dataclasses.replace(spec, sight=None) if job.task.alike else spec
+    spec = dataclasses.replace(spec, sight=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
 
 
@@ -166,7 +166,7 @@ def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: S
         cost_limit=float(card.get("cost_limit", 1.0)),
         action_low=card["action_low"],
         action_high=card["action_high"],
-        alike=spec.alike,
+        homogeneous=spec.homogeneous,
     )
 
 

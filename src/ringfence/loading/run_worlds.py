@@ -28,8 +28,8 @@ def for_guard(
     """The World that guards a run: the one that is given; else that of its task and seed, whatever the run's own
     training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
     is the one in the run's folder, or has to be given. `read`: what training read, if it is loaded already."""
-    alike = run.config["spec"].get("alike", False)
-    sight = sight or ("own" if alike else "all")
+    homogeneous = run.config["spec"].get("homogeneous", False)
+    sight = sight or ("own" if homogeneous else "all")
     if world is not None:
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, sight)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
-from ringfence.utils import schemas
+from ringfence.utils import schemas, stored
 
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed", "constraints")
@@ -60,7 +60,7 @@ def complete_card(card: dict) -> dict:
     """A card with every field present; unknown fields are kept, for provenance of any kind."""
     if not isinstance(card, dict):
         raise StoreError(f"The card is a {type(card).__name__}; it must be a dictionary of fields.")
-    card = {**DEFAULTS, **card}
+    card = {**DEFAULTS, **stored.card(card)}
     for rule in CARD_RULES:
         rule(card)
     try:
@@ -141,8 +141,8 @@ def _seconds_of_a_step(card: dict) -> None:
 
 
 def _homogeneous(card: dict) -> None:
-    if not isinstance(card.get("alike", False), bool):
-        raise StoreError(f"The card has alike={card['alike']!r}; it must be true or false.")
+    if not isinstance(card.get("homogeneous", False), bool):
+        raise StoreError(f"The card has homogeneous={card['homogeneous']!r}; it must be true or false.")
 
 
 def _hazard(card: dict) -> None:

@@ -35,6 +35,7 @@ from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import digest_of
+from ringfence.utils.renamed import deprecated
 
 FORMAT = 1
 PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
@@ -204,14 +205,14 @@ class EpisodeStore:
     def _shape_of_agents(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
         return self.observations.shape[1:], self.actions.shape[1:]
 
-    def apart(self) -> EpisodeStore:
+    def split_agents(self) -> EpisodeStore:
         """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
         `team` of the card tells how many they were. The global state is nobody's own, so it is left out."""
         n = self.n_agents
         if self.costs.ndim == 1 and n > 1:
             raise StoreError(
-                f"The agents of '{self.card['task']}' are alike and learn from what each of them meets, but its costs "
-                "are the team's; give costs (T, N)."
+                f"The agents of '{self.card['task']}' are homogeneous and learn from what each of them meets, but its "
+                "costs are the team's; give costs (T, N)."
             )
 
         def own(x: np.ndarray) -> np.ndarray:
@@ -237,6 +238,11 @@ class EpisodeStore:
             if self.constraints is None
             else np.moveaxis(self.constraints, 1, 0).reshape(-1, len(self.limits)),
         )
+
+    def apart(self) -> EpisodeStore:
+        """`split_agents`, as 0.1.0 called it."""
+        deprecated("EpisodeStore.apart", "split_agents")
+        return self.split_agents()
 
     # --- making ---
     @classmethod

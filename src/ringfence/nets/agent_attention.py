@@ -41,7 +41,7 @@ class AgentAttention(eqx.Module):
         carried: tuple[int, ...] | None = None,
         agents: int = 0,
     ):
-        """`agents`: their number if they are to be told apart, as limbs of one body are; 0: they are alike."""
+        """`agents`: their number if they are to be told apart, as limbs of one body are; 0: they are homogeneous."""
         keys = jax.random.split(key, depth + 3)
         self.carried = tuple(range(rows * features)) if carried is None else carried
         flat = len(self.carried)

@@ -44,12 +44,12 @@ class FeatureMap:
     reconcile: Callable[[Array], Array] | None = None  # (..., H, N, D): rows after the first follow from own entries
     follows: tuple[int, ...] = ()  # the entries that do, where names tell how
     origin: np.ndarray | None = None  # (N, D) where each entry stands in the global state, if it is one of it as it is
-    body: bool = False  # the agents are limbs of one body: its danger is everybody's
+    shared_body: bool = False  # the agents are limbs of one body: its danger is everybody's
     joint: bool = False  # what comes next depends on everybody's action, which is known
-    solitary: bool = False  # what follows does so from the agent's own movement alone
-    guessing: bool = False  # what comes next depends on what others see and do, which has to be guessed
-    dt: float | None = None  # s, of a solitary map: the step that velocities are predicted by
-    # D weights of the standardised entries that the critic reads; None: all alike
+    decentralized: bool = False  # what follows does so from the agent's own movement alone
+    models_others: bool = False  # what comes next depends on what others see and do, which has to be guessed
+    dt: float | None = None  # s, of a decentralized map: the step that velocities are predicted by
+    # D weights of the standardised entries that the critic reads; None: all the same
     critic_weight: tuple[float, ...] | None = None
 
     def __eq__(self, other: object) -> bool:
@@ -155,7 +155,7 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     return replace(map, own=own, reconcile=_relative(how, map.plus.shape[0]), follows=tuple(how))
 
 
-def coasting(map: FeatureMap, dt: float) -> FeatureMap:
+def constant_velocity(map: FeatureMap, dt: float) -> FeatureMap:
     """A map of agents who know where they are by their speed alone: everything named `goal.dx`, `obstacle0.dx` moves
     by `own.vx` in a step of `dt` seconds, and `other0.dx`, `other0.dvx` as if that other kept its velocity. So what is
     predicted of an agent is its own velocity, whoever the others are and however many; what else is told of things
@@ -179,22 +179,22 @@ def coasting(map: FeatureMap, dt: float) -> FeatureMap:
         map,
         own=own,
         follows=follows,
-        solitary=True,
+        decentralized=True,
         dt=dt,
-        reconcile=_reconcile_coasting(tuple(rules), tuple(sorted(stays)), dt),
+        reconcile=_reconcile_constant_velocity(tuple(rules), tuple(sorted(stays)), dt),
     )
 
 
-def solitary(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
+def decentralized(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
     """s̃ of an agent that has but its own observation, of these names: what it sees and no more, in every view."""
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
     table = np.arange(len(names))[None]  # of a team of one
-    return coasting(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), dt)
+    return constant_velocity(FeatureMap("decentralized", names, "observations", table, np.full_like(table, -1)), dt)
 
 
 @functools.cache
-def _reconcile_coasting(
+def _reconcile_constant_velocity(
     rules: tuple[tuple[int, int, int], ...], stays: tuple[int, ...], dt: float
 ) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities; the
@@ -223,12 +223,12 @@ def alone(map: FeatureMap) -> FeatureMap:
     """The map as one agent has it who hears of nobody: others' entries are predicted like its own, by what it takes
     the others to see and do, and only what stands still follows from its own movement. Bodies are moved by others,
     whose actions it does not know, and guessing them helps no guard there."""
-    if map.solitary:
+    if map.decentralized:
         return map
     rules = derived(map.names, map.plus.shape[0])
     how = {d: rule for d, rule in rules.items() if d in map.follows and rule[1] < 0}  # what stands still
-    guessing = map.plus.shape[0] > 1 and not map.body
-    return following(replace(map, own=None, reconcile=None, follows=(), joint=False, guessing=guessing), how)
+    models_others = map.plus.shape[0] > 1 and not map.shared_body
+    return following(replace(map, own=None, reconcile=None, follows=(), joint=False, models_others=models_others), how)
 
 
 def _relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:
@@ -271,7 +271,7 @@ def from_data(
     state_names: tuple[str, ...],
     first_rows: np.ndarray | None = None,
     keep: Iterable[str] = (),
-    alike: bool = False,
+    homogeneous: bool = False,
     dt: float | None = None,
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
@@ -280,7 +280,7 @@ def from_data(
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
     that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
-    agents who are `alike`, where it is known; else it is what the rows tell.
+    agents who are `homogeneous`, where it is known; else it is what the rows tell.
     """
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
@@ -289,10 +289,10 @@ def from_data(
     plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
     if view == "centralized":
         return plain
-    if alike and not any(f"own.{c}" in plain.names for c in "xyz"):
+    if homogeneous and not any(f"own.{c}" in plain.names for c in "xyz"):
         dt = dt or _step_of(plain, _logged_steps(plain, observations, None, first_rows))
         if dt is not None:
-            return coasting(plain, dt)
+            return constant_velocity(plain, dt)
     return following(plain, _confirmed(plain, _logged_steps(plain, observations, state, first_rows)))
 
 
@@ -469,7 +469,7 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
     if data.get("dt") is not None:
-        return coasting(map, data["dt"])
+        return constant_velocity(map, data["dt"])
     kept = set(data.get("follows", ()))
     rules = derived(map.names, map.plus.shape[0])
     return following(map, {d: rule for d, rule in rules.items() if d in kept})

@@ -1,6 +1,6 @@
 """A team of homogeneous agents that see for themselves is so many teams of one.
 
-What is learned of one of them holds for all. So logs are split into each agent's own (`EpisodeStore.apart`),
+What is learned of one of them holds for all. So logs are split into each agent's own (`EpisodeStore.split_agents`),
 every algorithm, World and guard works on teams of one, and one checkpoint plays any number of agents, at a cost per
 agent that does not grow with the team.
 """
@@ -16,7 +16,7 @@ from ringfence.problem.features import FeatureMap, X
 from ringfence.types import Array, Key, PolicyStep, PyTree
 
 
-class Each(eqx.Module):
+class PerAgent(eqx.Module):
     """A policy of teams of one, played by every agent of a team of `agents`. Nobody hears of anybody."""
 
     one: Any
@@ -27,9 +27,9 @@ class Each(eqx.Module):
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O) -> actions (B, N, A); a flag of one agent is one of its team."""
-        memory, step = self.one.act(memory, apart(observations), None, key)
+        memory, step = self.one.act(memory, split_agents(observations), None, key)
         batch, agents = observations.shape[:2]
-        return memory, together(step, (batch, agents))
+        return memory, merge_agents(step, (batch, agents))
 
     def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
         """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
@@ -45,7 +45,17 @@ class Each(eqx.Module):
         return self.one.hear(memory, own(cost))
 
 
-def together(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
+def team_policy(policy: Any, agents: int, homogeneous: bool) -> Any:
+    """A policy as a team of `agents` plays it: that of one agent by each of them, where they are homogeneous."""
+    return PerAgent(policy, agents) if homogeneous else policy
+
+
+def agent_policy(policy: Any) -> Any:
+    """Inverse of `team_policy`: the policy of one agent, where every agent plays it."""
+    return policy.one if isinstance(policy, PerAgent) else policy
+
+
+def merge_agents(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     """What B N teams of one decided, as B teams of N."""
     info = {k: step.info[k].reshape(shape).any(1) for k in ("infeasible", "strange") if k in step.info}
     if "clearance" in step.info:
@@ -53,14 +63,14 @@ def together(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     return PolicyStep(step.action.reshape(*shape, -1), info)
 
 
-def look(map: FeatureMap, alike: bool, observations: X | None, state: X | None) -> X:
+def local_features(map: FeatureMap, homogeneous: bool, observations: X | None, state: X | None) -> X:
     """Features (B, N, D) of a team, or (B N, 1, D) of homogeneous agents."""
-    if not alike:
+    if not homogeneous:
         return map(observations, state)
     assert observations is not None, "homogeneous agents see for themselves"
-    return map(apart(observations), None)
+    return map(split_agents(observations), None)
 
 
-def apart(x: X) -> X:
+def split_agents(x: X) -> X:
     """Teams (B, N, ...) as teams of one, (B N, 1, ...)."""
     return x.reshape(-1, 1, *x.shape[2:])

@@ -30,7 +30,7 @@ class Job:
     hazard: constraints.BoundHazard
     widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
     world: dict | None = None  # settings of the World that training reads, if it reads one
-    team: int = 1  # agents who play; more than the spec's one of those who are alike
+    team: int = 1  # agents who play; more than the spec's one where they are homogeneous
 
     @property
     def reads_world(self) -> bool:
@@ -95,7 +95,7 @@ def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None
     """How many entries an observation and the global state have (0: there is none, or nobody reads it): the
     simulator's, or the data's."""
     if task.env is not None:
-        return task.env.observation_dim, 0 if task.alike else len(task.env.state_names)
+        return task.env.observation_dim, 0 if task.homogeneous else len(task.env.state_names)
     if store is None:
         return None, None
     return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]

@@ -322,7 +322,7 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
     if (run.path / "config.json").exists():
         older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team")}  # that older runs do not tell
         there = older | run.config
-        there["spec"] = {"alike": False} | there.get("spec", {})
+        there["spec"] = {"homogeneous": False} | there.get("spec", {})
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

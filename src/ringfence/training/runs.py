@@ -49,7 +49,7 @@ class Run:
     def config(self) -> dict:
         """Contents of config.json."""
         remedy = "is no run folder that can be read; give the one that `ringfence train` made, or train it again"
-        return schemas.read(self.path / "config.json", schemas.Config, remedy)
+        return stored.config(schemas.read(self.path / "config.json", schemas.Config, remedy))
 
     @property
     def results(self) -> dict[str, dict[str, Any]]:

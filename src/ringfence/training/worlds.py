@@ -36,12 +36,13 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
 
 def sight_of(task: Task, wanted: str | None = None) -> str:
     """Whether guards see the team ("all") or every agent guards itself ("own"): as wanted; by default the team, but
-    agents who are alike know nothing but what each of them sees."""
-    if task.alike and wanted == "all":
+    homogeneous agents know nothing but what each of them sees."""
+    if task.homogeneous and wanted == "all":
         raise UserError(
-            f"The agents of '{task.name}' are alike and see for themselves, so there is no sight='all'; leave it out."
+            f"The agents of '{task.name}' are homogeneous and see for themselves, so there is no sight='all'; leave it "
+            "out."
         )
-    return wanted or ("own" if task.alike else "all")
+    return wanted or ("own" if task.homogeneous else "all")
 
 
 def usual(task: Task, sight: str) -> dict:

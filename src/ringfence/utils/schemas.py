@@ -43,7 +43,8 @@ class Spec(TypedDict, total=False):
     action_low: float
     action_high: float
     episode_length: Positive
-    alike: bool
+    homogeneous: bool
+    alike: bool  # of 0.1.0: homogeneous
     action_sizes: list[Positive] | None
 
 

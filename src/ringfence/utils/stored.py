@@ -45,6 +45,8 @@ WORLD_SETTINGS = {
     "both_ends": "use_transition",
     "missed": "miscoverage",
 }
+SPEC = {"alike": "homogeneous"}
+CARD = {"alike": "homogeneous"}
 BARRIERS = {"formula": "analytic"}
 EXECUTIONS = {"all": "centralized", "own": "decentralized"}
 PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}
@@ -103,6 +105,24 @@ def guard_options(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def world_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
     return named(stored, WORLD_SETTINGS)
+
+
+def config(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """config.json of a run."""
+    found = dict(stored)
+    if "spec" in found:
+        found["spec"] = spec(found["spec"])
+    return found
+
+
+def spec(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """What a run, a checkpoint or a World knows of its task."""
+    return {SPEC.get(name, name): value for name, value in stored.items()}
+
+
+def card(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """What a store says of itself."""
+    return {CARD.get(name, name): value for name, value in stored.items()}
 
 
 def named(stored: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:

@@ -136,10 +136,10 @@ def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = T
             own=tuple(range(len(names))),
             pairs=(),
             offsets=(),
-            both_ends=map.body if both_ends is None else both_ends,
+            both_ends=map.shared_body if both_ends is None else both_ends,
             groups=1 if map.joint else map.plus.shape[0],
             joint=map.joint,
-            blame="all" if map.body else "worst",
+            blame="all" if map.shared_body else "worst",
         )
     # A pair is the same wherever it is: own entries but the place.
     moving = tuple(d for d, name in enumerate(names) if _own_but_place(name))

@@ -31,10 +31,10 @@ class Dynamics(eqx.Module):
     which reads everybody's action. Otherwise every agent's own entries follow from its own action, and the rest from
     them (`FeatureMap.reconcile`).
 
-    A decentralized agent (`FeatureMap.guessing`) learns from everybody's view and action. It takes the others' from a
-    model of them that reads its own view alone. Without that its own action would tell what it cannot see: agents brake
-    in the logs because another comes, so that braking would predict one, and a push that nobody made would predict
-    none.
+    A decentralized agent (`FeatureMap.models_others`) learns from everybody's view and action. It takes the others'
+    from a model of them that reads its own view alone. Without that its own action would tell what it cannot see:
+    agents brake in the logs because another comes, so that braking would predict one, and a push that nobody made
+    would predict none.
     """
 
     net: MLP  # leaves (E, G, ...)
@@ -186,12 +186,12 @@ def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) 
     team whose entries are named alike, and the one body of robots."""
     n = map.plus.shape[0]
     entries = len(map.names)
-    read = n * (entries + action) if map.guessing else entries + (n if map.joint else 1) * action
+    read = n * (entries + action) if map.models_others else entries + (n if map.joint else 1) * action
     groups = 1 if map.joint or map.follows else n
     sizes = (read, width, width, len(_foreseen(map)))
     keys = jax.random.split(key, members)
     nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(keys)
-    if not map.guessing:
+    if not map.models_others:
         return nets, None
     keys = jax.random.split(jax.random.fold_in(key, 1), members)
     sizes = (entries, width, width, read - entries - action)

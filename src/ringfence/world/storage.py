@@ -15,7 +15,7 @@ from safetensors.numpy import save_file
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
-from ringfence.utils import schemas
+from ringfence.utils import schemas, stored
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
@@ -80,7 +80,7 @@ def _read(path: Path, map_of: MapOf) -> World:
     with safe_open(path, "numpy") as file:
         about = schemas.decode((file.metadata() or {})["ringfence_world"], schemas.World)
     card = Card.from_json(about["card"])
-    spec = Spec.of(dict(about["spec"]))
+    spec = Spec.of(stored.spec(about["spec"]))
     settings = card.settings
     map = map_of(spec.task, settings.view, card.data.hazard) or features.from_dict(dict(about["map"]))
     if settings.sight == "own":

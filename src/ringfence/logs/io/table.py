@@ -88,7 +88,7 @@ def read_table(
     Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
     `team` of them is there (by default of the size with most rows), or with `neighbours`=k the whole track of one
-    agent, who sees the k nearest others within `sight` m; such agents are alike, and a policy plays any number of
+    agent, who sees the k nearest others within `sight` m; such agents are homogeneous, and a policy plays any number of
     them. Episodes have `shortest` to `longest` steps. `fastest` m/s is more than anything there can do.
 
     The card's warnings say what was taken for what, and what was left out, after the `notes` of whoever read the
@@ -199,7 +199,7 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
 
     `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
     `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
-    are alike, any number in any order.
+    are homogeneous, any number in any order.
     """
     names = card.get("observation_names") or ()
     columns = {name: np.asarray(x, np.float64) for name, x in state.items()}
@@ -213,7 +213,7 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
     near = others(n)
     there = np.ones((n, slots), bool)
     reach = float(card.get("sight", np.inf))
-    if card.get("alike"):
+    if card.get("homogeneous"):
         zero = np.zeros(n, int)
         place = np.stack([columns[c] for c in axes], 1)
         now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, card.get("dt", 1.0))
@@ -579,7 +579,14 @@ def _own(made: _Made, moving: np.ndarray, with_place: bool) -> tuple[list[str], 
 
 
 def _steps(
-    made: _Made, arrays: dict, acts: np.ndarray, earned: bool, named: Sequence[str], danger, alike: bool, card: dict
+    made: _Made,
+    arrays: dict,
+    acts: np.ndarray,
+    earned: bool,
+    named: Sequence[str],
+    danger,
+    homogeneous: bool,
+    card: dict,
 ) -> dict[str, Any]:
     t, rows, many = made.tracks, arrays["rows"], arrays["many"]
     last = np.cumsum(many) - 1
@@ -597,7 +604,7 @@ def _steps(
         if cost.any():
             made.notes.append("all agents have the same costs: they are taken for the team's")
         cost = cost[:, 0]
-    elif n == 1 and not alike:
+    elif n == 1 and not homogeneous:
         cost = cost[:, 0]
     cost = dict(zip(named, np.moveaxis(cost, -1, 0))) if len(named) > 1 else cost[..., 0]
     acts = acts[steps]
@@ -611,7 +618,7 @@ def _steps(
         "action_low": -bound,
         "action_high": bound,
     }
-    told |= {"alike": True, "sight": arrays["sight"]} if alike else {}
+    told |= {"homogeneous": True, "sight": arrays["sight"]} if homogeneous else {}
     return {
         "observations": arrays["seen"][steps],
         "actions": acts,
