@@ -6,9 +6,9 @@ D feature, A action, K diffusion steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -47,9 +47,10 @@ class Spec:
     action_sizes: tuple[int, ...] | None = None  # entries that each agent's action has, where not all have action_dim
 
     @classmethod
-    def of(cls, told: dict[str, Any]) -> Spec:
+    def of(cls, stored: Mapping[str, Any]) -> Spec:
         """What `told` gave."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in told.items()})
+        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
+        return cls(**values)
 
     def told(self) -> dict[str, Any]:
         """As JSON holds it; what is the same for nearly all data is left out."""
@@ -85,6 +86,7 @@ class PolicyStep(NamedTuple):
     info: dict[str, Array]  # e.g. `clearance`, `infeasible` (B,), `plans` (B, P, H, N, D), `chosen` (B,)
 
 
+@runtime_checkable
 class Policy(Protocol):
     """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
 
@@ -96,6 +98,22 @@ class Policy(Protocol):
     def start(self, batch: int) -> PyTree: ...
 
     def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]: ...
+
+
+@runtime_checkable
+class ObservesCost(Protocol):
+    """A policy that is told what every step cost, (B,) or (B, N), or that by constraint, and remembers it."""
+
+    def hear(self, memory: PyTree, cost: Any) -> PyTree: ...
+
+
+@runtime_checkable
+class Proposes(Policy, Protocol):
+    """A policy that knows several steps ahead: (memory, actions (B, P, K, N, A) in [−1, 1], info)."""
+
+    def propose(
+        self, memory: PyTree, observations: Array, state: Any, key: Key, count: int, rows: int, world: Any
+    ) -> tuple[PyTree, Array, dict[str, Array]]: ...
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             error = ((proposed(p["actor"], t.x, noised.x, noised.k) - t.action) ** 2).sum(-1)
             losses["loss/actor"] = (weight * error).mean(0).sum()
             more = {"feasible": feasible.mean(), "weight": weight.mean(), "error": error.mean()}
-            return sum(losses.values()), losses | more
+            return sum(losses.values(), jnp.zeros(())), losses | more
 
         grads, metrics = jax.grad(loss, has_aux=True)(state["params"])
         params, moments, norms = opt.update(grads, state["opt"], state["params"])

@@ -285,12 +285,14 @@ def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndar
     """(H, D) bool: entries of a window that the denoiser reads and writes; the present is always read whole."""
     rows, d = config.history + config.horizon, len(feature_map.names)
     carried = np.ones((rows, d), bool)
-    if carries_own(config, feature_map):
+    if carries_own(config, feature_map) and feature_map.own is not None:
         carried[config.history + 1 :] = np.isin(np.arange(d), feature_map.own)
     return carried
 
 
-def denoising(params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: Array, carried: Array):
+def denoising(
+    params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: np.ndarray, carried: np.ndarray
+) -> tuple[Array, tuple[Array, diffusion.Noised, Array]]:
     """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted."""
     k1, k2, k3 = jax.random.split(key, 3)
     mask = diffusion.known_entries(

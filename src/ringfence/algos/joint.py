@@ -55,7 +55,7 @@ def hinges(
     safe: Array,
     valid: Array,
     retention: Retention,
-    eta: Array,
+    eta: Array | float,
     delta: float,
     scaled_margin: bool,
     weight: Array | float = 1.0,

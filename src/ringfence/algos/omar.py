@@ -103,11 +103,13 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
     def value(actions: Array) -> Array:
         return jnp.moveaxis(first(x, actions)[:, 0], 0, 1)  # (B, N, S)
 
-    mean, deviation, elites = jnp.zeros(own.shape), jnp.full(own.shape, config.search_deviation), None
+    mean = jnp.zeros(own.shape)
+    deviation = jnp.full(own.shape, config.search_deviation)
+    elites = actions = mean[:, :, None][:, :, :0]
+    q = actions[..., 0]
     for i in range(config.search_iterations):
         actions = jnp.clip(mean[:, :, None] + deviation[:, :, None] * noise[:, :, i], -1.0, 1.0)
-        if elites is not None:
-            actions = jnp.concatenate([actions, elites], 2)
+        actions = jnp.concatenate([actions, elites], 2)
         q = value(actions)
         if config.search == "softmax":
             mean = (jax.nn.softmax(q, -1)[..., None] * actions).sum(2)
@@ -116,7 +118,8 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
         else:
             best = jax.lax.top_k(q, config.elites)[1]
             elites = jnp.take_along_axis(actions, best[..., None], 2)
-            mean, deviation = elites.mean(2), elites.std(2, ddof=1)
+            mean = elites.mean(2)
+            deviation = elites.std(2, ddof=1)
     top = jnp.take_along_axis(actions, q.argmax(-1)[..., None, None], 2)[:, :, 0]
     rival = value(own[:, :, None])[..., 0]
     return jnp.where((q.max(-1) > rival)[..., None], top, own)
@@ -162,17 +165,23 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             loss = error + config.cql_weight * conservative
             return loss, {"loss/critic": error, "loss/conservative": conservative, "value": logged.mean()}
 
-        slope = lambda *part: jax.grad(critic_loss, has_aux=True)(params["critic"], *part)  # noqa: E731
+        def slope(*part: Array) -> tuple[PyTree, Metrics]:
+            return jax.grad(critic_loss, has_aux=True)(params["critic"], *part)
+
         parts = ac.in_pieces(slope, pieces, t.x, asked, goal.T, densities)
         grads, metrics = jax.tree.map(lambda g: g.mean(0), parts)
         critics, moments, norms = opt.update({"critic": grads}, state["opt"], {"critic": params["critic"]})
-        critic, searched = critics["critic"], None
+        critic = critics["critic"]
+        searched = t.action  # what nothing reads without a search
         if config.coefficient > 0:
             own = ac.act(params["actor"], t.x)
             # Agents learn apart, so they may share the random numbers, which cost as much as the search itself.
             noise = jax.random.normal(ks, (b, 1, config.search_iterations, config.search_samples, a))
-            look = lambda *part: rectified(critic, *part, config, spec)  # noqa: E731
-            searched = ac.in_pieces(look, pieces, t.x, own, noise).reshape(own.shape)
+
+            def search(x: Array, own: Array, noise: Array) -> Array:
+                return rectified(critic, x, own, noise, config, spec)
+
+            searched = ac.in_pieces(search, pieces, t.x, own, noise).reshape(own.shape)
 
         def actor_loss(actor) -> tuple[Array, Metrics]:
             logits = actor(t.x)

@@ -86,11 +86,13 @@ def init(
 def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None) -> WindowData:
     """Windows with their scores."""
     store = bc.within(store, config)
-    seen, values = None, None
-    if config.condition == "advantage":
-        seen, values = jnp.asarray(feature_map(store.observations, store.state), jnp.float32), world.values
-    y = conditions.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
-    return WindowData(store, feature_map, y)
+    seen = None
+    values = None
+    if config.condition == "advantage" and world is not None:
+        seen = jnp.asarray(feature_map(store.observations, store.state), jnp.float32)
+        values = world.values
+    scores = conditions.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
+    return WindowData(store, feature_map, scores)
 
 
 def needs(config: Config) -> dict | None:

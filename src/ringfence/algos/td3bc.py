@@ -134,7 +134,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
                 later = jax.nn.relu(target["cost"](*there).max(1))
                 cost = batch.costs[:, 1][None] + config.discount * t.bootstrap.T * later
                 metrics["loss/cost"] = ((p["cost"](*here) - cost[:, None]) ** 2).mean(2).sum()
-            return sum(metrics.values()), metrics
+            return sum(metrics.values(), jnp.zeros(())), metrics
 
         critics = {k: v for k, v in params.items() if k != "actor"}
         grads, metrics = jax.grad(critic_loss, has_aux=True)(critics)

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Column, Table
+from rich.text import Text
 
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
-from ringfence.cli.console import complain
+from ringfence.cli.console import Refusals, complain
 from ringfence.cli.doctor import doctor
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
 from ringfence.cli.renamed import rewritten
@@ -21,6 +23,10 @@ from ringfence.errors import UserError, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
+
+if TYPE_CHECKING:
+    from ringfence.logs.store import EpisodeStore
+    from ringfence.training.runs import Run
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
@@ -115,7 +121,8 @@ def fit(
 
     report = None if report is None else writable(report)
     store = _store(data)
-    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **assignments(set))
+    settings: dict[str, Any] = dict(assignments(set))
+    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **settings)
     out.print(str(made.card), soft_wrap=True, markup=False)
     if out_file is not None:
         print(world.save(made, out_file))
@@ -148,6 +155,15 @@ def evaluate(
     from ringfence.evaluation.evaluate import evaluate as run_evaluation
 
     given = playing.arguments()
+    found = _some_runs(runs)
+    if video:
+        from ringfence.loading.resolve import load_job
+        from ringfence.report.video import check
+
+        for run in {run.config["task"]: run for run in found}.values():
+            check(load_job(run).task)
+        num_recorded = num_recorded or 1
+    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "step": step, "quiet": False}
     names = (
         "run",
         "variant",
@@ -159,49 +175,44 @@ def evaluate(
         "cost norm",
     )
     table = Table(*names, "ended early")
-    if not runs:
-        raise UserError("No run was given; name run folders that `ringfence train` made.")
-    found = _runs(runs)
-    if video:
-        from ringfence.loading.resolve import load_job
-        from ringfence.report.video import check, film
-
-        for run in {run.config["task"]: run for run in found}.values():
-            check(load_job(run).task)
-        num_recorded = num_recorded or 1
-    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "step": step, "quiet": False}
-    refused: dict[str, list] = {}  # what several runs are refused for is said once
+    refusals = Refusals()
     for run in found:
-        try:
-            r = run_evaluation(run, **given)
-        except UserError as error:
-            refused.setdefault(str(error), []).append(run)
-            continue
-        if video:
-            try:
-                print(film(run, r["variant"]))
-            except UserError as error:
-                refused.setdefault(str(error), []).append(run)
-        table.add_row(
-            terminal(run.path),
-            terminal(r["variant"]),
-            f"{r['return_mean']:.1f}",
-            f"{r['cost_mean']:.3f}",
-            f"{r['cost_safe_start']:.3f}",
-            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
-            f"{r['return_norm']:.3f}" if _of_usual_size(r) else "–",  # constants are those of the logs' team
-            f"{r['cost_norm']:.3f}",
-            f"{100 * r['termination_rate']:.0f} %",
-        )
-    _told(table, refused, len(found))
+        with refusals.of(run):
+            result = run_evaluation(run, **given)
+            table.add_row(*_evaluated(run, result))
+            if video:
+                print(_film(run, result["variant"]))
+    _say(table, refusals, len(found))
 
 
-def _of_usual_size(r: dict) -> bool:
+def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
+    """A result's row of the table."""
+    return [
+        terminal(run.path),
+        terminal(result["variant"]),
+        f"{result['return_mean']:.1f}",
+        f"{result['cost_mean']:.3f}",
+        f"{result['cost_safe_start']:.3f}",
+        f"{result['violation_rate']:.3f} (≤ {result['violation_upper']:.3f})",
+        # Constants are those of the logs' team.
+        f"{result['return_norm']:.3f}" if _of_usual_size(result) else "–",
+        f"{result['cost_norm']:.3f}",
+        f"{100 * result['termination_rate']:.0f} %",
+    ]
+
+
+def _film(run: Run, variant: str) -> Path:
+    from ringfence.report.video import film
+
+    return film(run, variant)
+
+
+def _of_usual_size(result: dict[str, Any]) -> bool:
     """Whether as many agents played as a task's constants are of."""
     from ringfence.datasets.registry import TASKS
 
-    task = TASKS.get(r["task"])
-    return task is None or r["agents"] == task.env.n_agents
+    task = TASKS.get(result["task"])
+    return task is None or result["agents"] == task.simulator.n_agents
 
 
 def play(
@@ -225,40 +236,43 @@ def play(
     from ringfence.evaluation.simulators import simulator
 
     given = playing.arguments()
-    if not runs:
-        raise UserError("No run was given; name run folders that `ringfence train` made.")
-    found, make = _runs(runs), simulator(env)
-    table, refused = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible"), {}
+    found = _some_runs(runs)
+    make = simulator(env)
     given |= {"episodes": episodes, "split": split, "at_once": at_once, "keep": True, "quiet": False}
+    table = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    refusals = Refusals()
     for run in found:
-        try:
-            r = run_play(run, make, **given)
-        except UserError as error:
-            refused.setdefault(str(error), []).append(run)
-            continue
-        each = [
-            f"{terminal(name)} {c['cost_mean']:.3f}" + (f" of {c['limit']:g}" if "limit" in c else "")
-            for name, c in r.get("constraints", {}).items()
-        ]
-        table.add_row(
-            terminal(run.path),
-            r["guard"],
-            f"{r['return_mean']:.4g} ({r['return_interval'][0]:.4g} to {r['return_interval'][1]:.4g})",
-            "\n".join([f"{r['cost_mean']:.3f}", *each]),
-            f"{r['violation_rate']:.3f} (≤ {r['violation_upper']:.3f})",
-            f"{100 * r['infeasible_rate']:.2g} %" if "infeasible_rate" in r else "",
-        )
-    _told(table, refused, len(found))
+        with refusals.of(run):
+            table.add_row(*_played(run, run_play(run, make, **given)))
+    _say(table, refusals, len(found))
 
 
-def _told(table: Table, refused: dict[str, list], many: int) -> None:
+def _played(run: Run, result: dict[str, Any]) -> list[Text | str]:
+    """A result's row of the table."""
+    low, high = result["return_interval"]
+    costs = [f"{result['cost_mean']:.3f}"]
+    for name, cost in result.get("constraints", {}).items():
+        limit = f" of {cost['limit']:g}" if "limit" in cost else ""
+        costs.append(f"{terminal(name)} {cost['cost_mean']:.3f}{limit}")
+    return [
+        terminal(run.path),
+        result["guard"],
+        f"{result['return_mean']:.4g} ({low:.4g} to {high:.4g})",
+        "\n".join(costs),
+        f"{result['violation_rate']:.3f} (≤ {result['violation_upper']:.3f})",
+        f"{100 * result['infeasible_rate']:.2g} %" if "infeasible_rate" in result else "",
+    ]
+
+
+def _say(table: Table, refusals: Refusals, runs: int) -> None:
     """What was measured, and what runs were refused for; the process ends where any was."""
     if table.row_count:
         out.print(table)
-    for message, those in refused.items():
-        unsaid = [str(run.path) for run in those if str(run.path) not in message]
-        complain(", ".join(unsaid) + ": " * bool(unsaid) + message if many > 1 else message)
-    if refused:
+    for message, refused in refusals.runs.items():
+        unsaid = [str(run.path) for run in refused if str(run.path) not in message]
+        whose = ", ".join(unsaid) + ": " if unsaid else ""
+        complain(whose + message if runs > 1 else message)
+    if refusals.runs:
         sys.exit(2)
 
 
@@ -397,7 +411,7 @@ def main(arguments: list[str] | None = None) -> None:
     arguments = rewritten(sys.argv[1:] if arguments is None else arguments)
     interrupts.listen()
     for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others
-        if hasattr(stream, "reconfigure"):
+        if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
         if arguments[:1] == ["data"]:
@@ -447,7 +461,8 @@ def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
     build_config(a.Config, changes, a.name)
 
 
-def _store(data: str):
+def _store(data: str) -> EpisodeStore:
+    """A store's file, or the data set of a task."""
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
     from ringfence.logs.store import EpisodeStore
@@ -457,7 +472,14 @@ def _store(data: str):
     return make(registry.get(data), must_keep=False)[0]
 
 
-def _runs(paths: list[Path]) -> list:
+def _some_runs(paths: list[Path]) -> list[Run]:
+    if not paths:
+        raise UserError("No run was given; name run folders that `ringfence train` made.")
+    return _runs(paths)
+
+
+def _runs(paths: list[Path]) -> list[Run]:
+    """The runs in folders, or in folders of them."""
     from ringfence.training.runs import Run
 
     found = []

@@ -2,10 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
 from rich.console import Console
 from rich.markup import escape
+
+from ringfence.errors import UserError
+
+if TYPE_CHECKING:
+    from ringfence.training.runs import Run
 
 
 def complain(message: str) -> None:
     """Say on stderr what is wrong."""
     Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+@dataclass
+class Refusals:
+    """Why runs were refused, so that what several are refused for is said once."""
+
+    runs: dict[str, list[Run]] = field(default_factory=dict)  # by message
+
+    @contextmanager
+    def of(self, run: Run) -> Iterator[None]:
+        """Note down a refusal of this run and go on."""
+        try:
+            yield
+        except UserError as error:
+            self.runs.setdefault(str(error), []).append(run)

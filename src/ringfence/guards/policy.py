@@ -18,7 +18,7 @@ from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.problem import constraints, normalise
 from ringfence.proposals.base import held
-from ringfence.types import Array, Key, PolicyStep, PyTree
+from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
 from ringfence.world import World
 from ringfence.world.card import Avoidable
@@ -130,7 +130,7 @@ class Guarded(eqx.Module):
         """(memory, actions (B, P, K, N, A) in [−1, 1], info) of the proposal."""
         world = self.guard.world
         options = self.guard.options
-        if hasattr(self.proposal, "propose"):
+        if isinstance(self.proposal, Proposes):
             return self.proposal.propose(inner, observations, state, key, options.plans, options.rows, world)
         memory, step = self.proposal.act(inner, observations, state, key)
         action = normalise.to_unit(step.action, world.spec.action_low, world.spec.action_high)

@@ -15,7 +15,7 @@ from ringfence.guards.policy import Guarded, Paid, build, costs_of_one
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
 from ringfence.proposals.base import held
-from ringfence.types import Array, Key, PolicyStep, PyTree
+from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.world import World
 
 
@@ -133,7 +133,7 @@ def guard(
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
     if isinstance(policy, PerAgent):
         return PerAgent(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
-    if hasattr(policy, "start") and hasattr(policy, "act"):
+    if isinstance(policy, Policy):
         return build(policy, world, hazard, guard, danger, **options)
     if not callable(policy):
         raise UserError(

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.problem.features import FeatureMap, X
-from ringfence.types import Array, Key, PolicyStep, PyTree
+from ringfence.types import Array, Key, ObservesCost, PolicyStep, PyTree
 
 
 class PerAgent(eqx.Module):
@@ -33,7 +33,7 @@ class PerAgent(eqx.Module):
 
     def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
         """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
-        if not hasattr(self.one, "hear"):
+        if not isinstance(self.one, ObservesCost):
             return memory
 
         def own(cost: Array) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from ringfence.problem import normalise
 from ringfence.problem.features import FeatureMap, translation
 from ringfence.problem.normalise import Normaliser
-from ringfence.types import Array, Key, Policy, PolicyStep, PyTree, Spec
+from ringfence.types import Array, Key, ObservesCost, Policy, PolicyStep, PyTree, Spec
 from ringfence.world import World
 
 
@@ -84,11 +84,12 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
     return jnp.stack(actions, 1)[:, None]
 
 
-def heard(policy: Policy, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
-    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint."""
-    return policy.hear(memory, cost) if hasattr(policy, "hear") else memory
+def heard(policy: Policy, memory: PyTree, cost: Any) -> PyTree:
+    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
+    of NumPy or JAX."""
+    return policy.hear(memory, cost) if isinstance(policy, ObservesCost) else memory
 
 
-def act_with(policy: Policy, memory: PyTree, observations: Array, state: Array | None, key: Key):
+def act_with(policy: Policy, memory: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
     """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
     return policy.act(memory, observations, state, key)

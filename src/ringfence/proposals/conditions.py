@@ -23,6 +23,8 @@ def scores_of(
     starts = np.concatenate([[0], store.episode_ends[:-1]])
     step, team = np.arange(store.steps), store.rewards.mean(1)
     if condition == "advantage":
+        if values is None:
+            raise ValueError("an advantage needs the values of a World")
         row, last = step + episode, store.episode_ends[episode] + episode
         value = values_of(values.critic, features)
         return normal_scores(advantages(value, team, row, last, horizon, discount))

@@ -47,7 +47,7 @@ def known_entries(visible: Array, history: int, rows: int) -> Array:
     return (known[None, :, None] & visible[:, None, :])[..., None]
 
 
-def add_noise(x0: Array, mask: Array, alpha_bar: Array, key: Key) -> Noised:
+def add_noise(x0: Array, mask: Array, alpha_bar: Array | np.ndarray, key: Key) -> Noised:
     """Noise plans (B, ...) to random steps; `mask` is true on in-painted entries, which stay clean."""
     k1, k2 = jax.random.split(key)
     k = jax.random.randint(k1, (x0.shape[0],), 0, alpha_bar.shape[0])
@@ -89,7 +89,9 @@ def denoising_loss(
     return (error * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
-def guided(net: Callable, alpha_bar: Array, y: Array, guidance: float, prediction: Prediction, clip: float) -> Predict:
+def guided(
+    net: Callable, alpha_bar: Array | np.ndarray, y: Array, guidance: float, prediction: Prediction, clip: float
+) -> Predict:
     """Classifier-free guidance as one batched call: out(∅) + ω (out(y) − out(∅)); ω = 1 skips the second half."""
 
     def predict(x: Array, k: Array) -> Array:
@@ -202,6 +204,6 @@ def _multistep_ratio(bar: np.ndarray) -> np.ndarray:
     return ratio
 
 
-def _levels(alpha_bar: Array, k: Array, ndim: int) -> tuple[Array, Array]:
+def _levels(alpha_bar: Array | np.ndarray, k: Array, ndim: int) -> tuple[Array, Array]:
     bar = jnp.asarray(alpha_bar, jnp.float32)[k].reshape(-1, *[1] * (ndim - 1))
     return jnp.sqrt(bar), jnp.sqrt(1.0 - bar)

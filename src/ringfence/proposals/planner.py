@@ -27,7 +27,7 @@ from ringfence.proposals.base import from_unit
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
-from ringfence.world.values import plan_value
+from ringfence.world.values import Critic, plan_value
 
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
@@ -37,11 +37,11 @@ class Planner(eqx.Module):
 
     networks: dict[str, Any]  # denoiser, inverse
     normaliser: Normaliser
-    critic: dict[str, Any]  # what states are worth
+    critic: Critic  # what states are worth
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
     horizon: int = eqx.field(static=True)
     history: int = eqx.field(static=True)
-    prediction: str = eqx.field(static=True)
+    prediction: diffusion.Prediction = eqx.field(static=True)
     clip: float = eqx.field(static=True)
     discount: float = eqx.field(static=True)
     observe: str = eqx.field(static=True)  # whose present was known in training

@@ -51,7 +51,7 @@ class Retention:
             return self.m * np.arange(len(alpha_bar)) / (len(alpha_bar) - 1)
         return self.m * (1.0 - alpha_bar)
 
-    def decay(self, h: Array, eta: Array) -> Array:
+    def decay(self, h: Array, eta: Array | float) -> Array:
         """α_k(h) · h: the least value that h(s̃_{t+1}) may take; `eta` broadcasts against h."""
         kept = (self.m - eta) * h
         if not self.two_sided or self.m == 0.0:

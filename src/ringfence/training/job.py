@@ -71,9 +71,10 @@ def make_job(
     preset = preset or a.preset_for(task.presets)
     if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
-    own = task.env is None and store is not None and a.limit is not None and "cost_limit" in store.card
-    told = {a.limit: float(store.card["cost_limit"])} if own else {}
-    config = build_config(a.Config, {**a.presets[preset], **told, **changes}, a.name)
+    limits: dict[str, float] = {}
+    if task.env is None and store is not None and a.limit is not None and "cost_limit" in store.card:
+        limits[a.limit] = float(store.card["cost_limit"])
+    config = build_config(a.Config, {**a.presets[preset], **limits, **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
     reads = a.reads(config)
@@ -81,14 +82,15 @@ def make_job(
     a.check(config, hazard)
     if store is not None and reads != "nothing" and not store.costs.any():
         _refuse_blank_costs(a.name, task, store, reads)
-    told, wanted = None, a.needs(config)
+    settings = None
+    wanted = a.needs(config)
     if wanted is not None and store is not None:
-        told = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
+        settings = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
     elif world:
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
     team = spec.n_agents if store is None else store.card.get("team", store.n_agents)
     team = team if task.env is None else task.env.n_agents
-    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), told, team)
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), settings, team)
 
 
 def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:

@@ -10,10 +10,11 @@ import json
 import operator
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,13 +28,15 @@ from ringfence.logs.windows import WindowData, draw
 from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import Run, write_json
-from ringfence.types import PyTree
+from ringfence.types import Array, Key, Metrics, PyTree
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
 from ringfence.utils.progress import Progress
 from ringfence.world import World
 from ringfence.world import save as save_world
+
+Arrays = dict[str, Array]
 
 
 def train(
@@ -168,130 +171,194 @@ class _Options:
     on_chunk: Callable[[int, dict], None] | None
 
 
-def make_program(job: Job):
-    """(advance, diagnose): compiled functions over a leading axis of seeds.
+class Program(NamedTuple):
+    """Compiled functions over a leading axis of seeds."""
 
-    advance(state, keys, arrays, scores, count) makes `count` updates, a traced number, so that one compilation serves
-    every chunk length; it returns the new state and the chunk's mean metrics.
-    """
+    # (state, keys, arrays, scores, count) -> the state after `count` updates and their mean metrics; the count is
+    # traced, so that one compilation serves every chunk length
+    advance: Callable[..., tuple[PyTree, Metrics]]
+    diagnose: Callable[..., Metrics]  # (state, keys, arrays, scores) -> metrics
+
+
+def make_program(job: Job) -> Program:
+    """What trains a job."""
     config = job.config
     update = job.algorithm.make_update(config, job.spec, job.feature_map, job.hazard)
     look = job.algorithm.make_diagnose(config, job.spec, job.feature_map, job.hazard)
 
-    def one(state: PyTree, root, arrays, scores):
+    def one(state: PyTree, root: Key, arrays: Arrays, scores: Array) -> tuple[PyTree, Metrics]:
         arrays = arrays | {"scores": scores}
-        key = jax.random.fold_in(root, state["step"])
-        kd, ku = jax.random.split(key)
-        return update(state, draw(arrays, kd, config.batch, config.horizon, config.history), ku)
+        draw_key, update_key = jax.random.split(jax.random.fold_in(root, state["step"]))
+        batch = draw(arrays, draw_key, config.batch, config.horizon, config.history)
+        return update(state, batch, update_key)
 
-    def advance(state, roots, arrays, scores, count):
+    def advance(state: PyTree, roots: Key, arrays: Arrays, scores: Array, count: int) -> tuple[PyTree, Metrics]:
         # No vmap of one seed: its matrix products would be batched ones, which are slower; and no axis of one within
         # the loop, for which the compiler would copy the whole state at every update.
         alone = roots.shape[0] == 1
-        several, known = (one, roots[0]) if alone else (jax.vmap(one, in_axes=(0, 0, None, 0)), roots)
-        scores = scores[0] if alone else scores
-        state = jax.tree.map(lambda x: x[0], state) if alone else state
-        shapes = jax.eval_shape(several, state, known, arrays, scores)[1]
+        if alone:
+            state = jax.tree.map(lambda x: x[0], state)
+            roots = roots[0]
+            scores = scores[0]
+        several = one if alone else jax.vmap(one, in_axes=(0, 0, None, 0))
+        shapes = jax.eval_shape(several, state, roots, arrays, scores)[1]
         zeros = jax.tree.map(lambda s: jnp.zeros(s.shape, jnp.float32), shapes)
 
-        def body(_, carry):
+        def body(_: Array, carry: tuple[PyTree, Metrics]) -> tuple[PyTree, Metrics]:
             state, total = carry
-            state, metrics = several(state, known, arrays, scores)
+            state, metrics = several(state, roots, arrays, scores)
             return state, jax.tree.map(jnp.add, total, metrics)
 
         state, total = jax.lax.fori_loop(0, count, body, (state, zeros))
         means = jax.tree.map(lambda x: x / jnp.maximum(count, 1), total)
         return jax.tree.map(lambda x: x[None], (state, means)) if alone else (state, means)
 
-    def diagnose(state, roots, arrays, scores):
-        def of(state, root, scores):
-            kd, ku = jax.random.split(jax.random.fold_in(root, state["step"]))
-            return look(state, draw(arrays | {"scores": scores}, kd, config.batch, config.horizon, config.history), ku)
+    def diagnose(state: PyTree, roots: Key, arrays: Arrays, scores: Array) -> Metrics:
+        def of(state: PyTree, root: Key, scores: Array) -> Metrics:
+            draw_key, key = jax.random.split(jax.random.fold_in(root, state["step"]))
+            batch = draw(arrays | {"scores": scores}, draw_key, config.batch, config.horizon, config.history)
+            return look(state, batch, key)
 
         return jax.vmap(of)(state, roots, scores)
 
-    return jax.jit(advance, donate_argnums=0), jax.jit(diagnose)
+    return Program(jax.jit(advance, donate_argnums=0), jax.jit(diagnose))
 
 
-def _loop(job: Job, lessons: _Lessons, runs: list[Run], seeds, options: _Options, program=None):
+def _loop(
+    job: Job,
+    lessons: _Lessons,
+    runs: list[Run],
+    seeds: Sequence[int],
+    options: _Options,
+    program: Program | None = None,
+) -> Program:
     """Train runs that nobody else trains at this time, in one program."""
     with ExitStack() as locks:
         for run in runs:
             locks.enter_context(owned(run.path, f"Another process trains '{run.path}'; wait for it or stop it."))
-        return _advance(job, lessons, runs, seeds, options, program)
-
-
-def _advance(job: Job, lessons: _Lessons, runs: list[Run], seeds, options: _Options, program):
-    program = program or make_program(job)
-    advance, diagnose = program
-    roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
-    starts, states, conditions = [], [], []
-    for run, seed, root in zip(runs, seeds, roots):
-        world, windows = lessons.of(seed)
-        told = {} if world is None else {"world": world}
-        key = jax.random.fold_in(root, 2**31 - 1)
-        state = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **told)
-        if world is not None and not (run.path / worlds.WORLD).exists():
-            save_world(world, run.path / worlds.WORLD)
-        if run.checkpoints():
-            state = state | run.load_checkpoint(learned(state))[1]
-        starts.append(int(state["step"]))
-        states.append(state)
-        conditions.append(windows.arrays["scores"])
-    if len(set(starts)) > 1:
-        raise CheckpointError(
-            f"The runs stand at different steps ({sorted(set(starts))}), so they cannot go on in one program; "
-            "resume them one by one."
-        )
-    step, steps = starts[0], job.config.steps
-    state = jax.tree.map(lambda *x: jnp.stack(x), *states)
-    # Conditions differ between seeds, whose Worlds do; all else of the data is theirs together.
-    arrays = {k: v for k, v in windows.arrays.items() if k != "scores"}
-    conditions = jnp.stack(conditions)
-    for run in runs:
-        _trim_metrics(run, step)
-    writers = [_summary_writer()(str(run.path / "tensorboard")) for run in runs] if options.tensorboard else []
-    label = f"{job.algorithm.name}/{job.preset} {job.task.name} " + (
-        f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
-    )
-    saved = step if starts[0] else -1
-    with Progress(label, steps, step, options.quiet) as bar:
-        try:
-            while step < steps:
-                count = min(options.chunk - step % options.chunk, steps - step)
-                begun = time.perf_counter()
-                state, metrics = advance(state, roots, arrays, conditions, count)
-                step += count
-                metrics = {**metrics, **diagnose(state, roots, arrays, conditions)}
-                metrics = {k: np.asarray(v) for k, v in metrics.items()}
-                seconds = time.perf_counter() - begun
-                for i, run in enumerate(runs):
-                    row = {"step": step, "seconds": seconds / len(runs), "updates": count}
-                    row |= {k: float(v[i]) for k, v in metrics.items()}
-                    with open(run.path / "metrics.jsonl", "a") as f:
-                        f.write(json.dumps(row) + "\n")
-                    if writers:
-                        for k, v in row.items():
-                            writers[i].add_scalar(k, v, step)
-                means = {k: float(v.mean()) for k, v in metrics.items()}
-                bad = [k for k, v in means.items() if not np.isfinite(v)]
-                if bad:
-                    raise UserError(f"Training diverged: {bad[0]} is not finite at step {step}; lower lr.")
-                bar.advance(count, means)
-                if options.on_chunk:
-                    options.on_chunk(step, means)
-                if step // options.checkpoint_every > (step - count) // options.checkpoint_every or step == steps:
-                    _save(runs, step, state)
-                    saved = step
-        except KeyboardInterrupt:
-            if saved < step and not _deleted(state):
-                _save(runs, step, state)
-            raise
-    if saved < step:
-        _save(runs, step, state)
-    for w in writers:
-        w.close()
+        program = program or make_program(job)
+        _Training.begin(job, lessons, runs, seeds, options).finish(program)
     return program
+
+
+@dataclass
+class _Training:
+    """Runs of several seeds under way."""
+
+    job: Job
+    runs: list[Run]
+    options: _Options
+    label: str
+    roots: Key  # (seeds,)
+    arrays: Arrays  # of the data, the same for all
+    scores: Array  # (seeds, T): conditions differ between seeds, whose Worlds do
+    state: PyTree
+    step: int
+    saved: int  # step of the last checkpoint; −1: none
+    writers: list[Any]  # of TensorBoard
+
+    @classmethod
+    def begin(cls, job: Job, lessons: _Lessons, runs: list[Run], seeds: Sequence[int], options: _Options) -> _Training:
+        """Fresh states, or those of the last checkpoints."""
+        roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        states: list[PyTree] = []
+        scores: list[Array] = []
+        arrays: Arrays = {}
+        for run, seed, root in zip(runs, seeds, roots):
+            world, windows = lessons.of(seed)
+            states.append(_begun(job, run, root, world, windows))
+            scores.append(windows.arrays["scores"])
+            arrays = {name: array for name, array in windows.arrays.items() if name != "scores"}
+        steps = sorted({int(state["step"]) for state in states})
+        if len(steps) > 1:
+            raise CheckpointError(
+                f"The runs stand at different steps ({steps}), so they cannot go on in one program; resume them one "
+                "by one."
+            )
+        for run in runs:
+            _trim_metrics(run, steps[0])
+        whose = f"seed {seeds[0]}" if len(seeds) == 1 else f"{len(seeds)} seeds"
+        tensorboard = [_summary_writer()(str(run.path / "tensorboard")) for run in runs if options.tensorboard]
+        return cls(
+            job=job,
+            runs=runs,
+            options=options,
+            label=f"{job.algorithm.name}/{job.preset} {job.task.name} {whose}",
+            roots=roots,
+            arrays=arrays,
+            scores=jnp.stack(scores),
+            state=jax.tree.map(lambda *x: jnp.stack(x), *states),
+            step=steps[0],
+            saved=steps[0] or -1,
+            writers=tensorboard,
+        )
+
+    def finish(self, program: Program) -> None:
+        """Train to the last step; an interruption keeps what is there."""
+        steps = self.job.config.steps
+        with Progress(self.label, steps, self.step, self.options.quiet) as bar:
+            try:
+                while self.step < steps:
+                    count = min(self.options.chunk - self.step % self.options.chunk, steps - self.step)
+                    means = self._advance(program, count)
+                    bar.advance(count, means)
+                    if self.options.on_chunk:
+                        self.options.on_chunk(self.step, means)
+                    every = self.options.checkpoint_every
+                    if self.step // every > (self.step - count) // every or self.step == steps:
+                        self._save()
+            except KeyboardInterrupt:
+                if self.saved < self.step and not _deleted(self.state):
+                    self._save()
+                raise
+        if self.saved < self.step:
+            self._save()
+        for writer in self.writers:
+            writer.close()
+
+    def _advance(self, program: Program, count: int) -> dict[str, float]:
+        """One chunk of updates, logged; its metrics as means over the seeds."""
+        begun = time.perf_counter()
+        data = (self.roots, self.arrays, self.scores)
+        self.state, metrics = program.advance(self.state, *data, count)
+        self.step += count
+        metrics = {**metrics, **program.diagnose(self.state, *data)}
+        values = {name: np.asarray(value) for name, value in metrics.items()}
+        self._log(values, count, time.perf_counter() - begun)
+        means = {name: float(value.mean()) for name, value in values.items()}
+        diverged = [name for name, value in means.items() if not np.isfinite(value)]
+        if diverged:
+            raise UserError(f"Training diverged: {diverged[0]} is not finite at step {self.step}; lower lr.")
+        return means
+
+    def _log(self, values: dict[str, np.ndarray], count: int, seconds: float) -> None:
+        """A line for every run."""
+        for i, run in enumerate(self.runs):
+            row = {"step": self.step, "seconds": seconds / len(self.runs), "updates": count}
+            row |= {name: float(value[i]) for name, value in values.items()}
+            with open(run.path / "metrics.jsonl", "a") as file:
+                file.write(json.dumps(row) + "\n")
+            if self.writers:
+                for name, value in row.items():
+                    self.writers[i].add_scalar(name, value, self.step)
+
+    def _save(self) -> None:
+        host = jax.device_get(learned(self.state))
+        for i, run in enumerate(self.runs):
+            run.save_checkpoint(self.step, jax.tree.map(operator.itemgetter(i), host))
+        self.saved = self.step
+
+
+def _begun(job: Job, run: Run, root: Key, world: World | None, windows: WindowData) -> PyTree:
+    """A seed's state: fresh, or that of its last checkpoint. The World that it reads is kept beside it."""
+    read = {} if world is None else {"world": world}
+    key = jax.random.fold_in(root, 2**31 - 1)
+    state = job.algorithm.init(key, job.spec, job.config, windows, job.feature_map, job.hazard, **read)
+    if world is not None and not (run.path / worlds.WORLD).exists():
+        save_world(world, run.path / worlds.WORLD)
+    if run.checkpoints():
+        state = state | run.load_checkpoint(learned(state))[1]
+    return state
 
 
 def learned(state: PyTree) -> PyTree:
@@ -302,12 +369,6 @@ def learned(state: PyTree) -> PyTree:
 def _deleted(state: PyTree) -> bool:
     """An interruption inside a compiled call leaves donated buffers behind; there is nothing to save then."""
     return any(x.is_deleted() for x in jax.tree.leaves(state))
-
-
-def _save(runs: list[Run], step: int, state: PyTree) -> None:
-    host = jax.device_get(learned(state))
-    for i, run in enumerate(runs):
-        run.save_checkpoint(step, jax.tree.map(operator.itemgetter(i), host))
 
 
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:

@@ -46,7 +46,7 @@ class Run:
         return run if isinstance(run, Run) else cls(Path(run))
 
     @property
-    def config(self) -> dict:
+    def config(self) -> dict[str, Any]:
         """Contents of config.json."""
         remedy = "is no run folder that can be read; give the one that `ringfence train` made, or train it again"
         return stored.config(schemas.read(self.path / "config.json", schemas.Config, remedy))
@@ -110,16 +110,17 @@ class Run:
             found = [c for c in found if c[0] == step]
             if not found:
                 raise CheckpointError(f"'{self.path}' holds no checkpoint of step {step}; take one of: {there}.")
+        problem = ""
         for at, file in reversed(found):
-            try:
-                arrays = sound_arrays(file, at)
-            except ValueError as wrong:
-                problem = f"'{file}' is truncated or damaged ({wrong})"
-                if file == found[0][1]:
-                    raise CheckpointError(f"{problem}; delete it and train the run again.") from wrong
+            if problem:
                 _log.warning(f"{problem}; the one before is used.")
-                continue
-            return at, as_tree(arrays, template, file)
+            try:
+                return at, as_tree(sound_arrays(file, at), template, file)
+            except ValueError as wrong:
+                if isinstance(wrong, UserError):  # sound, but of another model
+                    raise
+                problem = f"'{file}' is truncated or damaged ({wrong})"
+        raise CheckpointError(f"{problem}; delete it and train the run again.")
 
     def add_result(self, variant: str, result: dict) -> None:
         """Keep a result beside the others, whoever else adds some at the same time."""

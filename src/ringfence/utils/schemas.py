@@ -236,7 +236,7 @@ class Row(TypedDict):
     seconds: float
 
 
-def decode(raw: bytes | str, kind: type[T]) -> T:
+def decode(raw: bytes | str, kind: Any) -> Any:
     """JSON of `kind`, with the fields that it does not name; ValueError says what is wrong and where."""
     try:
         told = msgspec.json.decode(raw)

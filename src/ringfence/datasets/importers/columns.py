@@ -47,7 +47,7 @@ def read(given: dict | str | os.PathLike) -> Columns:
             raw = file.read_bytes()
         else:  # ranges and arrays of Python's become lists
             raw = json.dumps(given, default=lambda x: x.tolist() if hasattr(x, "tolist") else list(x))
-        columns = schemas.decode(raw, _KIND)
+        columns: Columns = schemas.decode(raw, _KIND)
         for name, agent in columns.items():
             if extra := sorted(agent.keys() - {"observation", "action"}):
                 raise ValueError(f"agent '{name}' has '{extra[0]}', which is neither observation nor action")

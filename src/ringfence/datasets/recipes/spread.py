@@ -33,7 +33,7 @@ class Behaviour(eqx.Module):
     def start(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         return memory, PolicyStep(self.policy.act(observations, key), {})
 
 

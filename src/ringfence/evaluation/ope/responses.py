@@ -14,7 +14,7 @@ from ringfence.evaluation.ope.result import Behaviour
 from ringfence.guards.policy import Guarded
 from ringfence.problem import normalise
 from ringfence.proposals.base import held
-from ringfence.types import Array, Key, PyTree
+from ringfence.types import Array, Key, Proposes, PyTree
 from ringfence.world import World
 
 BATCH = 512  # states that a policy is asked in together
@@ -81,7 +81,7 @@ def _plan(
     """(B, K, N, A): the guard's plan, else what the policy proposes, else its action held."""
     if isinstance(policy, Guarded):
         return memory["last"]
-    if hasattr(policy, "propose"):
+    if isinstance(policy, Proposes):
         return policy.propose(policy.start(len(seen)), seen, state, key, 1, ahead, world)[1][:, 0]
     return held(action, ahead)[:, 0]
 
