@@ -48,11 +48,11 @@ class Spec:
 
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Spec:
-        """What `told` gave."""
+        """What `to_dict` gave."""
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
         return cls(**values)
 
-    def told(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is the same for nearly all data is left out."""
         return {k: v for k, v in asdict(self).items() if k != "action_sizes" or v is not None}
 
@@ -90,7 +90,7 @@ class PolicyStep(NamedTuple):
 class Policy(Protocol):
     """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
 
-    A policy may have `hear(memory, cost) -> memory`: it is then told the cost (B,) of every step. One that knows
+    A policy may have `hear(memory, cost) -> memory`: it then hears the cost (B,) of every step. One that knows
     several steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions
     (B, P, K, N, A) in [−1, 1], info), which guards choose from.
     """
@@ -102,7 +102,7 @@ class Policy(Protocol):
 
 @runtime_checkable
 class ObservesCost(Protocol):
-    """A policy that is told what every step cost, (B,) or (B, N), or that by constraint, and remembers it."""
+    """A policy that observes what every step cost, (B,) or (B, N), or that by constraint, and remembers it."""
 
     def hear(self, memory: PyTree, cost: Any) -> PyTree: ...
 

@@ -1,7 +1,7 @@
-"""The cheapest rivals of a planner that is told what return to reach: cloning the best episodes (`bc-best`), and an
+"""The cheapest rivals of a return-conditioned planner: cloning the best episodes (`bc-best`), and an
 actor that reads the return it is to reach (`bc-return`; Emmons et al. 2022, "RvS", whose outcomes are ours: scores.py).
 
-`bc-return` sees what the planner sees and is told what the planner is told, at the same discount and target: what
+`bc-return` sees what the planner sees and is conditioned on the same return, at the same discount and target: what
 differs is that it answers with one action and no plan.
 """
 

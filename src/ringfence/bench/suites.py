@@ -45,7 +45,7 @@ class Suite:
 
     tasks: tuple[str, ...]
     entries: tuple[Entry, ...]
-    episodes: int = 200  # per run, unless told otherwise
+    episodes: int = 200  # per run, by default
 
 
 _TIERS = ("hasty", "mixed", "careful", "random")

@@ -1,5 +1,5 @@
-"""The whole job in one command: data, a World, a cloned policy and a planner, as they are and under guard, told the
-formula of danger and not, on the same resets; report."""
+"""The whole job in one command: data, a World, a cloned policy and a planner, as they are and under guard, by the
+formula of danger and without it, on the same resets; report."""
 
 from __future__ import annotations
 

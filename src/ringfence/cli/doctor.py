@@ -17,12 +17,12 @@ def doctor() -> None:
     from ringfence.utils.cache import cache_dir
     from ringfence.utils.environment import environment
 
-    told = environment()
+    versions = environment()
     for name in ("ringfence", "python", "system", "processor", "cores", "git"):
-        out.print(f"{name:12} {escape(str(told[name]))}")
-    for name, version in told["packages"].items():
+        out.print(f"{name:12} {escape(str(versions[name]))}")
+    for name, version in versions["packages"].items():
         out.print(f"{name:12} {version}")
-    out.print(f"{'devices':12} {', '.join(told['devices'])}")
+    out.print(f"{'devices':12} {', '.join(versions['devices'])}")
     out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
     from ringfence.report import video
 

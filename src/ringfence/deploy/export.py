@@ -6,8 +6,8 @@ The function in the file is one joint action of `evaluate.Controller`, of one en
 
 Whatever nothing reads is left out: cloning under a shield takes observations (and the state, where its World sees it)
 and remembers nothing. `next.NAME` is `memory.NAME` of the step after; `cost` is what the last step cost, NaN where
-nobody told; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random numbers
-differ between runtimes. What memory begins with, names, shapes and the facts of the run are told inside the file.
+nobody gave; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random numbers
+differ between runtimes. What memory begins with, names, shapes and the facts of the run are metadata of the file.
 """
 
 from __future__ import annotations
@@ -109,12 +109,12 @@ def _constraints(policy: Policy) -> list[str]:
 class _Traced:
     """One joint action as programs: the one that draws, and the one that is given its noise instead."""
 
-    drawing: core.ClosedJaxpr  # (key, *seen, *memory) -> (*told, *memory)
-    given: core.ClosedJaxpr  # (key, *seen, *noise, *memory) -> (*told, *memory)
+    drawing: core.ClosedJaxpr  # (key, *seen, *memory) -> (*results, *memory)
+    given: core.ClosedJaxpr  # (key, *seen, *noise, *memory) -> (*results, *memory)
     seen: dict[str, jax.ShapeDtypeStruct]
     noise: dict[str, jax.ShapeDtypeStruct]
     memory: dict[str, Array]  # what it begins with
-    told: list[str]  # the action and what is known of it
+    results: list[str]  # the action and what is known of it
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -123,7 +123,7 @@ class _Traced:
 
     @property
     def outputs(self) -> list[str]:
-        return [*self.told, *(name.replace("memory.", "next.", 1) for name in self.memory)]
+        return [*self.results, *(name.replace("memory.", "next.", 1) for name in self.memory)]
 
 
 def step_of(job: Job, policy: Policy) -> Step:
@@ -131,7 +131,7 @@ def step_of(job: Job, policy: Policy) -> Step:
     traced = _trace(job, policy)
     program = traced.given.jaxpr
     names = list(traced.inputs)
-    equations, used = live(program, ["key", *names], list(traced.memory), len(traced.told))
+    equations, used = live(program, ["key", *names], list(traced.memory), len(traced.results))
     if "key" in used:
         raise UserError(
             "This policy draws more than normal noise, and a file holds nothing that draws; play it with "
@@ -139,7 +139,7 @@ def step_of(job: Job, policy: Policy) -> Step:
         )
     used -= _constant_memory(traced)
     inputs = [k for k, name in enumerate(names) if name in used]
-    outputs = [k for k, name in enumerate(traced.outputs) if k < len(traced.told) or _before(name) in used]
+    outputs = [k for k, name in enumerate(traced.outputs) if k < len(traced.results) or _before(name) in used]
     unread = {
         variable: traced.memory[name] for name, variable in zip(names, program.invars[1:]) if name in traced.memory
     }
@@ -180,7 +180,7 @@ def _trace(job: Job, policy: Policy) -> _Traced:
         return {"action": step.action[0]} | info, jax.tree.leaves(memory)
 
     key = jax.random.key(0)
-    drawing, (told, _) = jax.make_jaxpr(act, return_shape=True)(key, list(seen.values()), leaves)
+    drawing, (results, _) = jax.make_jaxpr(act, return_shape=True)(key, list(seen.values()), leaves)
     noise = {f"noise.{k}": shape for k, shape in enumerate(draws(drawing.jaxpr))}
 
     def act_given(key: Key, *arrays: Array) -> list[Array]:
@@ -191,7 +191,7 @@ def _trace(job: Job, policy: Policy) -> _Traced:
 
     given = jax.make_jaxpr(act_given)(key, *seen.values(), *noise.values(), *leaves)
     names = [f"memory.{name}" for name, _ in named_leaves(memory)]
-    return _Traced(drawing, given, seen, noise, dict(zip(names, leaves)), list(told))
+    return _Traced(drawing, given, seen, noise, dict(zip(names, leaves)), list(results))
 
 
 def _seen(job: Job, policy: Policy) -> dict[str, jax.ShapeDtypeStruct]:
@@ -226,7 +226,7 @@ def _constant_memory(traced: _Traced) -> set[str]:
     """Names of memory that no step changes: it is a constant."""
     program = traced.given.jaxpr
     before = program.invars[len(program.invars) - len(traced.memory) :]
-    after = program.outvars[len(traced.told) :]
+    after = program.outvars[len(traced.results) :]
     return {name for name, old, new in zip(traced.memory, before, after) if new is old}
 
 

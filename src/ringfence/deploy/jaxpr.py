@@ -11,7 +11,7 @@ plays one. Under a second trace, what it does becomes a flatter program:
 * any other primitive without a program inside is bound as it is, and so are those of `BOUND`.
 
 Any other primitive that holds a program, or calls Python, is refused. Names of parameters differ between versions of
-JAX, so what a loop closes over, carries and stacks is told by shapes alone.
+JAX, so what a loop closes over, carries and stacks follows from shapes alone.
 """
 
 from __future__ import annotations

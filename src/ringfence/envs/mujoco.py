@@ -89,7 +89,7 @@ class SafeMuJoCo:
 
     @property
     def world(self) -> dict[str, Any]:
-        """Contacts are hard to predict, and a speed limit is to be told to a tenth of a m/s; 25 steps of 1000 above it
+        """Contacts are hard to predict, and a speed limit is to be met to a tenth of a m/s; 25 steps of 1000 above it
         are allowed. Ten steps before its fall an Ant runs fastest, so values look farther than that."""
         return {
             "discount": 0.97,

@@ -66,7 +66,7 @@ class Controller:
         return np.asarray(step.action[0])
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
-        """Refuse arrays too short for the entries that the run reads; runs of own data once told no widths."""
+        """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
         view, last = self.job.feature_map, int(self.job.feature_map.plus.max())
         name, there = "observations", seen.shape[-1]
         if view.source == "state":

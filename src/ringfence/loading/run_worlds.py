@@ -54,7 +54,7 @@ def _made_here(run: Run) -> bool:
 
 def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
     """The World of a run's data and seed, where that is regenerated."""
-    told = run.config
+    config = run.config
     if not _made_here(run):
         raise UserError(
             f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
@@ -62,20 +62,20 @@ def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
         )
     from ringfence.datasets.make import make
 
-    card = told["data"]
+    card = config["data"]
     size = card.get("size", card.get("transitions"))
-    store, _ = make(registry.get(told["task"]), size, card.get("seed", 0), must_keep=False)
-    return fit(store, seed=told["seed"], sight=sight, quiet=quiet)
+    store, _ = make(registry.get(config["task"]), size, card.get("seed", 0), must_keep=False)
+    return fit(store, seed=config["seed"], sight=sight, quiet=quiet)
 
 
 def _of_same(run: Run, world: World, sight: str) -> None:
     """Refuse a World of other data, or of another sight."""
-    told = run.config
-    here, there = told["data"].get("content"), world.card.data
-    apart = told["task"] != there.task or (here is not None and here != there.content)
+    config = run.config
+    here, there = config["data"].get("content"), world.card.data
+    apart = config["task"] != there.task or (here is not None and here != there.content)
     if apart:
         raise UserError(
-            f"The World is of '{there.task}', the run '{run.path}' of other data ('{told['task']}'); fit one to the "
+            f"The World is of '{there.task}', the run '{run.path}' of other data ('{config['task']}'); fit one to the "
             "data that the run was trained on."
         )
     if world.alone != (sight == "own"):

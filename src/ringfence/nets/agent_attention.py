@@ -2,7 +2,7 @@
 
 Flattening the window into the token turns the work into a few wide matrix products, which is what a CPU is good at;
 `benchmarks/denoisers.py` puts it beside MADIFF's temporal U-Net. The number of agents appears in no weight unless
-they are told apart.
+they are distinguished.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class AgentAttention(eqx.Module):
     inlet: Array  # (carried entries, W)
     outlet: Array  # (W, carried entries)
     blocks: list[dict[str, Array]]
-    which: Array | None  # (N, W), where agents are told apart
+    which: Array | None  # (N, W), where agents are distinguished
     carried: tuple[int, ...] = eqx.field(static=True)  # entries of a flattened window (H·D) that are read and written
 
     def __init__(
@@ -41,7 +41,7 @@ class AgentAttention(eqx.Module):
         carried: tuple[int, ...] | None = None,
         agents: int = 0,
     ):
-        """`agents`: their number if they are to be told apart, as limbs of one body are; 0: they are homogeneous."""
+        """`agents`: their number if they are to be distinguished, as limbs of one body are; 0: they are homogeneous."""
         keys = jax.random.split(key, depth + 3)
         self.carried = tuple(range(rows * features)) if carried is None else carried
         flat = len(self.carried)
@@ -61,8 +61,8 @@ class AgentAttention(eqx.Module):
             token = token + jnp.tile(self.which, (b, 1))
         for p in self.blocks:
             token = token + _attend(_norm(token), p, n)
-            told = jnp.repeat(c @ p["tell"] + p["bias"], n, axis=0)
-            token = token + jax.nn.silu(_norm(token) @ p["up"] + told) @ p["down"]
+            condition = jnp.repeat(c @ p["tell"] + p["bias"], n, axis=0)
+            token = token + jax.nn.silu(_norm(token) @ p["up"] + condition) @ p["down"]
         out = jnp.zeros((b * n, h * d)).at[:, carried].set(_norm(token) @ self.outlet)
         return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
 

@@ -12,7 +12,7 @@ import optax
 from ringfence.types import Array, Key, Metrics, PyTree
 from ringfence.utils.progress import Progress
 
-CHUNKS = 40  # a regression is in, one after the other, so that its progress can be told
+CHUNKS = 40  # a regression is in, one after the other, so that its progress is seen
 
 
 @dataclass(frozen=True)

@@ -58,22 +58,25 @@ class TemporalUNet(eqx.Module):
         check_sizes(rows, width, depth)
         keys = iter(jax.random.split(key, 64))
         channels = [features] + [width * m for m in MULTIPLIERS[:depth]]
-        told = 2 * width  # the embeddings of step and return, side by side
+        condition = 2 * width  # the embeddings of step and return, side by side
         self.step = [_linear(next(keys), a, b) for a, b in ((_waves(width), 4 * width), (4 * width, width))]
         self.target = [_linear(next(keys), a, b) for a, b in ((1, width), (width, 4 * width), (4 * width, width))]
         self.down = []
         for level, (a, b) in enumerate(zip(channels[:-1], channels[1:])):
-            stage = {"first": _residual(next(keys), a, b, told), "second": _residual(next(keys), b, b, told)}
+            stage = {"first": _residual(next(keys), a, b, condition), "second": _residual(next(keys), b, b, condition)}
             if level < depth - 1:
                 stage["halve"] = _linear(next(keys), 3 * b, b)
             self.down.append(stage)
         deepest = channels[-1]
-        self.middle = [_residual(next(keys), deepest, deepest, told) for _ in range(2)]
+        self.middle = [_residual(next(keys), deepest, deepest, condition) for _ in range(2)]
         skips = channels[:1:-1]  # from the deepest up; the full resolution's is not used
-        self.meet = [_attention(next(keys), c, told) for c in (deepest, *skips)]
+        self.meet = [_attention(next(keys), c, condition) for c in (deepest, *skips)]
         self.up = []
         for a, b in zip(skips, channels[-2:0:-1]):
-            blocks = {"first": _residual(next(keys), 2 * a, b, told), "second": _residual(next(keys), b, b, told)}
+            blocks = {
+                "first": _residual(next(keys), 2 * a, b, condition),
+                "second": _residual(next(keys), b, b, condition),
+            }
             # A transposed convolution of kernel 4 and stride 2: even rows see (t-1, t), odd rows (t, t+1).
             self.up.append({**blocks, "even": _weight(next(keys), 2 * b, b), "odd": _linear(next(keys), 2 * b, b)})
         self.outlet = {
@@ -84,28 +87,28 @@ class TemporalUNet(eqx.Module):
     def __call__(self, x: Array, k: Array, y: Array, keep: Array) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool -> (B, H, N, D)."""
         b, rows, n, d = x.shape
-        told = _mish(self._told(k, y, keep))  # every use of it begins with this activation
-        told = jnp.repeat(told, n, axis=0)
+        condition = _mish(self._condition(k, y, keep))  # every use of it begins with this activation
+        condition = jnp.repeat(condition, n, axis=0)
         z = jnp.moveaxis(x, 1, 2).reshape(b * n, rows, d)
         unit = 2 ** (len(self.down) - 1)
         z = jnp.pad(z, ((0, 0), (0, -rows % unit), (0, 0)), mode="edge")
         skips = []
         for stage in self.down:
-            z = _apply_residual(stage["second"], _apply_residual(stage["first"], z, told), told)
+            z = _apply_residual(stage["second"], _apply_residual(stage["first"], z, condition), condition)
             skips.append(z)
             if "halve" in stage:
                 z = _apply(stage["halve"], _neighbours(z, 1, 1, stride=2))
         for block in self.middle:
-            z = _apply_residual(block, z, told)
-        z = _meet(self.meet[0], z, told, n)
+            z = _apply_residual(block, z, condition)
+        z = _meet(self.meet[0], z, condition, n)
         for meet, stage in zip(self.meet[1:], self.up):
-            z = jnp.concatenate([z, _meet(meet, skips.pop(), told, n)], -1)
-            z = _apply_residual(stage["second"], _apply_residual(stage["first"], z, told), told)
+            z = jnp.concatenate([z, _meet(meet, skips.pop(), condition, n)], -1)
+            z = _apply_residual(stage["second"], _apply_residual(stage["first"], z, condition), condition)
             z = _double(stage, z)
         z = _apply(self.outlet["last"], _apply_convolution(self.outlet["block"], z))[:, :rows]
         return jnp.moveaxis(z.reshape(b, n, rows, d), 2, 1)
 
-    def _told(self, k: Array, y: Array, keep: Array) -> Array:
+    def _condition(self, k: Array, y: Array, keep: Array) -> Array:
         """(B, 2 W): what diffusion step and return say; a dropped return is zeros."""
         first, last = self.step
         step = _apply(last, _mish(_apply(first, sinusoidal(k, first["weight"].shape[0]))))
@@ -146,14 +149,14 @@ def _mish(z: Array) -> Array:
     return z * (e / (e + 2.0))
 
 
-def _residual(key: Key, a: int, b: int, told: int) -> dict:
+def _residual(key: Key, a: int, b: int, condition: int) -> dict:
     k = jax.random.split(key, 4)
-    block = {"enter": _convolution(k[0], a, b), "tell": _linear(k[1], told, b), "leave": _convolution(k[2], b, b)}
+    block = {"enter": _convolution(k[0], a, b), "tell": _linear(k[1], condition, b), "leave": _convolution(k[2], b, b)}
     return block if a == b else {**block, "pass": _linear(k[3], a, b)}
 
 
-def _apply_residual(p: dict, z: Array, told: Array) -> Array:
-    inner = _apply_convolution(p["enter"], z) + _apply(p["tell"], told)[:, None]
+def _apply_residual(p: dict, z: Array, condition: Array) -> Array:
+    inner = _apply_convolution(p["enter"], z) + _apply(p["tell"], condition)[:, None]
     return _apply_convolution(p["leave"], inner) + (_apply(p["pass"], z) if "pass" in p else z)
 
 
@@ -171,27 +174,27 @@ def _apply_convolution(p: Params, z: Array) -> Array:
     return _mish(grouped.reshape(z.shape) * p["norm_scale"] + p["norm_bias"])
 
 
-def _attention(key: Key, c: int, told: int) -> dict:
+def _attention(key: Key, c: int, condition: int) -> dict:
     heads = math.gcd(HEADS, c)
     narrow = heads * max(1, c // (4 * heads))  # queries and keys; values keep all channels
     k = jax.random.split(key, 5)
     return {
         "query": _linear(k[0], c, narrow),
-        "query_told": _linear(k[1], told, narrow),
+        "query_told": _linear(k[1], condition, narrow),
         "key": {"weight": _weight(k[2], c, narrow)},
         "value": _linear(k[3], c, c),
-        "value_told": _linear(k[4], told, c),
+        "value_told": _linear(k[4], condition, c),
         "gamma": jnp.zeros(1),  # training starts without a word between agents
     }
 
 
-def _meet(p: dict, z: Array, told: Array, n: int) -> Array:
+def _meet(p: dict, z: Array, condition: Array, n: int) -> Array:
     """Attention over the n agents of each plan, all time steps at once; z (B·n, T, C)."""
     m, t, c = z.shape
     heads = math.gcd(HEADS, c)
 
-    query = _apply(p["query"], z) + _apply(p["query_told"], told)[:, None]
-    value = _apply(p["value"], z) + _apply(p["value_told"], told)[:, None]
+    query = _apply(p["query"], z) + _apply(p["query_told"], condition)[:, None]
+    value = _apply(p["value"], z) + _apply(p["value_told"], condition)[:, None]
     parts = query, z @ p["key"]["weight"], value
     query, key, value = (part.reshape(m // n, n, t, heads, -1) for part in parts)
     logits = jnp.einsum("bithd,bjthd->bhij", query, key) / (t * query.shape[-1]) ** 0.5

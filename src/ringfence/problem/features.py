@@ -158,7 +158,7 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
 def constant_velocity(map: FeatureMap, dt: float) -> FeatureMap:
     """A map of agents who know where they are by their speed alone: everything named `goal.dx`, `obstacle0.dx` moves
     by `own.vx` in a step of `dt` seconds, and `other0.dx`, `other0.dvx` as if that other kept its velocity. So what is
-    predicted of an agent is its own velocity, whoever the others are and however many; what else is told of things
+    predicted of an agent is its own velocity, whoever the others are and however many; what else is known of things
     (`obstacle0.radius`) stays."""
     names = {name: d for d, name in enumerate(map.names)}
     axes = [c for c in "xyz" if f"own.v{c}" in names]

@@ -92,7 +92,7 @@ def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> N
 
 
 def to_unit(action: Array, low: float, high: float) -> Array:
-    """Actions within [low, high], told in [−1, 1], where weights, noise and searches mean the same in any bounds.
+    """Actions within [low, high], in units of [−1, 1], where weights, noise and searches mean the same in any bounds.
     Those bounded so anyway are left as they are, to the last bit."""
     return (action - (high + low) / 2) / ((high - low) / 2)
 

@@ -79,7 +79,7 @@ def _training(section: Section[Row], data: str) -> list[str]:
 
 
 def _usual_preset(algorithm: str, task: str) -> str:
-    """The preset that training takes without being told one; no name where that is not known."""
+    """The preset that training takes by default; no name where that is not known."""
     known = algos.ALGORITHMS.get(algorithm)
     if known is None:
         return ""

@@ -113,7 +113,7 @@ def _film_shows(section: Section[Row]) -> str:
 
 
 def constraint_table(rows: list[Row]) -> list[ConstraintLine]:
-    """A line for each named constraint of the rows whose simulator told them apart."""
+    """A line for each named constraint of the rows whose simulator names them."""
     found = []
     for row in rows:
         costs = [result["constraints"] for _, result in row.members if "constraints" in result]

@@ -45,7 +45,7 @@ class Job:
             "preset": self.preset,
             "config": dataclasses.asdict(self.config),
             "task": self.task.name,
-            "spec": self.spec.told(),
+            "spec": self.spec.to_dict(),
             "hazard": constraints.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "widths": None if self.task.env is not None else list(self.widths),

@@ -116,8 +116,8 @@ def _undone(fresh: list[Run]) -> Iterator[None]:
             if not run.checkpoints():
                 with suppress(UserError), owned(run.path, "another process trains there by now"):
                     shutil.rmtree(run.path, ignore_errors=True)
-        told = str(error)
-        if isinstance(error, MemoryError) or any(word in told for word in ("RESOURCE_EXHAUSTED", "Out of memory")):
+        message = str(error)
+        if isinstance(error, MemoryError) or any(word in message for word in ("RESOURCE_EXHAUSTED", "Out of memory")):
             raise UserError(
                 "This machine has not enough memory for that; lower batch, width, horizon or the number of seeds."
             ) from error

@@ -133,13 +133,13 @@ def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:
     believed."""
     try:
         with safe_open(file, framework="np") as opened:
-            told = opened.metadata() or {}
+            metadata = opened.metadata() or {}
             arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 (it is no dict)
     except (SafetensorError, OSError, ValueError, TypeError) as error:
         raise ValueError(str(error).splitlines()[0]) from error
     if arrays.get("step", np.array(step)).tolist() != step:
         raise ValueError("it is not of the step in its name")
-    if "digest" in told and told["digest"] != digest_of(sorted(arrays.items())):
+    if "digest" in metadata and metadata["digest"] != digest_of(sorted(arrays.items())):
         raise ValueError("its contents have changed")
     return arrays
 

@@ -26,12 +26,12 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     safe steps from unsafe ones, else from its formula; without either, no barrier."""
     task = task or registry.from_store(store)
     sight = sight_of(task, changes.pop("sight", None))
-    told = usual(task, sight)
+    settings = usual(task, sight)
     costs = store.costs > 0
     if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
         formula = not isinstance(task.hazard, constraints.CostColumn)
-        told |= {"labels": "formula"} if formula else {"barrier": False}
-    return build_config(Settings, {**told, **changes}, "the World")
+        settings |= {"labels": "formula"} if formula else {"barrier": False}
+    return build_config(Settings, {**settings, **changes}, "the World")
 
 
 def sight_of(task: Task, wanted: str | None = None) -> str:
@@ -46,7 +46,7 @@ def sight_of(task: Task, wanted: str | None = None) -> str:
 
 
 def usual(task: Task, sight: str) -> dict:
-    """What a task asks of its World, unless told otherwise: the fields of `Settings` that are not as everywhere."""
+    """What a task asks of its World by default: the fields of `Settings` that are not as everywhere."""
     return {"view": "decentralized" if sight == "own" else "pruned", **task.world, "sight": sight}
 
 

@@ -239,13 +239,13 @@ class Row(TypedDict):
 def decode(raw: bytes | str, kind: Any) -> Any:
     """JSON of `kind`, with the fields that it does not name; ValueError says what is wrong and where."""
     try:
-        told = msgspec.json.decode(raw)
+        value = msgspec.json.decode(raw)
     except RecursionError:
         raise ValueError("it is nested too deeply") from None
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise ValueError(str(error)) from None
-    check(told, kind)  # what the schema does not name stays
-    return told
+    check(value, kind)  # what the schema does not name stays
+    return value
 
 
 def check(value: Any, kind: Any) -> None:
@@ -265,5 +265,5 @@ def read(path: Path, kind: type[T], problem: str) -> T:
             raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
         return decode(path.read_bytes(), kind)
     except (OSError, ValueError) as error:
-        told = error.strerror if isinstance(error, OSError) and error.strerror else error
-        raise UserError(f"'{path.parent}' {problem} ({path.name}: {told}).") from None
+        cause = error.strerror if isinstance(error, OSError) and error.strerror else error
+        raise UserError(f"'{path.parent}' {problem} ({path.name}: {cause}).") from None

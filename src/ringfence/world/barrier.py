@@ -128,7 +128,7 @@ def soft(score: Array) -> Array:
 def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = True) -> Shape:
     """The shape that a view's names tell; without `distances` pairs do not read how far apart they are. A body's danger
     is of a step (a mean speed), so both its ends are read; of agents in a plane it is of the state that a step leads
-    to, unless told otherwise."""
+    to, by default."""
     names = map.names
     things = {} if map.joint else _things(names)
     if not things:

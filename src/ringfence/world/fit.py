@@ -258,7 +258,7 @@ def _shape_in_words(barrier: cbf.Barrier | cbf.Worst | None) -> str:
         return "one body: everybody answers for its danger"
     return (
         "one network per agent on all it sees; no names like other0.dx tell which entries belong to which other, so "
-        "pairs could not be told apart"
+        "pairs could not be distinguished"
     )
 
 

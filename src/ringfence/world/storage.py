@@ -56,7 +56,7 @@ def save(
 ) -> Path:
     """Write one file, whole or not at all: arrays, as `kept` makes them, and the card as its metadata."""
     path = Path(path)
-    about = {"map": features.to_dict(world.map), "spec": world.spec.told(), "card": world.card.to_json()}
+    about = {"map": features.to_dict(world.map), "spec": world.spec.to_dict(), "card": world.card.to_json()}
     with whole(path) as temporary:
         arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
         save_file(arrays, temporary, {"ringfence_world": json.dumps(about)})

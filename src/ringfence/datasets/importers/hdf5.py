@@ -64,9 +64,9 @@ def import_hdf5(
     call safe. Actions are bounded by `action_low` and `action_high`, by default by Minari's action space, else by −1
     and 1. `StoreError` names what does not fit, with the row of the file.
     """
-    told = {"task": task, "cost_limit": cost_limit}
-    told = {key: value for key, value in told.items() if value is not None}
-    complete_card(told)  # a name that cannot be one is refused before the file is read
+    known = {"task": task, "cost_limit": cost_limit}
+    known = {key: value for key, value in known.items() if value is not None}
+    complete_card(known)  # a name that cannot be one is refused before the file is read
     asked = common.Asked(None if agents is None else columns.read(agents), action_low, action_high)
     path = _located(path)
     try:
@@ -81,10 +81,10 @@ def import_hdf5(
     except Exception as error:  # a damaged file raises anything: KeyError, RuntimeError, UnicodeDecodeError, ...
         said = (str(error).splitlines() or [type(error).__name__])[0]
         raise StoreError(f"'{path}' is damaged ({said}); copy it again.") from error
-    return _store(path, log, asked.agents, told)
+    return _store(path, log, asked.agents, known)
 
 
-def _store(path: Path, log: common.Logs, agents: columns.Columns | None, told: dict) -> EpisodeStore:
+def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: dict) -> EpisodeStore:
     """The steps, shared out."""
     (low, high), notes = log.bounds, list(log.notes)
     seen, done = log.observations[:, None], log.actions[:, None]
@@ -114,7 +114,7 @@ def _store(path: Path, log: common.Logs, agents: columns.Columns | None, told: d
         "action_high": high,
         "observation_names": names,
         "warnings": notes,
-        **told,
+        **known,
     }
     try:
         return EpisodeStore(

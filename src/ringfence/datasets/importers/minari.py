@@ -42,10 +42,11 @@ class Shapes:
 
 def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> common.Logs:
     """The steps of those episodes, in that order."""
-    told, notes = _metadata(path, f), []
-    if isinstance(count := told.get("total_episodes"), int | np.integer) and count != len(episodes):
+    metadata = _metadata(path, f)
+    notes: list[str] = []
+    if isinstance(count := metadata.get("total_episodes"), int | np.integer) and count != len(episodes):
         raise StoreError(f"'{path}' holds {len(episodes)} episodes, its metadata tells of {count}; copy it again.")
-    bounds = common.bounds_of(_action_space(path, told, asked, notes), asked)
+    bounds = common.bounds_of(_action_space(path, metadata, asked, notes), asked)
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
     for name, shapes in found.items():
@@ -107,9 +108,9 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
         terminated,
         bounds,
         notes,
-        told["dataset_id"] if isinstance(told.get("dataset_id"), str) else path.stem,
+        metadata["dataset_id"] if isinstance(metadata.get("dataset_id"), str) else path.stem,
         None if flat else names,
-        _simulator(told),
+        _simulator(metadata),
     )
 
 
@@ -146,7 +147,7 @@ def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:
         cost = True
         array = arrays.array(path, infos, "cost", f"{name}/infos/cost")
         common.vector(path, f"{name}/infos/cost", array.shape)
-        if len(array) != steps:  # one of every step; the reset has told none
+        if len(array) != steps:  # one of every step; the reset has none
             common.rows_of(path, f"{name}/infos/cost", len(array), steps + 1, steps)
         size += array.nbytes
     return Shapes(steps, parts["observations"], parts["actions"], cost, size)
@@ -221,22 +222,22 @@ def _metadata(path: Path, f: h5py.File) -> dict:
     try:
         if file.stat().st_size > schemas.LARGEST:
             raise ValueError(f"it is larger than {schemas.LARGEST / 2**20:.0f} MiB")
-        told = json.loads(file.read_bytes())
-        if not isinstance(told, dict):
+        metadata = json.loads(file.read_bytes())
+        if not isinstance(metadata, dict):
             raise ValueError("it is no object")
     except (OSError, ValueError, RecursionError) as error:
         raise StoreError(
             f"'{file}' cannot be read ({error}); copy it again, or read the HDF5 file without it."
         ) from None
-    return told
+    return metadata
 
 
-def _action_space(path: Path, told: dict, asked: common.Asked, notes: list[str]) -> tuple[float, float] | None:
+def _action_space(path: Path, metadata: dict, asked: common.Asked, notes: list[str]) -> tuple[float, float] | None:
     """The bounds of Minari's action space, the widest of any entry; None where it has none or they are not asked."""
-    if "action_space" not in told or (asked.low is not None and asked.high is not None):
+    if "action_space" not in metadata or (asked.low is not None and asked.high is not None):
         return None
     try:
-        boxes = list(_boxes(path, json.loads(told["action_space"])))
+        boxes = list(_boxes(path, json.loads(metadata["action_space"])))
         low, high = (np.concatenate([np.asarray(box[k], np.float64).ravel() for box in boxes]) for k in ("low", "high"))
     except StoreError:
         raise
@@ -266,9 +267,9 @@ def _boxes(path: Path, space: dict) -> Iterator[dict]:
         )
 
 
-def _simulator(told: dict) -> str | None:
+def _simulator(metadata: dict) -> str | None:
     try:
-        name = json.loads(told["env_spec"])["id"]
+        name = json.loads(metadata["env_spec"])["id"]
     except (KeyError, RecursionError, TypeError, ValueError):
         return None
     return name[:200] if isinstance(name, str) else None

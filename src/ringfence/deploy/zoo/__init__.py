@@ -41,20 +41,20 @@ def get(name: str, out: str | Path = "runs") -> Run:
         raise unknown("trained policy", str(name), names())
     file = FOLDER / f"{name}.safetensors"
     with safe_open(file, "numpy") as opened:
-        told = json.loads(opened.metadata()["ringfence_policy"])
-    run = Run(Path(out) / name / f"seed-{told['config']['seed']}")
+        metadata = json.loads(opened.metadata()["ringfence_policy"])
+    run = Run(Path(out) / name / f"seed-{metadata['config']['seed']}")
     config = run.path / "config.json"
     if config.exists():
-        if run.config != told["config"]:
+        if run.config != metadata["config"]:
             raise UserError(f"'{run.path}' holds another run; choose another place with --out.")
         if run.checkpoints():
             return run
     writable(config)
     kept = load_file(file)
-    arrays = {k: kept[k].astype(kind) for k, kind in told["kinds"].items()}
-    arrays |= {k: arrays[other] for k, other in told["same"].items()}
-    arrays |= {k: np.zeros(shape, kind) for k, (shape, kind) in told["zeros"].items()}
-    arrays["step"] = np.array(told["step"], told["step_kind"])
+    arrays = {k: kept[k].astype(kind) for k, kind in metadata["kinds"].items()}
+    arrays |= {k: arrays[other] for k, other in metadata["same"].items()}
+    arrays |= {k: np.zeros(shape, kind) for k, (shape, kind) in metadata["zeros"].items()}
+    arrays["step"] = np.array(metadata["step"], metadata["step_kind"])
     task = name.split("/")[0]
     own = FOLDER / f"{name}-world.safetensors"
     worlds = {WORLD: own, GUARD: FOLDER / task / "world.safetensors"}
@@ -63,9 +63,9 @@ def get(name: str, out: str | Path = "runs") -> Run:
     for there, here in worlds.items():
         with whole(run.path / there) as temporary:
             temporary.write_bytes(here.read_bytes())
-    write_json(run.path / "env.json", told["env"])
-    write_json(config, told["config"])
-    run.save_checkpoint(told["step"], arrays)
+    write_json(run.path / "env.json", metadata["env"])
+    write_json(config, metadata["config"])
+    run.save_checkpoint(metadata["step"], arrays)
     return run
 
 
