@@ -630,7 +630,9 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     store = dataclasses.replace(store)
     told = {k: v for k, v in TINY[name].items() if k != "steps"} | {"view": "centralized"}
     job = make_job(name, registry.from_store(store), None, told, store)
-    assert job.spec.action_sizes == (2, 1, 2) and type(job.spec).of(json.loads(json.dumps(job.spec.to_dict()))) == job.spec
+    assert (
+        job.spec.action_sizes == (2, 1, 2) and type(job.spec).of(json.loads(json.dumps(job.spec.to_dict()))) == job.spec
+    )
     state = job.algorithm.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard)
     state = jax.tree.map(lambda x: x + 0.1 if x.dtype == jnp.float32 else x, state)  # as if it had learned
     policy = resolve.make_policy(job, state, {})

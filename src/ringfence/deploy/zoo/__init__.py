@@ -20,6 +20,7 @@ from safetensors.numpy import load_file, save_file
 from ringfence.errors import UserError, unknown
 from ringfence.loading.run_worlds import GUARD, WORLD
 from ringfence.training.runs import Run, write_json
+from ringfence.utils import stored
 from ringfence.utils.files import whole, writable
 from ringfence.utils.pytrees import digest_of, named_arrays
 from ringfence.world import World
@@ -45,7 +46,7 @@ def get(name: str, out: str | Path = "runs") -> Run:
     run = Run(Path(out) / name / f"seed-{metadata['config']['seed']}")
     config = run.path / "config.json"
     if config.exists():
-        if run.config != metadata["config"]:
+        if run.config != stored.config(metadata["config"]):
             raise UserError(f"'{run.path}' holds another run; choose another place with --out.")
         if run.checkpoints():
             return run
