@@ -102,8 +102,8 @@ TRUE = {
     "the true dynamics": Way(other=by_simulator),
     "the true dynamics and formula": Way({"danger": "formula"}, other=by_simulator),
 }
-V = {"the last row judged by V": Way({"future": True})}
-V_ALONE = {"by V alone": Way({"future": False}, other=by_value)}
+V = {"the last row judged by V": Way({"terminal_value": True})}
+V_ALONE = {"by V alone": Way({"terminal_value": False}, other=by_value)}
 GUESS = {"foreseen by the own action alone": Way(world={"cached": False}, fitted=unguessed)}
 OWN = ", own sight"  # of a guard's name here
 # By task, algorithm and preset, and guard; the default is not named among the ways.
@@ -116,14 +116,14 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **TRUE,
         **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
         **{f"{k} steps of climbing": Way({"refine": k}) for k in (5, 10, 40)},
-        "no shield after it": Way({"shield": 0, "adapt": 0.0}),
+        "no shield after it": Way({"correction_steps": 0, "adapt": 0.0}),
     },
     ("simple_spread-expert", "icbf:split", "select"): {
         f"{k} plan{'s' * (k > 1)} to select from": Way({"plans": k}) for k in (1, 4, 16)
     },
     ("crossing-hasty", "bc", "shield"): {
         **{k: v for k, v in ROWS.items() if k != "5 rows foreseen"},
-        "by ℓ alone": Way({"future": False}),
+        "by ℓ alone": Way({"terminal_value": False}),
         **V_ALONE,
         **RETAIN,
         **MEMBERS,
@@ -140,7 +140,7 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **MEMBERS,
         **FORMULA,
         **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
-        "climbing anywhere": Way({"reach": 2.0}),
+        "climbing anywhere": Way({"trust_radius": 2.0}),
     },
     ("simple_spread-expert", "bc", f"full{OWN}"): GUESS,
     ("simple_spread-medium-replay", "bc", f"full{OWN}"): GUESS,

@@ -144,7 +144,7 @@ OF_ROBOTS = (
             ("mpc", f"default{FULL}{reach}"),
             ROBOT_KEYS,
         )
-        for where, reach in (("near rest", ""), ("climbed anywhere", "+reach2.0"))
+        for where, reach in (("near rest", ""), ("climbed anywhere", "+trust_radius2.0"))
     ),
 )
 
@@ -199,7 +199,7 @@ ROBOTS: dict[str, Row] = {
     "BC, `full`": ("bc", f"default{FULL}"),
     "ICBF (low temperature), `full`": ("icbf", f"default+steady{FULL}"),
     "MPC from a zero proposal (`mpc`), `full`": ("mpc", f"default{FULL}"),
-    "MPC from a zero proposal, `full`, anywhere": ("mpc", f"default{FULL}+reach2.0"),
+    "MPC from a zero proposal, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }
 
 

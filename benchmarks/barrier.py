@@ -41,9 +41,9 @@ WAYS: dict[str, dict] = {
 GUARDS: dict[str, dict] = {
     "margin": {},
     "retain": {"condition": "retain"},
-    "future": {"future": True},
+    "future": {"terminal_value": True},
 }
-SHORT = {"3 rows": {"rows": 3}, "future, 3 rows": {"future": True, "rows": 3}}  # where 7 are usual
+SHORT = {"3 rows": {"horizon": 3}, "future, 3 rows": {"terminal_value": True, "horizon": 3}}  # where 7 are usual
 
 FIELDS = ("task", "way", "guard", "seed", "fit_seconds", "unsafe_share", "recall", "auroc", "margin")
 FIELDS += ("foreseen_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible_rate")
@@ -78,7 +78,7 @@ class Yard:
 
         self.env, self.episodes, self.store = yard.Yard, episodes, yard.record()
         (self.run,) = loop.train("bc", self.store, seeds=(seed,), out=folder, quiet=True)
-        self.guard = {"guard": "shield", "rows": 7}
+        self.guard = {"guard": "shield", "horizon": 7}
 
     def play(self, world, **options) -> dict:
         kw = dict(episodes=self.episodes, at_once=self.episodes, split="validation", world=world)

@@ -71,7 +71,7 @@ def on_robots(row, paired, more: int, less: int) -> Callable[[], tuple[bool, str
 
 
 PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 0)
-PRIOR = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}+reach2.0"), 9, 0)
+PRIOR = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}+trust_radius2.0"), 9, 0)
 
 
 def within(bound: float) -> Callable[[list], bool]:
@@ -213,7 +213,7 @@ def as_safe_by_v() -> tuple[bool, str]:
     name = "default+shield-learned"
     shares = [
         mean("crossing-guards", "crossing-hasty", ("bc", name + more), "violation_rate")
-        for more in ("+rows1+futureFalse", "+rows3+futureFalse", "+rows15+futureFalse", "+rows1", "")
+        for more in (*(f"+horizon{k}+terminal_valueFalse" for k in (1, 3, 15)), "+horizon1", "")
     ]
     text = ", ".join(f"{100 * s:.3g} %" for s in shares)
     return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {text} of episodes"
@@ -234,7 +234,7 @@ CERTIFICATES = ("certificates", "reference")
 def full_is_safe() -> tuple[bool, str]:
     """No contact, and by how much more than the shield alone; beside itself with one margin, climbing anywhere."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+full-learned"
-    wide = f"{key}+reach2.0+margin1.0"
+    wide = f"{key}+trust_radius2.0+margin1.0"
     more = difference(suite, task, ("bc", key), ("bc", "default+shield-learned"), "return")
     cost = difference(suite, task, ("bc", key), ("bc", wide), "cost")
     share = more.mean / mean(suite, task, ("bc", "default+shield-learned"), "return_mean")

@@ -27,7 +27,7 @@ BATCH = 500
 GUARDS = {
     "none": {},
     "shield": {"guard": "shield"},
-    "shield by ℓ alone along 15 rows": {"guard": "shield", "rows": 15, "future": False},
+    "shield by ℓ alone along 15 rows": {"guard": "shield", "horizon": 15, "terminal_value": False},
     "full": {"guard": "full"},
 }
 

@@ -46,14 +46,17 @@ BESIDE = {
 TIERS = BESIDE | {"bc default": "BC", "bc default+shield-learned": "**BC, shield, learned**"}
 WAYS = BESIDE | {
     "bc default": "BC",
-    **{f"bc default+shield-learned+rows{k}+futureFalse": f"shield, ℓ, {k} row{'s' * (k > 1)}" for k in (1, 3, 7, 15)},
-    "bc default+shield-learned+rows1": "shield, ℓ and V, 1 row",
+    **{
+        f"bc default+shield-learned+horizon{k}+terminal_valueFalse": f"shield, ℓ, {k} row{'s' * (k > 1)}"
+        for k in (1, 3, 7, 15)
+    },
+    "bc default+shield-learned+horizon1": "shield, ℓ and V, 1 row",
     "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
-    "bc default+shield-formula+rows15+futureFalse": "shield, analytic, 15 rows",
+    "bc default+shield-formula+horizon15+terminal_valueFalse": "shield, analytic, 15 rows",
     "bc default+full-learned": "**full**",
     "bc default+full-learned+margin1.0": "full, a margin of 1",
-    "bc default+full-learned+reach2.0+margin1.0": "full, a margin of 1, climbing anywhere",
-    "mpc default+full-learned+reach2.0+margin1.0": (
+    "bc default+full-learned+trust_radius2.0+margin1.0": "full, a margin of 1, climbing anywhere",
+    "mpc default+full-learned+trust_radius2.0+margin1.0": (
         "MPC from a zero proposal (`mpc`), full, a margin of 1, climbing anywhere"
     ),
     "bc-best default": "10 % BC",

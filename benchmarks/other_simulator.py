@@ -211,7 +211,7 @@ def main() -> None:
             (run,) = loop.train("bc", store, seeds=(a.seed,), out=Path(folder), quiet=True)
             played(words, run, world, 8)
             for n in (8, 16):
-                played(words, run, world, n, guard="shield", rows=3, future=True)
+                played(words, run, world, n, guard="shield", horizon=3, terminal_value=True)
 
 
 if __name__ == "__main__":

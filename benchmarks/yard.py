@@ -32,17 +32,17 @@ OUT = ROOT / "results" / "yard.csv"
 # Who acts, under which guard, of how many episodes one (`full` takes ten times as long).
 ROWS = (
     ("BC", "none", "none", {}, 1),
-    ("BC", "shield", "learned", {"future": False}, 1),
+    ("BC", "shield", "learned", {"terminal_value": False}, 1),
     ("BC", "shield", "learned", {}, 1),
     ("BC", "shield", "formula", {}, 1),
     ("BC", "full", "learned", {}, 5),
-    ("BC", "full", "learned", {"rows": 3, "future": True}, 5),
+    ("BC", "full", "learned", {"horizon": 3, "terminal_value": True}, 5),
     ("BC", "full", "formula", {}, 5),
     ("naive controller", "none", "none", {}, 1),
-    ("naive controller", "shield", "learned", {"future": False}, 1),
+    ("naive controller", "shield", "learned", {"terminal_value": False}, 1),
     ("naive controller", "shield", "learned", {}, 1),
-    ("naive controller", "shield", "learned", {"rows": 7}, 1),
-    ("naive controller", "shield", "learned", {"rows": 10}, 1),
+    ("naive controller", "shield", "learned", {"horizon": 7}, 1),
+    ("naive controller", "shield", "learned", {"horizon": 10}, 1),
     ("naive controller", "shield", "formula", {}, 1),
 )
 HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
@@ -80,7 +80,7 @@ def main() -> None:
                 run, yard.Yard, episodes=episodes, at_once=100, **asked, **({"world": world} if asked else {})
             )
         else:
-            asked = asked or {"shield": 0, "select": True}  # of one proposal: a guard that only looks on
+            asked = asked or {"correction_steps": 0, "select": True}  # of one proposal: a guard that only looks on
             pilot = ringfence.guard(blind, world, hazard=hazard, **asked)
             r = ringfence.play(pilot, yard.Yard, episodes=episodes, at_once=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]

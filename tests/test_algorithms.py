@@ -177,9 +177,9 @@ def test_gradient_depths(small_store, small_world, gradient):
     "options",
     [
         dict(),
-        dict(plans=3, guard="select", danger="both"),
+        dict(num_samples=3, guard="select", danger="both"),
         dict(replan=2, sampler="dpm++"),
-        dict(plans=2, select=True, ascent=5.0, guidance=1.0, sampler="ddpm", shield=2),
+        dict(num_samples=2, select=True, ascent=5.0, guidance=1.0, sampler="ddpm", correction_steps=2),
     ],
 )
 def test_planner_options(trained, options):
@@ -190,9 +190,9 @@ def test_planner_options(trained, options):
 
 
 def test_a_controller_acts_like_the_policy(trained, small_store):
-    how = dict(planner="climbing", guard="select", steps=2, plans=2, shield=1)
+    how = dict(planner="climbing", guard="select", steps=2, num_samples=2, correction_steps=1)
     pilot = Controller(trained["icbf"], **how)
-    assert pilot.policy.proposal.options.ascent == 100.0 and pilot.policy.guard.options.plans == 2
+    assert pilot.policy.proposal.options.ascent == 100.0 and pilot.policy.guard.options.num_samples == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
     assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["strange"].dtype == bool
@@ -232,9 +232,9 @@ def test_names_of_variants_follow_values(trained):
     """Neither the order nor the spelling of options makes another variant; those that results hold keep their names."""
     run = Run(trained["icbf"].path)
     for options, name in (
-        ({"guard": "select", "plans": 3}, "split+select-learned+plans3"),
+        ({"guard": "select", "num_samples": 3}, "split+select-learned+num_samples3"),
         ({"planner": "climbing", "steps": 2}, "split+climbing+steps2"),
-        ({"margin": 0, "rows": "2", "guard": "shield"}, "split+shield-learned+rows2+margin0.0"),
+        ({"margin": 0, "horizon": "2", "guard": "shield"}, "split+shield-learned+horizon2+margin0.0"),
         ({"ascent": "1e1"}, "split+ascent10.0"),
         ({"guard": "adapt", "danger": "formula", "adapt": 0.2}, "split+adapt-formula+adapt0.2"),
     ):
@@ -347,8 +347,8 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         evaluate(run, reconcile=False)
     with pytest.raises(UserError, match="did you mean 'paper'"):
         loop.train("icbf", small_store, out=tmp_path, changes={"routing": "papr"})
-    with pytest.raises(UserError, match="rows=7 are judged, but plans hold 3 steps"):
-        evaluate(run, guard="shield", rows=7)
+    with pytest.raises(UserError, match="horizon=7 rows are judged, but plans hold 3 steps"):
+        evaluate(run, guard="shield", horizon=7)
     assert not any(tmp_path.rglob("ckpt"))
 
 
@@ -410,7 +410,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     store = own_store
     how = job_of("icbf") | {"changes": {**TINY["icbf"], "steps": 2}}
     run = loop.train("icbf", store, out=tmp_path, **how)[0]
-    _, policy = load(run, guard="select", plans=2, steps=2)
+    _, policy = load(run, guard="select", num_samples=2, steps=2)
     seen = jnp.asarray(store.observations[:4])
     _, out = policy.act(policy.start(4), seen, None, jax.random.key(0))
     assert out.action.shape == (4, 3, 2)
@@ -582,7 +582,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
         (["--set", "quiet=1"], "Unknown option of planner or guard 'quiet'"),
         (["--steps", "3", "--set", "steps=2"], "--steps 3 and --set steps=2 both set steps"),
         (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
-        (["--set", "steps=3", "--set", "plans=2", "rows=x"], "rows='x' cannot be read as int"),
+        (["--set", "steps=3", "--set", "num_samples=2", "horizon=x"], "horizon='x' cannot be read as int"),
         (["--record", "-1"], "num_recorded=-1 must be a whole number"),
         (["--step", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],

@@ -95,7 +95,7 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
     assert cell.state(tmp_path, 4) == "done"
     assert cell.state(tmp_path, 5) == "to do"
     with monkeypatch.context() as patch:
-        patch.setitem(GUARDS, "shield", {**GUARDS["shield"], "rows": 5})
+        patch.setitem(GUARDS, "shield", {**GUARDS["shield"], "horizon": 5})
         assert cell.state(tmp_path, 4) == "to do"
     world = grid.dataclasses.asdict(Settings(labels="formula"))  # which follows from the data
     for change, state in (({}, "done"), ({"members": 5}, "to do"), ({"view": "centralized"}, "to do")):

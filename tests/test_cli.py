@@ -145,8 +145,8 @@ def test_the_whole_job(tmp_path, monkeypatch, capsys):
     """`make demo`, tiny: data, two trainings, evaluations on the same resets, the table and the page."""
     monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr(rollout, "CHUNK", 10)
-    monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "rows": 2, "starts": 2, "shield": 1})
-    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
+    monkeypatch.setitem(GUARDS, "full", {**GUARDS["full"], "horizon": 2, "num_restarts": 2, "correction_steps": 1})
+    monkeypatch.setitem(GUARDS, "shield", {"correction_steps": 1, "horizon": 1})
     page = demo.run(tmp_path / "demo", "random", quick=True)
     text = page.read_text()
     assert "http://" not in text.replace("http://www.w3.org", "") and "https://" not in text

@@ -146,8 +146,8 @@ def test_every_constraint_has_a_barrier(logs, fitted, tmp_path):
 
 def test_a_guard_keeps_all_of_them(fitted):
     """Who only accelerates is held below 0.6 m/s, and short of the wall."""
-    free = guard(hurry, fitted, shield=0, select=True)
-    held = guard(hurry, fitted, guard="shield", rows=5, future=False)
+    free = guard(hurry, fitted, correction_steps=0, select=True)
+    held = guard(hurry, fitted, guard="shield", horizon=5, terminal_value=False)
     loose, tight = (play(p, Sleds, episodes=10, seed=1) for p in (free, held))
     assert tight["constraints"].keys() == LIMITS.keys()
     for name, limit in LIMITS.items():

@@ -181,10 +181,10 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20
-    result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, shield=1, rows=1)
+    result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, correction_steps=1, horizon=1)
     assert result["agents"] == 3 and result["sight"] == "own" and 0 <= result["infeasible_rate"] <= 1
     assert 0 <= result["agent_violation_rate"] <= result["violation_rate"]
-    assert result["variant"] == "default+shield-learned+shield1+rows1+agents3"
+    assert result["variant"] == "default+shield-learned+correction_steps1+horizon1+agents3"
     assert evaluate(run, episodes=2)["agents"] == 8
     pilot = Controller(run, guard="shield", world=world, agents=5)
     env = Crossing(n_agents=5)

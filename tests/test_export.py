@@ -25,8 +25,8 @@ from ringfence.proposals.base import Constant
 from ringfence.training import loop
 from tests.quick import QUICK_WORLD
 
-SHIELD = dict(guard="shield", rows=1, shield=3, margin=4.0)
-FULL = dict(guard="full", rows=1, shield=1, refine=2, starts=3, plans=1)
+SHIELD = dict(guard="shield", horizon=1, correction_steps=3, margin=4.0)
+FULL = dict(guard="full", horizon=1, correction_steps=1, optimizer_steps=2, num_restarts=3, num_samples=1)
 STEPS = 12
 
 
@@ -123,7 +123,18 @@ def test_a_shield(run, small_store, small_world, tmp_path, capsys):
     from ringfence import world as worlds_files
 
     kept = worlds_files.save(small_world, tmp_path / "w.safetensors")
-    words = ["--guard", "shield", "--rows", "1", "--margin", "4", "--set", "shield=3", "--world", str(kept)]
+    words = [
+        "--guard",
+        "shield",
+        "--horizon",
+        "1",
+        "--margin",
+        "4",
+        "--set",
+        "correction_steps=3",
+        "--world",
+        str(kept),
+    ]
     main(["export", str(run.path), "--out", str(tmp_path / "s.onnx"), *words])
     assert capsys.readouterr().out.strip().endswith("s.onnx")
     call, told = of_onnx(tmp_path / "s.onnx")
@@ -192,7 +203,7 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
         ([str(both), *out], "holds 2 runs"),
         ([str(both / "a"), *out], "config.json"),
         ([str(run.path), *out, "--guard", "shield"], "needs the World of its data"),
-        ([str(run.path), *out, "--set", "shild=3"], "did you mean 'shield'"),
+        ([str(run.path), *out, "--set", "horizn=3"], "did you mean 'horizon'"),
         ([str(run.path), *out, "--format", "tflite"], "invalid choice"),
         ([str(run.path), *out, "--step", "99"], "holds no checkpoint of step 99"),
     ):

@@ -44,7 +44,7 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
     last = jnp.zeros_like(plan)
     found = {}
     for name, margin in (("easy", -90.0), ("hard", 4.0)):
-        guard = make(small_world, bound, shield=8)
+        guard = make(small_world, bound, correction_steps=8)
         found[name] = eqx.filter_jit(guard.decide)(
             present, plan[:, None], last, jnp.full((64, 1), margin), jax.random.key(0)
         )
@@ -58,7 +58,7 @@ def test_the_shield_corrects_what_falls_short_and_nothing_else(small_world, boun
 
 
 def test_the_shield_never_makes_it_worse(small_world, bound, present):
-    guard = make(small_world, bound, shield=3)
+    guard = make(small_world, bound, correction_steps=3)
     plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.full((64, 1), 3.0)
 
@@ -71,7 +71,7 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
 
 def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
     """Those who need it, a few at a time; their number is no multiple of anything."""
-    guard = make(small_world, bound, shield=4)
+    guard = make(small_world, bound, correction_steps=4)
     plan = jax.random.uniform(jax.random.key(6), (45, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.linspace(-1.0, 3.0, 45)[:, None]
     several = eqx.filter_jit(guard.shielded)(present[:45], plan, margin)
@@ -83,7 +83,7 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
 
 
 def test_refining_climbs_value(small_world, bound, present):
-    guard = make(small_world, bound, refine=10, starts=4, care=0.0)
+    guard = make(small_world, bound, optimizer_steps=10, num_restarts=4, safety_weight=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
     worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
     better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros((64, 1)))
@@ -97,7 +97,7 @@ def test_refining_climbs_value(small_world, bound, present):
 
 
 def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present):
-    guard = make(small_world, bound, refine=10, starts=6, plans=2, reach=0.1)
+    guard = make(small_world, bound, optimizer_steps=10, num_restarts=6, num_samples=2, trust_radius=0.1)
     plan = jnp.stack([jnp.full((64, 3, 3, 2), v) for v in (0.0, 0.95)], 1)
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts, low, high = guard.started(plan, last, jax.random.key(0))
@@ -116,8 +116,8 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
         ([0.2, 0.6, 0.9], 0.97, {}, True),
         ([0.2, 0.88, 0.9], 0.97, {}, False),
         ([0.2, 0.2, 0.9], 0.5, {}, False),
-        ([0.2, 0.2, 0.9], 0.97, {"rows": 7}, False),
-        ([0.2, 0.2, 0.9], 0.97, {"future": False}, False),
+        ([0.2, 0.2, 0.9], 0.97, {"horizon": 7}, False),
+        ([0.2, 0.2, 0.9], 0.97, {"terminal_value": False}, False),
     ],
 )
 def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, options, future):
@@ -128,18 +128,18 @@ def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, optio
     world = dataclasses.replace(small_world, card=card)
     for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
                    ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip
-        assert policy.guard.danger.future == policy.guard.options.future == future
-    assert not build(Constant(world.spec), world, None, "shield", "learned", {}, **options).guard.options.future
+        assert policy.guard.danger.terminal_value == policy.guard.options.terminal_value == future
+    assert not build(Constant(world.spec), world, None, "shield", "learned", {}, **options).guard.options.terminal_value
 
 
 def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
-    guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(shield=10, bound=0.1))
+    guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(correction_steps=10, max_correction=0.1))
     plan = jnp.full((64, 3, 3, 2), 0.95)
     kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full((64, 1), 9.0))
     moved = jnp.abs(kept - plan)
     assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
-    far = make(small_world, bound, shield=10).shielded(present, plan, jnp.full((64, 1), 9.0))
+    far = make(small_world, bound, correction_steps=10).shielded(present, plan, jnp.full((64, 1), 9.0))
     assert jnp.abs(far - plan).max() > 0.2
 
 
@@ -154,7 +154,7 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     assert world.alone and world.map.view == "decentralized"
     seen = jnp.asarray(small_store.observations[:16])
     bound = constraints.bind(constraints.Separation(), world.spec.feature_names, 3)
-    guard = make(world, bound, shield=4, refine=3, starts=3, select=True)
+    guard = make(world, bound, correction_steps=4, optimizer_steps=3, num_restarts=3, select=True)
     plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
     last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3, 1)), jax.random.key(0)
     here = world.map(seen, None)
@@ -168,7 +168,7 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
 
 def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
     """However wrong foresight is, the share of unsafe steps tends to the chosen one (Gibbs and Candès 2021)."""
-    guard = make(small_world, bound, shield=1, adapt=0.2, rate=0.05)
+    guard = make(small_world, bound, correction_steps=1, adapt=0.2, rate=0.05)
     wrong = jnp.asarray([0.0, 0.1, 0.5])  # that foresight is off by, and tenfold in every hundredth step
 
     def step(margin, key):
@@ -208,7 +208,15 @@ def test_entries_of_actions_that_an_agent_has_not_stay_where_they_are(small_worl
     spec = dataclasses.replace(small_world.spec, action_sizes=(2, 1, 2))
     world = dataclasses.replace(small_world, spec=spec)
     pilot = ringfence.guard(
-        lambda *_: np.full((3, 2), 0.3), world, guard="full", rows=2, refine=2, starts=3, plans=1, shield=2, margin=9.0
+        lambda *_: np.full((3, 2), 0.3),
+        world,
+        guard="full",
+        horizon=2,
+        optimizer_steps=2,
+        num_restarts=3,
+        num_samples=1,
+        correction_steps=2,
+        margin=9.0,
     )
     acted = pilot.act(*(np.zeros(k, np.float32) for k in ((3, 18), 18)))
     assert acted[1, 1] == 0 and (np.abs(np.delete(acted.ravel(), 3) - 0.3) > 1e-4).all()

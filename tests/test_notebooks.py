@@ -21,7 +21,7 @@ def test_it_runs(file, tmp_path, monkeypatch, capsys):
     matplotlib.use("Agg")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(EXAMPLES))
-    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
+    monkeypatch.setitem(GUARDS, "shield", {"correction_steps": 1, "horizon": 1})
     space: dict = {}
     for cell in json.loads(file.read_text())["cells"]:
         if cell["cell_type"] == "code":

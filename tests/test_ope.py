@@ -66,7 +66,7 @@ def test_a_result_says_what_the_policy_does(run, logs, world):
     other = dataclasses.replace(logs.select(np.arange(60) < 40))
     guarded = worlds.fit(logs, seed=0, **QUICK_WORLD)
     beside = worlds.fit(other, seed=1, **QUICK_WORLD)
-    how = {"evaluation_world": beside, "guard": "shield", "world": guarded, "shield": 1, **QUICK}
+    how = {"evaluation_world": beside, "guard": "shield", "world": guarded, "correction_steps": 1, **QUICK}
     result = ringfence.ope(run, other, **how)
     assert not result.trained_on and result.logs.episodes == 40
     safety = result.safety

@@ -233,7 +233,7 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
 
 def test_anybodys_function_under_guard_is_played(small_world):
     """With what the guard could not do; there is no run to keep results in."""
-    still = guard(lambda seen, state: np.zeros((3, 2)), small_world, rows=1, shield=1)
+    still = guard(lambda seen, state: np.zeros((3, 2)), small_world, horizon=1, correction_steps=1)
     result = play(still, SimpleSpreadParallel, episodes=2)
     assert result["episodes"] == 2 and 0 <= result["infeasible_rate"] <= 1 and 0 <= result["ood_rate"] <= 1
     with pytest.raises(UserError, match="a function under guard has none"):

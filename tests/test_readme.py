@@ -23,7 +23,7 @@ PAGES = [
 
 def test_the_first_lines_of_python_run(tmp_path, monkeypatch):
     """Word by word, but for how long things are fitted and how hard the shield tries."""
-    monkeypatch.setitem(GUARDS, "shield", {"shield": 1, "rows": 1})
+    monkeypatch.setitem(GUARDS, "shield", {"correction_steps": 1, "horizon": 1})
     rng = np.random.default_rng(0)
     names = ["own.x", "own.y", "goal.dx", "goal.dy"]
     told = SimpleNamespace(

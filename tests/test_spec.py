@@ -16,15 +16,22 @@ def test_every_name_of_a_suite_reads_back(name):
 
 
 def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
-    wanted = "steady+shield-formula-own+temperature0.5+reach2.0+rows7+agents4"
+    wanted = "steady+shield-formula-own+temperature0.5+trust_radius2.0+horizon7+agents4"
     first = PolicySpec.of(
-        planner="steady", guard="shield", danger="formula", sight="own", agents=4, rows="7", reach=2, temperature=0.5
+        planner="steady",
+        guard="shield",
+        danger="formula",
+        sight="own",
+        agents=4,
+        horizon="7",
+        trust_radius=2,
+        temperature=0.5,
     )
     other = PolicySpec.of(
         temperature="0.5",
         agents=4,
-        reach=2.0,
-        rows=7.0,
+        trust_radius=2.0,
+        horizon=7.0,
         sight="own",
         danger="formula",
         guard="shield",
@@ -40,12 +47,19 @@ def test_names_of_results_are_understood():
         trust_radius=2.0, target_return=1.0,
     )  # fmt: skip
     assert spec == PolicySpec.of(
-        planner="steady", guard="shield", danger="formula", sight="own", rows=7, reach=2.0, target=1.0
+        planner="steady", guard="shield", danger="formula", sight="own", horizon=7, trust_radius=2.0, target=1.0
     )
     assert PolicySpec.of(execution="decentralized").plan_options == (("execution", "decentralized"),)
     for twice in ({"horizon": 7, "rows": 7}, {"barrier": "learned", "danger": "learned"}):
         with pytest.raises(UserError, match="two names of one choice"):
             PolicySpec.of(guard="shield", **twice)
+
+
+def test_options_of_before_are_read_and_said():
+    wanted = PolicySpec.of(guard="shield", horizon=7, terminal_value=False)
+    assert PolicySpec.parse("shield-learned+rows7+futureFalse") == wanted
+    with pytest.warns(FutureWarning, match="rows of the guard is called horizon now"):
+        assert PolicySpec.of(guard="shield", rows=7, terminal_value=False) == wanted
 
 
 def test_commands_of_before_are_rewritten(capsys):
@@ -72,7 +86,7 @@ def test_what_a_result_is_called():
         ({"danger": "formula"}, "danger is read by nothing without a guard"),
         ({"sight": "own"}, "sight is read by nothing without a guard"),
         ({"agents": 0}, "agents=0 must be a whole number"),
-        ({"rows": "seven"}, "rows"),
+        ({"horizon": "seven"}, "horizon"),
     ],
 )
 def test_bad_choices_are_refused(options, message):
@@ -80,7 +94,7 @@ def test_bad_choices_are_refused(options, message):
         PolicySpec.of(**options)
 
 
-@pytest.mark.parametrize("name", ["learned-shield", "plain+", "agentsx", "rows"])
+@pytest.mark.parametrize("name", ["learned-shield", "plain+", "agentsx", "horizon"])
 def test_a_name_that_says_nothing_is_refused(name):
     with pytest.raises(UserError, match="says nothing of planner or guard"):
         PolicySpec.parse(name)

@@ -119,7 +119,9 @@ SUITES = {
             ),
             Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
             *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
-            Entry("mpc", evaluations=("full-learned", "full-learned+reach2.0")),  # anywhere, too: near rest is no place
+            Entry(
+                "mpc", evaluations=("full-learned", "full-learned+trust_radius2.0")
+            ),  # anywhere, too: near rest is no place
         ),
         episodes=20,
     ),
@@ -137,15 +139,15 @@ SUITES = {
                 evaluations=(
                     "plain",
                     "shield-learned",
-                    "shield-learned+rows1",
-                    *(f"shield-learned+rows{k}+futureFalse" for k in (1, 3, 7, 15)),
-                    "shield-formula+rows15+futureFalse",
+                    "shield-learned+horizon1",
+                    *(f"shield-learned+horizon{k}+terminal_valueFalse" for k in (1, 3, 7, 15)),
+                    "shield-formula+horizon15+terminal_valueFalse",
                     "full-learned",
                     "full-learned+margin1.0",
-                    "full-learned+reach2.0+margin1.0",
+                    "full-learned+trust_radius2.0+margin1.0",
                 ),
             ),
-            Entry("mpc", evaluations=("full-learned+reach2.0+margin1.0",)),  # near rest is no place to look
+            Entry("mpc", evaluations=("full-learned+trust_radius2.0+margin1.0",)),  # near rest is no place to look
             Entry("icbf", evaluations=_ALONE),
             Entry("madiff", evaluations=_ALONE),
             *(Entry(name, evaluations=_ALONE) for name in _RIVALS),

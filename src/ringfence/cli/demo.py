@@ -44,7 +44,7 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     rows["ICBF split"] = evaluate(planner, **protocol, **fewer)
     guided = PolicySpec.of(planner, planner="climbing", guard="shield", danger="learned", **fewer)
     rows["ICBF split, shielded, learned"] = evaluate_spec(guided, **protocol)
-    rounds: dict[str, Any] = {"refine": 2} if quick else {}
+    rounds: dict[str, Any] = {"optimizer_steps": 2} if quick else {}
     rows["BC, full guard, learned"] = evaluate(cloned, guard="full", world=world, **protocol, **rounds)
     table = Table(
         Column("", no_wrap=True), "return", "norm.", "cost", "safe starts", "unsafe episodes", title=task.name

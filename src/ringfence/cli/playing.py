@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ringfence.errors import UserError
+from ringfence.utils import stored
+from ringfence.utils.renamed import renamed
 
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
@@ -33,12 +35,12 @@ class Playing:
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
     planner: Literal["default", "value_guided", "low_temperature"] = "default"
     """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots."""
-    plans: int | None = None
-    """asked for by the guard."""
+    num_samples: int | None = None
+    """proposals that the guard asks for."""
     margin: float | None = None
     """kept from danger, in units of its source: calibrated margins, or the hazard's safe margin."""
-    rows: int | None = None
-    """foreseen and judged."""
+    horizon: int | None = None
+    """rows that the guard predicts and judges."""
     steps: int | None = None
     """of the sampler."""
     sampler: str | None = None
@@ -52,7 +54,7 @@ class Playing:
     replan: int | None = None
     """steps for which a plan is followed."""
     set: Assignments = field(default_factory=list)
-    """any other option of planner or guard, e.g. --set shield=20 ascent=10; docs/evaluation.md lists them."""
+    """any other option of planner or guard, e.g. --set correction_steps=20 ascent=10; docs/evaluation.md lists them."""
 
     def arguments(self) -> dict[str, Any]:
         """What was given, as arguments of `PolicySpec.of`; refused before any run is played."""
@@ -60,7 +62,7 @@ class Playing:
 
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
         given = {name: value for name, value in given.items() if value is not None}
-        assigned = assignments(self.set)
+        assigned = renamed(assignments(self.set), stored.GUARD_OPTIONS, "--set")
         flags = {"episodes", "split", "num_recorded", "step", *_FLAGS_ALONE}
         for name, value in assigned.items():
             if name in flags:

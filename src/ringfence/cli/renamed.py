@@ -10,7 +10,13 @@ from ringfence.utils import stored
 OLD_COMMANDS: dict[str, str] = {"judge": "ope"}
 # By today's command; "" holds flags of every command.
 OLD_FLAGS: dict[str, dict[str, str]] = {
-    command: {"--danger": "--barrier", "--sight": "--execution"} for command in ("eval", "play", "export", "ope")
+    command: {
+        "--danger": "--barrier",
+        "--sight": "--execution",
+        "--rows": "--horizon",
+        "--plans": "--num-samples",
+    }
+    for command in ("eval", "play", "export", "ope")
 }
 OLD_FLAGS["eval"]["--record"] = "--num-recorded"
 # By today's flag.

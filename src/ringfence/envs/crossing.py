@@ -105,8 +105,8 @@ class Crossing(Defaults):
         """Danger is decided up to ten steps before contact, so what will be dangerous is asked of the last row. Who
         climbs drives as nobody in the logs does, all the more the farther, and others no longer go on as the World
         predicts."""
-        shield = {"rows": 3, "future": True}
-        return {"shield": shield, "adapt": shield, "full": shield | {"reach": 0.5, "margin": 1.5}}
+        shield = {"horizon": 3, "terminal_value": True}
+        return {"shield": shield, "adapt": shield, "full": shield | {"trust_radius": 0.5, "margin": 1.5}}
 
     @property
     def side(self) -> float:

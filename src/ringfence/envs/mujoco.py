@@ -104,8 +104,14 @@ class SafeMuJoCo:
         """What named guards do otherwise (guards.options_of). Three steps ahead predictions err by a tenth of what
         changes. An Ant that is pushed or climbs far from where the logs were falls; where it is to creep, the
         margin is missing most of the time, so that it is always pushed, and less will do."""
-        climb = {"rows": 3, "refine": 10, "starts": 4, "reach": 0.2 if self.ant else 0.5, "care": 30.0}
-        bound = {"bound": 0.2 if self.limit < CREEPING else 0.5} if self.ant else {}
+        climb = {
+            "horizon": 3,
+            "optimizer_steps": 10,
+            "num_restarts": 4,
+            "trust_radius": 0.2 if self.ant else 0.5,
+            "safety_weight": 30.0,
+        }
+        bound = {"max_correction": 0.2 if self.limit < CREEPING else 0.5} if self.ant else {}
         return {"shield": bound, "adapt": bound, "refine": climb, "full": climb | bound}
 
     @property

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.utils import stored
 from ringfence.utils.files import read_npz, whole
 
 Recording = dict[str, np.ndarray]
@@ -31,6 +32,8 @@ def read(folder: Path, variant: str) -> Recording | None:
     """What was kept, or None if nothing was."""
     file = folder / f"rollout-{variant}.npz"
     if not file.exists():
+        file = _of_before(folder, variant)
+    if file is None:
         return None
     try:
         arrays = read_npz(file)
@@ -38,6 +41,12 @@ def read(folder: Path, variant: str) -> Recording | None:
     except ValueError as error:
         raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error
     return arrays
+
+
+def _of_before(folder: Path, variant: str) -> Path | None:
+    """The file that an older version wrote, under the variant's name of then."""
+    files = sorted(folder.glob("rollout-*.npz"))
+    return next((f for f in files if stored.variant(f.stem.removeprefix("rollout-")) == variant), None)
 
 
 def _check(arrays: Recording) -> None:

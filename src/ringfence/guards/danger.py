@@ -25,7 +25,7 @@ class Danger(eqx.Module):
     world: World
     source: str = eqx.field(static=True)  # one of DANGERS
     hazard: BoundHazard | None = eqx.field(static=True)  # bound to the World's view
-    future: bool = eqx.field(static=True)  # the last row is judged by what will be dangerous, too
+    terminal_value: bool = eqx.field(static=True)  # the last row is judged by what will be dangerous, too
 
     def __check_init__(self):
         if self.source not in DANGERS:
@@ -58,7 +58,7 @@ class Danger(eqx.Module):
             return self._by_formula(after)
         barrier = self._barrier
         score = barrier.apart(rows[..., :-1, :, :], after)
-        if self.future:
+        if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
         score = score - jnp.maximum(spread / self.world.strange - 1.0, 0.0)[..., None]

@@ -68,13 +68,13 @@ class Guard(eqx.Module):
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
         (B, C), of each constraint, or (B, N, C) of agents who are alone."""
         proposals = self.world.spec.own(proposals)
-        if self.options.refine:
+        if self.options.optimizer_steps:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.foreseen(present, proposals)
         chosen = self.selected(rows, proposals, self.clear(rows, spread, margin))
         index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
         plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
-        if self.options.shield:
+        if self.options.correction_steps:
             plan = self.shielded(present, plan, margin)
         ahead, spread = self.foreseen(present, plan[:, None])
         missing = self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin)
@@ -127,9 +127,9 @@ class Guard(eqx.Module):
 
     def started(self, proposals: Array, last: Array, key: Key) -> tuple[Array, Array, Array]:
         """(B, S, K, N, A) thrice: what is refined (the proposals, the last plan moved on by a step, and noisy copies of
-        these), and the bounds of each, `reach` around the proposal that it belongs to."""
+        these), and the bounds of each, `trust_radius` around the proposal that it belongs to."""
         many = proposals.shape[1]
-        count = max(self.options.starts, many)
+        count = max(self.options.num_restarts, many)
         moved = jnp.concatenate([last[:, 1:], last[:, -1:]], 1)[:, None]
         known = jnp.concatenate([proposals, moved], 1)[:, :count]
         copied = known.shape[1]
@@ -137,7 +137,7 @@ class Guard(eqx.Module):
         starts = known[:, source]
         noise = self.options.noise * jax.random.normal(key, starts[:, copied:].shape)
         starts = starts.at[:, copied:].add(noise)
-        low, high = self._within(proposals[:, jnp.where(source < many, source, 0)], self.options.reach)
+        low, high = self._within(proposals[:, jnp.where(source < many, source, 0)], self.options.trust_radius)
         return jnp.clip(starts, low, high), low, high
 
     def _within(self, actions: Array, distance: float) -> tuple[Array, Array]:
@@ -147,14 +147,14 @@ class Guard(eqx.Module):
         return self.world.spec.own(low), self.world.spec.own(high)
 
     def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
-        """Actions (B, S, K, N, A) after Adam's ascent of value within bounds, in deviations of the logs', less `care`
-        for every margin that is missing."""
+        """Actions (B, S, K, N, A) after Adam's ascent of value within bounds, in deviations of the logs', less
+        `safety_weight` for every margin that is missing."""
 
         def loss(actions: Array) -> Array:
             rows, spread = self.imagined(present, actions)
             value = self.world.values.of_plan(rows, actions) / self.world.values.usual
             short = jnp.minimum(self.clear(rows, spread, margin), 0.0).sum((2, 3))
-            return -(value.sum() + self.options.care * short.sum())
+            return -(value.sum() + self.options.safety_weight * short.sum())
 
         adam = optax.adam(RATE, b1=0.9, b2=0.99, eps=1e-6)
 
@@ -164,13 +164,13 @@ class Guard(eqx.Module):
             actions = optax.projections.projection_box(optax.apply_updates(actions, move), low, high)
             return (actions, moments), None
 
-        (actions, _), _ = jax.lax.scan(climb, (actions, adam.init(actions)), length=self.options.refine)
+        (actions, _), _ = jax.lax.scan(climb, (actions, adam.init(actions)), length=self.options.optimizer_steps)
         return actions
 
     def selected(self, rows: Array, actions: Array, clear: Array) -> Array:
         """(B,) which proposal: the one of most value among those that keep the margin; where there is none, the safest.
         (B, N) where every agent chooses for itself. `clear` (B, P, K, N)."""
-        if actions.shape[1] == 1 or not (self.options.select or self.options.refine):
+        if actions.shape[1] == 1 or not (self.options.select or self.options.optimizer_steps):
             shape = actions.shape[:1] + ((actions.shape[3],) if self.world.alone else ())
             return jnp.zeros(shape, jnp.int32)
         value = self.world.values.of_plan(rows, actions)
@@ -181,10 +181,10 @@ class Guard(eqx.Module):
         """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
         otherwise.
 
-        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within `bound`
-        of the plan. Where the condition cannot be met, larger actions throw robots over. Where nothing is missing the
-        plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and corrected a few teams
-        at a time as long as there is something to correct.
+        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within
+        `max_correction` of the plan. Where the condition cannot be met, larger actions throw robots over. Where nothing
+        is missing the plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and
+        corrected a few teams at a time as long as there is something to correct.
         """
         batch = plan.shape[0]
         if batch <= TOGETHER:
@@ -210,7 +210,7 @@ class Guard(eqx.Module):
     def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
         """`shielded`, of all teams at once."""
         alone = self.world.alone
-        low, high = self._within(plan, self.options.bound)
+        low, high = self._within(plan, self.options.max_correction)
 
         def shortfall(plan: Array) -> Array:
             return self._shortfall(present, plan, margin)
@@ -230,7 +230,7 @@ class Guard(eqx.Module):
             )
 
         def goes_on(c: Correction) -> Array:  # until the round after the last in which something was missing
-            return (c.round < self.options.shield) & (c.short < 0).any()
+            return (c.round < self.options.correction_steps) & (c.short < 0).any()
 
         nothing = jnp.full((plan.shape[0], plan.shape[2] if alone else 1), -jnp.inf)
         begun = Correction(plan, plan, nothing, nothing, jnp.asarray(0))

@@ -21,44 +21,50 @@ Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions
 class GuardOptions:
     """Every choice of a guard. Margins are in the unit of the danger's source (danger.py)."""
 
-    plans: Samples = 1  # proposals that are asked for
+    num_samples: Samples = 1  # proposals that are asked for
     select: bool = False  # among them; else the first is followed
-    refine: Rounds = 0  # Adam steps that climb the value; 0: none
-    starts: Samples = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
+    optimizer_steps: Rounds = 0  # Adam steps that climb the value; 0: none
+    num_restarts: Samples = 1  # that are refined in all: the proposals, the last plan moved on, and noisy copies
     noise: NonNegative = 0.5  # deviation of noisy copies
-    reach: Distance = 2.0  # how far refining may take an action from its proposal; 2: anywhere
-    care: NonNegative = 10.0  # weight of danger in what is climbed, in deviations of value per margin
-    shield: Rounds = 0  # rounds of correction; 0: none
-    bound: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
-    rows: Samples = 3  # predicted rows that are judged
+    trust_radius: Distance = 2.0  # how far refining may take an action from its proposal; 2: anywhere
+    safety_weight: NonNegative = 10.0  # weight of danger in what is climbed, in deviations of value per margin
+    correction_steps: Rounds = 0  # rounds of correction; 0: none
+    max_correction: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
+    horizon: Samples = 3  # predicted rows that are judged
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: Fall = 0.5  # share of what is left of the distance that one step may use up
     margin: float = 0.6  # distance that is kept
-    future: bool = False  # judge the last row by the value of danger, where it is learned
+    terminal_value: bool = False  # judge the last row by the value of danger, where it is learned
     adapt: NonNegative = 0.0  # step of the margin after a cost; 0: it stays
     rate: CostRate = 0.0125  # share of steps with a cost at which an adapting margin settles
 
     def __post_init__(self):
         check_bounds(self)
-        if self.plans > 1 and not self.select and not self.refine:
-            raise UserError(f"plans={self.plans} are drawn, but none is selected; set select=true, or plans=1.")
-        if self.starts > 1 and not self.refine:
-            raise UserError(f"starts={self.starts} is read by nothing without refine; set refine=30, or starts=1.")
+        if self.num_samples > 1 and not self.select and not self.optimizer_steps:
+            raise UserError(
+                f"num_samples={self.num_samples} are drawn, but none is selected; set select=true, or num_samples=1."
+            )
+        if self.num_restarts > 1 and not self.optimizer_steps:
+            raise UserError(
+                f"num_restarts={self.num_restarts} is read by nothing without optimizer_steps; "
+                "set optimizer_steps=30, or num_restarts=1."
+            )
 
     @property
     def judges(self) -> bool:
         """Whether it does anything at all."""
-        return self.select or self.refine > 0 or self.shield > 0
+        return self.select or self.optimizer_steps > 0 or self.correction_steps > 0
 
 
-_SHIELD = {"shield": 10}
+_SHIELD = {"correction_steps": 10}
 
 # Named sets of choices; "none" follows the proposal.
 GUARDS: dict[str, dict[str, Any]] = {
     "none": {},
-    "select": {"plans": 8, "select": True},
+    "select": {"num_samples": 8, "select": True},
     "shield": _SHIELD,
     "adapt": _SHIELD | {"adapt": 0.1},
-    "refine": {"refine": 20, "starts": 8, "select": True, "rows": 7},
-    "full": _SHIELD | {"plans": 4, "refine": 20, "starts": 8, "select": True, "rows": 7, "adapt": 0.1},
+    "refine": {"optimizer_steps": 20, "num_restarts": 8, "select": True, "horizon": 7},
+    "full": _SHIELD
+    | {"num_samples": 4, "optimizer_steps": 20, "num_restarts": 8, "select": True, "horizon": 7, "adapt": 0.1},
 }

@@ -49,7 +49,7 @@ class Guarded(eqx.Module):
         memory = {
             "inner": self.proposal.start(batch),
             "margin": jnp.full(shape, options.margin),
-            "last": jnp.zeros((batch, options.rows, spec.n_agents, spec.action_dim)),
+            "last": jnp.zeros((batch, options.horizon, spec.n_agents, spec.action_dim)),
             "before": jnp.zeros((batch, spec.n_agents, spec.feature_dim)),
             "cost": jnp.full(batch, jnp.nan),
             "age": jnp.zeros((), jnp.int32),
@@ -131,10 +131,10 @@ class Guarded(eqx.Module):
         world = self.guard.world
         options = self.guard.options
         if isinstance(self.proposal, Proposes):
-            return self.proposal.propose(inner, observations, state, key, options.plans, options.rows, world)
+            return self.proposal.propose(inner, observations, state, key, options.num_samples, options.horizon, world)
         memory, step = self.proposal.act(inner, observations, state, key)
         action = normalise.to_unit(step.action, world.spec.action_low, world.spec.action_high)
-        return memory, held(action, options.rows), {}
+        return memory, held(action, options.horizon), {}
 
 
 def costs_of_one(cost: Paid) -> np.ndarray | dict[str, np.ndarray]:
@@ -171,14 +171,14 @@ def far_sighted(world: World) -> Named:
         return {}
     if not scores.ahead_kept >= KEPT or not _too_late(scores.avoidable):
         return {}
-    return {name: {"future": True} for name in FAR_SIGHTED}
+    return {name: {"terminal_value": True} for name in FAR_SIGHTED}
 
 
 def _too_late(avoidable: Avoidable) -> bool:
     """Whether the rows that a guard predicts avoid little of the danger that could have been avoided, e.g. where
     braking takes longer."""
-    rows = GuardOptions().rows
-    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= rows]
+    horizon = GuardOptions().horizon
+    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= horizon]
     return max(seen, default=0.0) < LITTLE * max(avoidable.avoided)
 
 
@@ -196,7 +196,7 @@ def build(
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
     if usual is None:
-        looks = danger == "learned" and "rows" not in changes and "future" not in changes
+        looks = danger == "learned" and not {"horizon", "terminal_value"} & set(changes)
         usual = far_sighted(world) if looks else {}
     options = build_config(GuardOptions, options_of(name, danger, usual, **changes), "the guard")
     if not options.judges:
@@ -204,4 +204,4 @@ def build(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
-    return Guarded(proposal, Guard(Danger(world, danger, bound, options.future), options))
+    return Guarded(proposal, Guard(Danger(world, danger, bound, options.terminal_value), options))

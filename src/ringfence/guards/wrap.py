@@ -16,6 +16,8 @@ from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
+from ringfence.utils import stored
+from ringfence.utils.renamed import renamed
 from ringfence.world import World
 
 
@@ -65,7 +67,7 @@ class Callback:
         action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
         given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
         present = local_features(world.map, spec.homogeneous, *given)
-        plan = held(split_agents(action) if spec.homogeneous else action, self.guarded.guard.options.rows)
+        plan = held(split_agents(action) if spec.homogeneous else action, self.guarded.guard.options.horizon)
         memory, step = _decided(self.guarded, memory, present, plan, key)
         return memory, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
 
@@ -131,6 +133,7 @@ def guard(
     """
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
+    options = renamed(options, stored.GUARD_OPTIONS, "the guard")
     if isinstance(policy, PerAgent):
         return PerAgent(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
     if isinstance(policy, Policy):

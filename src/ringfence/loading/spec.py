@@ -17,6 +17,7 @@ from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils import stored
 from ringfence.utils.config import fields_of, read_text
+from ringfence.utils.renamed import renamed
 from ringfence.world import World
 
 SIGHTS = ("all", "own")
@@ -27,8 +28,8 @@ Options = tuple[tuple[str, Any], ...]
 @dataclass(frozen=True)
 class PolicySpec:
     """A run, and how it is to be played. `of` makes one from names and options and refuses what cannot be; `name` says
-    it in one word, e.g. `steady+shield-learned+rows7+agents4`, and `parse` reads that back. Neither the order in which
-    options were given nor how their values were spelled makes another spec."""
+    it in one word, e.g. `steady+shield-learned+horizon7+agents4`, and `parse` reads that back. Neither the order in
+    which options were given nor how their values were spelled makes another spec."""
 
     run: Run | None = None
     checkpoint: int | None = None  # the step of the one that is played; None: the last
@@ -61,6 +62,7 @@ class PolicySpec:
         The names under which results are read (utils/stored.py) are understood, too: `barrier` (learned, analytic,
         both) for `danger`, `execution` (centralized, decentralized) of a guard for `sight`, planners and options."""
         planner = _TO_PLANNER.get(planner, planner)
+        options = renamed(options, stored.GUARD_OPTIONS, "the guard")
         options = {_TO_OPTION.get(name, name): value for name, value in _once(options).items()}
         barrier = options.pop("barrier", None)
         if barrier is not None:
@@ -144,7 +146,7 @@ class PolicySpec:
 _TO_PLANNER = {new: old for old, new in stored.PLANNERS.items()}
 _TO_BARRIER = {new: old for old, new in stored.BARRIERS.items()}
 _TO_SIGHT = {new: old for old, new in stored.EXECUTIONS.items()}
-_TO_OPTION = {new: old for names in (stored.PLANNER_OPTIONS, stored.GUARD_OPTIONS) for old, new in names.items()}
+_TO_OPTION = {new: old for old, new in stored.PLANNER_OPTIONS.items()}
 
 
 def _once(options: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -190,6 +192,7 @@ _AGENTS = re.compile(r"agents(\d+)")
 
 def _part(part: str, name: str) -> Iterator[tuple[str, Any]]:
     """What one part of a name says, as arguments of `PolicySpec.of`."""
+    part = stored.choice(part)
     if part in PLANNERS:
         yield "planner", part
     elif found := _GUARD.fullmatch(part):

@@ -96,8 +96,8 @@ class Planner(eqx.Module):
             raise UserError("A guard decides at every step; use replan=1.")
         if rows > self.horizon - 1:
             raise UserError(
-                f"rows={rows} are judged, but plans hold {self.horizon - 1} steps; use at most as many, or a longer "
-                "horizon."
+                f"horizon={rows} rows are judged, but plans hold {self.horizon - 1} steps; use at most as many, or a "
+                "longer horizon."
             )
         past, present = self._context(memory, observations, state)
         plans = self.plans(past, present, key, count)

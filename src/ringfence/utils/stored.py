@@ -92,7 +92,22 @@ def result(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def results(stored: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
     """Results by variant, or reference rows by name."""
-    return {name: result(one) for name, one in stored.items()}
+    return {variant(name): result(one) for name, one in stored.items()}
+
+
+_OLD_OPTION = re.compile(rf"({'|'.join(GUARD_OPTIONS)})(\d.*|(?:True|False).*)")
+
+
+def variant(name: str) -> str:
+    """A result's name under today's names of options, e.g. `default+shield-learned+horizon7`."""
+    preset, *parts = name.split("+")
+    return "+".join([preset, *map(choice, parts)])
+
+
+def choice(part: str) -> str:
+    """A part of such a name."""
+    found = _OLD_OPTION.fullmatch(part)
+    return part if found is None else GUARD_OPTIONS[found[1]] + found[2]
 
 
 def planner_options(stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,6 +157,8 @@ def rows(stored: Iterable[Mapping[str, str]]) -> list[dict[str, str]]:
     for line in stored:
         names = dict(COLUMNS) if "barrier" not in line else {k: v for k, v in COLUMNS.items() if v != "barrier"}
         row = named(line, names | HEADS)
+        if "variant" in row:
+            row["variant"] = variant(row["variant"])
         if "options" in row:
             row["options"] = re.sub(r"\b(\w+)=", lambda m: f"{GUARD_OPTIONS.get(m[1], m[1])}=", row["options"])
         found.append(row)

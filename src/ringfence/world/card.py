@@ -238,7 +238,7 @@ def _of_horizon(avoidable: Avoidable, kept: float) -> str:
     shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
     line = (
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
-        f"{avoidable.rows} ahead (rows={avoidable.rows}), where foresight reaches that far"
+        f"{avoidable.rows} ahead (horizon={avoidable.rows}), where foresight reaches that far"
     )
     if math.isnan(kept):
         return line + "."
