@@ -81,7 +81,7 @@ class Yard:
         self.guard = {"guard": "shield", "horizon": 7}
 
     def play(self, world, **options) -> dict:
-        kw = dict(episodes=self.episodes, at_once=self.episodes, split="validation", world=world)
+        kw = dict(episodes=self.episodes, num_envs=self.episodes, split="validation", world=world)
         return ringfence.play(self.run, self.env, **kw, **{**self.guard, **options})
 
 

@@ -66,7 +66,7 @@ def main() -> None:
     rows = []
     for guard, barriers in ROWS:
         how = {} if guard == "none" else {"guard": guard, "world": worlds[barriers], "rate": rate}
-        r = ringfence.play(runs[barriers], Strict, episodes=episodes, at_once=100, **how)
+        r = ringfence.play(runs[barriers], Strict, episodes=episodes, num_envs=100, **how)
         touched, hurried = (r["constraints"][name] for name in LIMITS)
         row = {
             "guard": guard,

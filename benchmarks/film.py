@@ -1,6 +1,6 @@
 """Films of two runs on the same test reset, side by side: robots with speed and limit drawn in, discs with who touches.
 
-    ringfence get crossing-hasty/bc; RUN=runs/crossing-hasty/bc/seed-0
+    ringfence pretrained crossing-hasty/bc; RUN=runs/crossing-hasty/bc/seed-0
     ringfence eval $RUN --agents 64 --episodes 1 --num-recorded 1
     ringfence eval $RUN --agents 64 --episodes 1 --num-recorded 1 --guard shield
     python benchmarks/film.py $RUN default+agents64 $RUN default+shield-learned+agents64 --out docs/images/crossing.gif

@@ -171,7 +171,7 @@ def main() -> None:
 
     def played(words: str, run, world, n: int, **guard) -> None:
         guarded = {} if not guard else {"world": world} | guard
-        r = play(run, lambda: IrSim(n), episodes=a.episodes, agents=n, at_once=50, **guarded)
+        r = play(run, lambda: IrSim(n), episodes=a.episodes, agents=n, num_envs=50, **guarded)
         row = {"learned from": words, "agents": n, "guard": guard.get("guard", "none"), "seed": a.seed}
         row |= {"options": ", ".join(f"{k}={v}" for k, v in guard.items() if k != "guard")}
         row |= {"episodes": a.episodes, "return": round(r["return_mean"], 3), "steps with contact": r["cost_mean"]}

@@ -38,12 +38,12 @@ def main() -> None:
     rows: list[dict] = []
     with tempfile.TemporaryDirectory() as there:
         for name in ("simple_spread-expert/bc", "simple_spread-expert/icbf"):
-            run = zoo.get(name, there)
+            run = zoo.pretrained(name, there)
             for place, make in PLACES.items():
                 for how in ({}, {"guard": "shield"}):
-                    result = ringfence.play(run, make, episodes=EPISODES, at_once=100, **how)
+                    result = ringfence.play(run, make, episodes=EPISODES, num_envs=100, **how)
                     rows.append(row(name, "OMAR's rules", place, result))
-        pilot = ringfence.Controller(zoo.get("simple_spread-expert/bc", there))
+        pilot = ringfence.Controller(zoo.pretrained("simple_spread-expert/bc", there))
         rng = np.random.default_rng(0)
         unsure = lambda seen, state: np.clip(pilot.act(seen, state) + 0.5 * rng.normal(size=(3, 2)), -1, 1)  # noqa: E731
         card = {"task": "mpe2-spread", "observation_names": [*NAMES, *(f"silence{k}" for k in range(4))]}
@@ -51,7 +51,7 @@ def main() -> None:
         world = ringfence.fit(store)
         run = ringfence.train("bc", store, out=there, quiet=True)[0]
         for how in ({}, {"guard": "shield", "world": world}):
-            result = ringfence.play(run, Spread, episodes=EPISODES, at_once=100, **how)
+            result = ringfence.play(run, Spread, episodes=EPISODES, num_envs=100, **how)
             rows.append(row("bc, learned of logs recorded there", "mpe2", "mpe2", result))
     write(OUT, rows)
     put("docs/evaluation.md", "mpe2", table(rows))

@@ -43,7 +43,7 @@ def main() -> None:
     arguments = parser.parse_args()
     rows = Rows()
     with tempfile.TemporaryDirectory() as folder:
-        run = zoo.get(POLICY, Path(folder) / "runs").path
+        run = zoo.pretrained(POLICY, Path(folder) / "runs").path
         command = EVALUATE.format(run=run)
         measure(rows, f"ringfence {EVALUATE.format(run=POLICY)}", arguments.repeats, lambda: evaluated(command))
         for guard in ("shield", "full"):

@@ -64,7 +64,7 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
         def look(updates: int) -> None:
             if updates not in wanted or updates in there:
                 return
-            found, _ = evaluate_policy(load(run, step=updates)[1], task, EPISODES, "validation", 0)
+            found, _ = evaluate_policy(load(run, checkpoint=updates)[1], task, EPISODES, "validation", 0)
             logged = [r for r in run.metrics if r["step"] <= updates]
             row = dict(zip(FIELDS, (name, algorithm, SEED, updates, round(sum(r["seconds"] for r in logged)))))
             row |= {k: f"{found[v]:.5g}" for k, v in (("return", "return_mean"), ("return_norm", "return_norm"))}

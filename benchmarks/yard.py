@@ -77,12 +77,12 @@ def main() -> None:
         asked = {} if guard == "none" else {"guard": guard, "danger": danger, **options}
         if method == "BC":
             r = ringfence.play(
-                run, yard.Yard, episodes=episodes, at_once=100, **asked, **({"world": world} if asked else {})
+                run, yard.Yard, episodes=episodes, num_envs=100, **asked, **({"world": world} if asked else {})
             )
         else:
             asked = asked or {"correction_steps": 0, "select": True}  # of one proposal: a guard that only looks on
             pilot = ringfence.guard(blind, world, hazard=hazard, **asked)
-            r = ringfence.play(pilot, yard.Yard, episodes=episodes, at_once=100)
+            r = ringfence.play(pilot, yard.Yard, episodes=episodes, num_envs=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]
         bound = upper_bound(round(r["violation_rate"] * episodes), episodes)
         rows.append([method, guard, danger, words, episodes, *measured, bound])

@@ -54,7 +54,7 @@ def main() -> None:
     rows = []
     with tempfile.TemporaryDirectory() as there:
         for name in zoo.names():
-            task, run = name.split("/")[0], zoo.get(name, there)
+            task, run = name.split("/")[0], zoo.pretrained(name, there)
             planner = "steady" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "plain"
             for guard in ("none", GUARDS[task]):
                 result = evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)

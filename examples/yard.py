@@ -152,7 +152,7 @@ def main(episodes: int = 200) -> None:
     run = ringfence.train("bc", store)[0]
     for guard in ("none", "shield", "full"):
         how = {} if guard == "none" else {"guard": guard, "world": world}
-        told = ringfence.play(run, Yard, episodes=episodes, at_once=100, **how)
+        told = ringfence.play(run, Yard, episodes=episodes, num_envs=100, **how)
         bad = 100 * told["violation_rate"]
         print(f"cloning, guard {guard:7} return {told['return_mean']:.2f}, {bad:.1f} % of episodes with contact")
 

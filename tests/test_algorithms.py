@@ -141,11 +141,11 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
         out=tmp_path / "b",
         changes=changes,
         quiet=True,
-        together=True,
+        vmap_seeds=True,
         tensorboard=True,
     )
     assert all(list((run.path / "tensorboard").glob("events*")) for run in together)
-    more = dict(changes=changes, quiet=True, together=True)
+    more = dict(changes=changes, quiet=True, vmap_seeds=True)
     both = loop.train("bc", small_store, seeds=(0, 2), out=tmp_path / "b", **more)  # a seed beside those there
     assert [run.metrics[-1]["step"] for run in both] == [12, 12]
     for x, y in zip(apart, together):
@@ -450,7 +450,7 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
     assert evaluate(str(trained["bc"].path), episodes=2)["step"] == 12
     assert not caplog.text
     with pytest.raises(CheckpointError, match="no checkpoint of step 7; take one of: 5"):
-        evaluate(run, episodes=2, step=7)
+        evaluate(run, episodes=2, checkpoint=7)
 
 
 class Lost(eqx.Module):
@@ -578,13 +578,13 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
     ("words", "said"),
     [
         (["--set", "planner=climbing"], "write --planner climbing"),
-        (["--set", "step=12"], "write --step 12"),
+        (["--set", "checkpoint=12"], "write --checkpoint 12"),
         (["--set", "quiet=1"], "Unknown option of planner or guard 'quiet'"),
         (["--steps", "3", "--set", "steps=2"], "--steps 3 and --set steps=2 both set steps"),
         (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
         (["--set", "steps=3", "--set", "num_samples=2", "horizon=x"], "horizon='x' cannot be read as int"),
         (["--record", "-1"], "num_recorded=-1 must be a whole number"),
-        (["--step", "3"], "no checkpoint of step 3; take one of: 6, 12"),
+        (["--checkpoint", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],
 )
 def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsys):

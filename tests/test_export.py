@@ -205,7 +205,7 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
         ([str(run.path), *out, "--guard", "shield"], "needs the World of its data"),
         ([str(run.path), *out, "--set", "horizn=3"], "did you mean 'horizon'"),
         ([str(run.path), *out, "--format", "tflite"], "invalid choice"),
-        ([str(run.path), *out, "--step", "99"], "holds no checkpoint of step 99"),
+        ([str(run.path), *out, "--checkpoint", "99"], "holds no checkpoint of step 99"),
     ):
         with pytest.raises(SystemExit) as stop:
             main(["export", *words])

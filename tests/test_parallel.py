@@ -47,13 +47,13 @@ class Watched(SimpleSpreadParallel):
 
 def test_what_is_summed_is_what_the_simulator_gave(run):
     Watched.books = []
-    result = play(run, Watched, episodes=3, at_once=2)
+    result = play(run, Watched, episodes=3, num_envs=2)
     books = np.array(Watched.books)  # (E, L, 2)
     np.testing.assert_allclose(result["per_episode"]["return"], books[..., 0].sum(1), atol=2e-3)
     np.testing.assert_allclose(result["per_episode"]["cost"], books[..., 1].sum(1))
     assert result["episodes"] == 3 and result["cost_limit"] == 3 and result["steps_mean"] == 25
     assert result["termination_rate"] == 0 and "return_norm" not in result
-    alone = play(run, Watched, episodes=3, at_once=1)  # cloning draws nothing: side by side or not is the same
+    alone = play(run, Watched, episodes=3, num_envs=1)  # cloning draws nothing: side by side or not is the same
     np.testing.assert_allclose(alone["per_episode"]["return"], result["per_episode"]["return"], atol=2e-3)
     charged = play(run, Watched, episodes=1, cost=lambda infos: 2.0)
     assert charged["cost_mean"] == 50
@@ -94,7 +94,7 @@ def test_the_hazard_counts_where_the_simulator_does_not(own_store, tmp_path):
             counted.append(max(self.said))
             return step
 
-    result = play(run, Counted, episodes=40, at_once=20)
+    result = play(run, Counted, episodes=40, num_envs=20)
     assert 0 < result["cost_mean"] * 40 == pytest.approx(sum(counted))
     Own.end = 7
     try:

@@ -154,7 +154,9 @@ def test_what_was_played_before_training_went_on_is_dated(runs):
     (section,) = sections(runs)
     seeds = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
     assert seeds["split@step10"] == (0,) and seeds["split"] == (1,)
-    assert any("--step 10" in line and str(runs[0].path) in line for line in made.commands(section, Path("r.html")))
+    assert any(
+        "--checkpoint 10" in line and str(runs[0].path) in line for line in made.commands(section, Path("r.html"))
+    )
 
 
 def test_a_run_that_is_older_than_a_field_had_its_default(runs):

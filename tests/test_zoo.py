@@ -21,11 +21,11 @@ from ringfence.training.runs import Run
 def test_every_one_is_loaded_with_the_world_that_guards_it(name, tmp_path, monkeypatch):
     """Nothing is regenerated, fitted or trained for it."""
     monkeypatch.setattr(run_worlds, "_of_data", lambda *_: pytest.fail("asked for its data"))
-    run = zoo.get(name, tmp_path)
+    run = zoo.pretrained(name, tmp_path)
     job, policy = load(run, guard="shield")
     assert (job.task.name, job.algorithm.name) == tuple(name.split("/"))
     assert policy.start(2)
-    assert run.path == tmp_path / name / "seed-0" and zoo.get(name, tmp_path).path == run.path
+    assert run.path == tmp_path / name / "seed-0" and zoo.pretrained(name, tmp_path).path == run.path
 
 
 def test_they_are_few_and_small():
@@ -41,7 +41,7 @@ def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
     assert [f.name for f in made] == ["bc.safetensors", "world.safetensors", "bc-world.safetensors"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(zoo, "FOLDER", tmp_path)
-        back = zoo.get("mine/bc", tmp_path / "got")
+        back = zoo.pretrained("mine/bc", tmp_path / "got")
     seen, state = small_store.observations[0], small_store.state[0]
     was, now = (Controller(r, guard="shield", horizon=1, correction_steps=1, world=small_world) for r in (run, back))
     np.testing.assert_allclose(now.act(seen, state), was.act(seen, state), atol=0.02)
@@ -53,13 +53,13 @@ def test_what_does_not_fit_or_is_not_there_is_refused(tmp_path, capsys):
     with pytest.raises(UserError, match="beyond 65504"):
         zoo.half(np.float32([1e6]), "ema/actor")
     with pytest.raises(SystemExit):
-        app.main(["get", "crossing-hasty/bd"])
+        app.main(["pretrained", "crossing-hasty/bd"])
     assert "did you mean 'crossing-hasty/bc'" in capsys.readouterr().err
     (tmp_path / "crossing-hasty/bc/seed-0").mkdir(parents=True)
-    config = zoo.get("simple_spread-expert/bc", tmp_path).path / "config.json"
+    config = zoo.pretrained("simple_spread-expert/bc", tmp_path).path / "config.json"
     (tmp_path / "crossing-hasty/bc/seed-0/config.json").write_text(config.read_text())
     with pytest.raises(UserError, match="holds another run"):
-        zoo.get("crossing-hasty/bc", tmp_path)
+        zoo.pretrained("crossing-hasty/bc", tmp_path)
     assert not Run(tmp_path / "crossing-hasty/bc/seed-0").checkpoints()
-    app.main(["get"])
+    app.main(["pretrained"])
     assert capsys.readouterr().out.split() == zoo.names()

@@ -60,7 +60,7 @@ def train(
     preset: str | None = None,
     set: Assignments = [],  # noqa: B006 (tyro reads it, nobody writes it)
     out: Path = Path("runs"),
-    together: bool = False,
+    vmap_seeds: bool = False,
     tensorboard: bool = False,
 ) -> None:
     """Train an algorithm on a task or on a store of your own; an interrupted run is resumed by the same command.
@@ -73,7 +73,7 @@ def train(
         preset: named differences from the defaults, e.g. split or paper; by default that of the data tier, if any.
         set: config fields, e.g. --set barrier_weight=0.5 steps=8000.
         out: folder of runs.
-        together: train all seeds in one program.
+        vmap_seeds: train all seeds in one program.
         tensorboard: write TensorBoard logs, too.
     """
     from ringfence.training import loop
@@ -88,7 +88,7 @@ def train(
         seeds=tuple(range(first_seed, first_seed + seeds)),
         out=out,
         changes=changes,
-        together=together,
+        vmap_seeds=vmap_seeds,
         tensorboard=tensorboard,
     )
     for run in runs:
@@ -138,7 +138,7 @@ def evaluate(
     episodes: int = 200,
     split: Literal["test", "validation"] = "test",
     num_recorded: int = 4,
-    step: int | None = None,
+    checkpoint: int | None = None,
     video: bool = False,
     playing: How = AS_IT_IS,
 ) -> None:
@@ -149,7 +149,7 @@ def evaluate(
         episodes: at least 200 for a table.
         split: test resets, or validation resets for choosing settings.
         num_recorded: episodes kept for the animation of the report.
-        step: of the checkpoint that is played; the last one by default.
+        checkpoint: step of the one that is played; the last one by default.
         video: make a GIF of the first episode (robots).
     """
     from ringfence.evaluation.evaluate import evaluate as run_evaluation
@@ -163,7 +163,13 @@ def evaluate(
         for run in {run.config["task"]: run for run in found}.values():
             check(load_job(run).task)
         num_recorded = num_recorded or 1
-    given |= {"episodes": episodes, "split": split, "num_recorded": num_recorded, "step": step, "quiet": False}
+    given |= {
+        "episodes": episodes,
+        "split": split,
+        "num_recorded": num_recorded,
+        "checkpoint": checkpoint,
+        "quiet": False,
+    }
     names = (
         "run",
         "variant",
@@ -220,7 +226,7 @@ def play(
     env: str,
     episodes: int = 100,
     split: Literal["test", "validation"] = "test",
-    at_once: int = 16,
+    num_envs: int = 16,
     playing: How = AS_IT_IS,
 ) -> None:
     """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports.
@@ -230,7 +236,7 @@ def play(
         env: what makes the simulator, as FILE.py:NAME or MODULE:NAME, e.g. examples/yard.py:Yard. It is run.
         episodes: a bound of 1 % takes 300 without an accident.
         split: test resets, or validation resets for choosing settings.
-        at_once: simulators that are stepped side by side.
+        num_envs: simulators that are stepped side by side.
     """
     from ringfence.evaluation.play import play as run_play
     from ringfence.evaluation.simulators import simulator
@@ -238,7 +244,7 @@ def play(
     given = playing.arguments()
     found = _some_runs(runs)
     make = simulator(env)
-    given |= {"episodes": episodes, "split": split, "at_once": at_once, "keep": True, "quiet": False}
+    given |= {"episodes": episodes, "split": split, "num_envs": num_envs, "keep": True, "quiet": False}
     table = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
     refusals = Refusals()
     for run in found:
@@ -276,7 +282,7 @@ def _say(table: Table, refusals: Refusals, runs: int) -> None:
         sys.exit(2)
 
 
-def get(
+def pretrained(
     names: Positional[tuple[str, ...]] = (), out_folder: Annotated[Path, tyro.conf.arg(name="out")] = Path("runs")
 ) -> None:
     """Trained policies that come with the package, to be evaluated, filmed and played at once; without a name, which.
@@ -289,7 +295,7 @@ def get(
 
     if not names:
         print(*zoo.names(), sep="\n")
-    for run in [zoo.get(name, out_folder) for name in names]:
+    for run in [zoo.pretrained(name, out_folder) for name in names]:
         print(run.path)
 
 
@@ -297,7 +303,7 @@ def export(
     run: Positional[Path],
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
     format: Literal["onnx", "stablehlo"] = "onnx",
-    step: int | None = None,
+    checkpoint: int | None = None,
     playing: How = AS_IT_IS,
 ) -> None:
     """Write a trained policy, guard included, as one file that needs neither Python nor this library.
@@ -306,7 +312,7 @@ def export(
         run: a run folder.
         out_file: the file to write.
         format: onnx, for onnxruntime and the like, needs the extra `ringfence[export]`; stablehlo needs nothing.
-        step: of the checkpoint that is written; the last one by default.
+        checkpoint: step of the one that is written; the last one by default.
     """
     given = playing.arguments()
     found = _runs([run])
@@ -314,7 +320,7 @@ def export(
         raise UserError(f"'{run}' holds {len(found)} runs, and a file is of one; name it, e.g. {found[0].path}.")
     from ringfence.deploy.export import export as write
 
-    print(write(found[0], out_file, format, step, **given))
+    print(write(found[0], out_file, format, checkpoint, **given))
 
 
 def ope(
@@ -397,7 +403,7 @@ COMMANDS = {
     "train": train,
     "eval": evaluate,
     "play": play,
-    "get": get,
+    "pretrained": pretrained,
     "export": export,
     "bench": bench_commands.bench,
     "ope": ope,

@@ -63,7 +63,7 @@ class Playing:
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
         given = {name: value for name, value in given.items() if value is not None}
         assigned = renamed(assignments(self.set), stored.GUARD_OPTIONS, "--set")
-        flags = {"episodes", "split", "num_recorded", "step", *_FLAGS_ALONE}
+        flags = {"episodes", "split", "num_recorded", "checkpoint", *_FLAGS_ALONE}
         for name, value in assigned.items():
             if name in flags:
                 flag = f"--{name.replace('_', '-')}"

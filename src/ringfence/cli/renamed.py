@@ -7,7 +7,7 @@ import sys
 from ringfence.utils import stored
 
 # Of `ringfence data X` the command is "data X", of `ringfence bench X` it is "bench X".
-OLD_COMMANDS: dict[str, str] = {"judge": "ope"}
+OLD_COMMANDS: dict[str, str] = {"judge": "ope", "get": "pretrained"}
 # By today's command; "" holds flags of every command.
 OLD_FLAGS: dict[str, dict[str, str]] = {
     command: {
@@ -18,7 +18,10 @@ OLD_FLAGS: dict[str, dict[str, str]] = {
     }
     for command in ("eval", "play", "export", "ope")
 }
-OLD_FLAGS["eval"]["--record"] = "--num-recorded"
+OLD_FLAGS["eval"] |= {"--record": "--num-recorded", "--step": "--checkpoint"}
+OLD_FLAGS["export"] |= {"--step": "--checkpoint"}
+OLD_FLAGS["play"] |= {"--at-once": "--num-envs"}
+OLD_FLAGS["train"] = {"--together": "--vmap-seeds"}
 # By today's flag.
 OLD_VALUES: dict[str, dict[str, str]] = {
     "--barrier": stored.BARRIERS,

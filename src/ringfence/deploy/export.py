@@ -42,6 +42,7 @@ from ringfence.training.runs import Run
 from ringfence.types import Array, Key, Policy
 from ringfence.utils.files import whole, writable
 from ringfence.utils.pytrees import digest_of, named_arrays, named_leaves
+from ringfence.utils.renamed import renamed
 
 FORMATS = ("onnx", "stablehlo")
 OPSET = 21  # of ONNX: onnxruntime 1.20 (2024) and younger read it
@@ -76,9 +77,9 @@ def export(
     run: Run | str | Path,
     out: str | Path,
     format: str = "onnx",
-    step: int | None = None,
+    checkpoint: int | None = None,
     planner: str = "plain",
-    **options,
+    **options: Any,
 ) -> Path:
     """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, needs the extra
     `ringfence[export]`; `stablehlo` needs nothing. Options are those of `evaluate.load`; what a format cannot hold is
@@ -87,7 +88,9 @@ def export(
         raise unknown("format", str(format), FORMATS)
     file = writable(out)
     _converter() if format == "onnx" else _packer()
-    resolved = resolve(PolicySpec.of(run, checkpoint=step, planner=planner, **options))
+    options = renamed(options, {"step": "checkpoint"}, "export")
+    checkpoint = options.pop("checkpoint", checkpoint)
+    resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     action = step_of(resolved.job, resolved.team)
     metadata = metadata_of(resolved, action)
     write = _write_onnx if format == "onnx" else _write_stablehlo

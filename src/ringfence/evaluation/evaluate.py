@@ -24,7 +24,7 @@ from ringfence.utils.renamed import renamed
 _log = logging.getLogger(__name__)
 
 Split = Literal["test", "validation"]
-OLD_ARGUMENTS = {"record": "num_recorded"}
+OLD_ARGUMENTS = {"record": "num_recorded", "step": "checkpoint"}
 
 
 def evaluate(
@@ -35,7 +35,7 @@ def evaluate(
     planner: str = "plain",
     num_recorded: int = 0,
     quiet: bool = True,
-    step: int | None = None,
+    checkpoint: int | None = None,
     **options: Any,
 ) -> dict[str, Any]:
     """Evaluate a run folder and add the result to its results.json, under the variant's name.
@@ -46,8 +46,9 @@ def evaluate(
     """
     options = renamed(options, OLD_ARGUMENTS, "evaluate")
     num_recorded = options.pop("num_recorded", num_recorded)
+    checkpoint = options.pop("checkpoint", checkpoint)
     return evaluate_spec(
-        PolicySpec.of(run, checkpoint=step, planner=planner, **options),
+        PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options),
         episodes=episodes,
         split=split,
         num_recorded=num_recorded,

@@ -24,7 +24,7 @@ from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import renamed
 
-OLD_ARGUMENTS = {"longest": "max_episode_steps"}
+OLD_ARGUMENTS = {"longest": "max_episode_steps", "at_once": "num_envs"}
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
 
 
@@ -37,7 +37,7 @@ def play(
     split: str = "test",
     seed: int = 0,
     cost: Cost | None = None,
-    at_once: int = 16,
+    num_envs: int = 16,
     max_episode_steps: int | None = None,
     keep: bool = False,
     quiet: bool = True,
@@ -46,8 +46,8 @@ def play(
     """Returns, costs and their intervals over `episodes` episodes of a simulator.
 
     run: a run, or a policy of anybody's under guard (`ringfence.guard`). `make_env()` makes a PettingZoo `ParallelEnv`
-    whose agents, in the order of `possible_agents`, are those of the data, and who begin and end together. `at_once` of
-    them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
+    whose agents, in the order of `possible_agents`, are those of the data, and who begin and end together.
+    `num_envs` of them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
     7 000 001 + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
     `max_episode_steps` (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's
     noise. `planner` and `options` (guard, danger, sight, world, ...) are as in `evaluate.load`. `keep` adds the result
@@ -63,8 +63,9 @@ def play(
     keep_programs()
     options = renamed(options, OLD_ARGUMENTS, "play")
     max_episode_steps = options.pop("max_episode_steps", max_episode_steps)
+    num_envs = options.pop("num_envs", num_envs)
     whole_number("episodes", episodes, 1)
-    whole_number("at_once", at_once, 1)
+    whole_number("num_envs", num_envs, 1)
     if max_episode_steps is not None:
         whole_number("max_episode_steps", max_episode_steps, 1)
     if split not in rollout.RESETS:
@@ -73,7 +74,7 @@ def play(
     if keep:
         _check_kept(player)
     max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
-    envs = _made(make_env, min(at_once, episodes))
+    envs = _made(make_env, min(num_envs, episodes))
     begun = time.perf_counter()
     key = jax.random.key(seed)
     tables: list[Table] = []
@@ -108,7 +109,7 @@ def _made(make_env: Callable[[], Any], count: int) -> list[Any]:
     if len({id(env) for env in envs}) < len(envs):
         raise UserError(
             f"make_env() gave the same {type(envs[0]).__name__} twice, but several are stepped side by side; make a "
-            "new one at every call, or pass at_once=1."
+            "new one at every call, or pass num_envs=1."
         )
     return envs
 

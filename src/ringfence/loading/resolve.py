@@ -25,6 +25,7 @@ from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
 from ringfence.types import Policy, PyTree, Spec
 from ringfence.utils.config import build_config
+from ringfence.utils.renamed import renamed
 from ringfence.world import World
 
 
@@ -67,7 +68,7 @@ class Resolved:
         return self.spec.variant(self.job.preset, split)
 
 
-def load(run: Run | str, step: int | None = None, planner: str = "plain", **options: Any) -> tuple[Job, Policy]:
+def load(run: Run | str, checkpoint: int | None = None, planner: str = "plain", **options: Any) -> tuple[Job, Policy]:
     """(job, policy) of a finished run.
 
     `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards
@@ -77,7 +78,9 @@ def load(run: Run | str, step: int | None = None, planner: str = "plain", **opti
     are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """
-    found = resolve(PolicySpec.of(run, checkpoint=step, planner=planner, **options))
+    options = renamed(options, {"step": "checkpoint"}, "load")
+    checkpoint = options.pop("checkpoint", checkpoint)
+    found = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     return found.job, found.team
 
 

@@ -119,7 +119,7 @@ def _how(result: Result, run: Run) -> str:
     if result["split"] == "validation":
         words.append("--split validation")
     if not of_last_step(result, run.config["config"]):
-        words.append(f"--step {result['step']}")
+        words.append(f"--checkpoint {result['step']}")
     planner = result.get("planner", "default")
     if planner != "default":
         words.append(f"--planner {planner}")

@@ -6,6 +6,7 @@ not, and chunk lengths change nothing.
 
 from __future__ import annotations
 
+import inspect
 import json
 import operator
 import shutil
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets import registry
-from ringfence.errors import CheckpointError, RunConflict, UserError
+from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.logs.provenance import other_data, regenerated
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, draw
@@ -33,10 +34,12 @@ from ringfence.utils.compilation import keep_programs
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
 from ringfence.utils.progress import Progress
+from ringfence.utils.renamed import renamed
 from ringfence.world import World
 from ringfence.world import save as save_world
 
 Arrays = dict[str, Array]
+OLD_ARGUMENTS = {"together": "vmap_seeds"}
 
 
 def train(
@@ -48,7 +51,7 @@ def train(
     out: str | Path = "runs",
     changes: dict | None = None,
     world: dict | None = None,
-    together: bool = False,
+    vmap_seeds: bool = False,
     chunk: int | None = None,
     checkpoint_every: int | None = None,
     tensorboard: bool = False,
@@ -56,17 +59,22 @@ def train(
     on_chunk: Callable[[int, dict], None] | None = None,
     on_finish: Callable[[Run], None] | None = None,
     folder: Callable[[int], Path] | None = None,
+    **older: Any,
 ) -> list[Run]:
     """Train `algorithm` on `data` for every seed; returns one finished run folder per seed.
 
     A folder that exists is resumed from its last checkpoint if it holds the same job, and refused otherwise.
-    `together` trains all seeds in one program (same results up to rounding; faster only where the networks are too
+    `vmap_seeds` trains all seeds in one program (same results up to rounding; faster only where the networks are too
     small to fill the machine). `chunk` is the number of updates between log lines, a fortieth of all by default;
     `world` changes settings of the World that training reads (world/fitting.py `Settings`), if it reads one.
     `on_chunk` and `on_finish` are called after each of them and with each finished run. `folder` names the run folder
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
     keep_programs()
+    older = renamed(older, OLD_ARGUMENTS, "train")
+    vmap_seeds = older.pop("vmap_seeds", vmap_seeds)
+    if older:
+        raise unknown("argument of train()", next(iter(older)), inspect.signature(train).parameters)
     if not isinstance(data, EpisodeStore):
         raise UserError(
             f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
@@ -93,12 +101,12 @@ def train(
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
     chunk = chunk or max(1, steps // 40)
     options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
-    if together and left:
+    if vmap_seeds and left:
         with _undone(fresh):
             _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
     for run, seed in zip(runs, seeds):
-        if run in left and not together:
+        if run in left and not vmap_seeds:
             with _undone(fresh):
                 program = _loop(job, lessons, [run], [seed], options, program)
         if on_finish:

@@ -23,6 +23,7 @@ from ringfence.training.runs import Run, write_json
 from ringfence.utils import stored
 from ringfence.utils.files import whole, writable
 from ringfence.utils.pytrees import digest_of, named_arrays
+from ringfence.utils.renamed import deprecated
 from ringfence.world import World
 from ringfence.world import save as save_world
 
@@ -35,7 +36,7 @@ def names() -> list[str]:
     return sorted(f"{f.parent.name}/{f.stem}" for f in found)
 
 
-def get(name: str, out: str | Path = "runs") -> Run:
+def pretrained(name: str, out: str | Path = "runs") -> Run:
     """The run folder out/TASK/ALGORITHM/seed-S of a trained policy, made of the file in the package; the one that is
     there if it is the same."""
     if name not in names():
@@ -115,3 +116,9 @@ def _put_world(world: World, file: Path) -> Path:
 
 def _content(world: World) -> str:
     return digest_of(named_arrays(world).items())
+
+
+def get(name: str, out: str | Path = "runs") -> Run:
+    """`pretrained` as it was called in 0.1.0."""
+    deprecated("get of ringfence.zoo", "pretrained")
+    return pretrained(name, out)
