@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,6 @@ from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import deprecated
 
 EACH = 100  # episodes after which what is there is kept
-KEPT = ("observations", "actions", "rewards", "costs")
 
 
 def record(
@@ -36,11 +36,11 @@ def record(
 ) -> EpisodeStore:
     """The logs of `episodes` episodes of `make_env()`, a PettingZoo `ParallelEnv` whose agents begin and end together.
 
-    `policy` takes observations (N, O) and the state (S,), or None where the simulator tells none, and gives actions
-    (N, A); what has `act` and `reset` (a `Controller`, a guarded callable) is reset with every episode. None draws
+    `policy` takes observations (N, O) and the state (S,), or None where the simulator has none, and gives actions
+    (N, A). One with `act` and `reset` (a `Controller`, a guarded callable) is reset with every episode. None draws
     actions uniformly within the action spaces' bounds. Episode k is reset with `seed` + k, and its draws follow from
-    that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0. Told as a
-    dictionary they are those of constraints, whose limits per episode `card["constraints"]` tells (0 by default).
+    that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0. A
+    dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0 by default).
 
     With `out` a store's file is written every hundred episodes, and a recording of the same simulator, policy's name
     and seed goes on from there. `max_episode_steps` without an end are refused. `card` adds fields to the store's.
@@ -56,47 +56,125 @@ def record(
     file = None if out is None else writable(out)
     env = make_env()
     check(env, "action_space")
-    name = getattr(policy, "__qualname__", type(policy).__name__) if policy is not None else "uniform"
-    if code := getattr(policy, "__code__", None):  # two lambdas have one name
-        name += "-" + hashlib.blake2b(code.co_code + repr(code.co_consts).encode(), digest_size=3).hexdigest()
-    told = {"simulator": type(env).__name__, "policy": name, "first_seed": seed}
-    done = _before(file, told, episodes)
-    if done is not None and done.episodes >= episodes:
-        return done
-    (low, high, width), shown = _bounds(env), Shape(state=None if _tells_state(env, seed) else 0)
-    act = getattr(policy, "act", policy)
-    made: list[dict] = []
-    begun = 0 if done is None else done.episodes
-    with Progress(f"recording {type(env).__name__}", episodes, begun, quiet) as bar:
+    player = _Player.of(policy)
+    source = {"simulator": type(env).__name__, "policy": player.name, "first_seed": seed}
+    kept = _kept_before(file, source, episodes)
+    begun = 0 if kept is None else kept.episodes
+    if kept is not None and begun >= episodes:
+        return kept
+    rules = _Rules(
+        bounds=_bounds(env),
+        shape=Shape(state=None if _has_state(env, seed) else 0),
+        cost=cost,
+        max_steps=max_episode_steps,
+    )
+    fresh: list[_Played] = []
+    with Progress(f"recording {source['simulator']}", episodes, begun, quiet) as bar:
         for k in range(begun, episodes):
-            if hasattr(policy, "reset"):
-                policy.reset()
-            chance = np.random.default_rng((seed, k))
-            made.append(_played(env, shown, act, seed + k, cost, max_episode_steps, low, high, width, chance))
+            fresh.append(_played(env, player, rules, seed, k))
             bar.advance(1)
-            if file is not None and (len(made) == EACH or k + 1 == episodes):
-                done, made = _grown(done, made, told, (low, high), env, card), []
-                done.save(file)
-    return done if not made else _grown(done, made, told, (low, high), env, card)
+            if k + 1 == episodes or (file is not None and len(fresh) == EACH):
+                made = _store(
+                    fresh, env, rules.bounds, source, card, by_agent=kept is not None and kept.costs.ndim == 2
+                )
+                kept = made if kept is None else kept.followed_by(made)
+                fresh = []
+                if file is not None:
+                    kept.save(file)
+    assert kept is not None  # the last episode is always kept
+    return kept
 
 
-def _played(
-    env, shown: Shape, act, seed: int, cost, max_episode_steps: int, low: float, high: float, width: int, chance
-) -> dict:
-    """Arrays of one episode of L steps: observations (L+1, N, O), actions (L, N, A), ..."""
-    episode = Episode(env, shown, seed, max_episode_steps)
-    seen, states, acted = [episode.seen], [episode.state], []
-    while episode.running:
-        shape = (len(episode.agents), width)
-        action = chance.uniform(low, high, shape) if act is None else act(episode.seen, episode.state)
-        action = given_as("actions", action, shape)
-        if (action < low - 1e-4 * (high - low)).any() or (action > high + 1e-4 * (high - low)).any():
+@dataclass(frozen=True)
+class _Player:
+    """What acts, and what begins an episode of it."""
+
+    name: str
+    act: Callable[..., Any] | None  # None: uniform draws
+    reset: Callable[[], object]
+
+    @classmethod
+    def of(cls, policy: Any) -> _Player:
+        if policy is None:
+            return cls("uniform", None, lambda: None)
+        name = getattr(policy, "__qualname__", type(policy).__name__)
+        code = getattr(policy, "__code__", None)
+        if code is not None:  # two lambdas have one name
+            content = code.co_code + repr(code.co_consts).encode()
+            name += "-" + hashlib.blake2b(content, digest_size=3).hexdigest()
+        return cls(name, getattr(policy, "act", policy), getattr(policy, "reset", lambda: None))
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """Of every agent's actions."""
+
+    low: float
+    high: float
+    entries: int
+
+    def clipped(self, actions: np.ndarray) -> np.ndarray:
+        """Actions (N, A) within the bounds; more than a rounding outside is refused."""
+        slack = 1e-4 * (self.high - self.low)
+        if (actions < self.low - slack).any() or (actions > self.high + slack).any():
             raise UserError(
-                f"The policy gave actions from {action.min():.4g} to {action.max():.4g}, the action space is from "
-                f"{low:g} to {high:g}; clip or scale them."
+                f"The policy gave actions from {actions.min():.4g} to {actions.max():.4g}, the action space is from "
+                f"{self.low:g} to {self.high:g}; clip or scale them."
             )
-        acted.append(np.clip(action, low, high))
-        episode.step(acted[-1], cost)
+        return np.clip(actions, self.low, self.high)
+
+
+@dataclass(frozen=True)
+class _Rules:
+    """What holds for every episode."""
+
+    bounds: _Bounds
+    shape: Shape
+    cost: Cost | None
+    max_steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Played:
+    """An episode of L steps."""
+
+    observations: np.ndarray  # (L+1, N, O)
+    actions: np.ndarray  # (L, N, A)
+    rewards: np.ndarray  # (L, N)
+    costs: np.ndarray  # (L, N)
+    constraints: dict[str, np.ndarray]  # (L, N) each
+    by_agent: bool  # some step had a cost of each agent
+    state: np.ndarray | None  # (L+1, S)
+    terminated: bool
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Of a step, which all episodes share."""
+        return tuple(x.shape[1:] for x in (self.observations, self.actions, self.rewards, self.costs))
+
+    @property
+    def one_cost(self) -> bool:
+        """Whether all agents have the same costs throughout."""
+        return all(bool((x == x[:, :1]).all()) for x in (self.costs, *self.constraints.values()))
+
+
+def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -> _Played:
+    """Episode k."""
+    player.reset()
+    chance = np.random.default_rng((first_seed, k))
+    episode = Episode(env, rules.shape, first_seed + k, rules.max_steps)
+    bounds = rules.bounds
+    shape = (len(episode.agents), bounds.entries)
+    seen = [episode.seen]
+    states = [episode.state]
+    actions = []
+    while episode.running:
+        if player.act is None:
+            action = chance.uniform(bounds.low, bounds.high, shape)
+        else:
+            action = player.act(episode.seen, episode.state)
+        actions.append(bounds.clipped(given_as("actions", action, shape)))
+        episode.step(actions[-1], rules.cost)
         episode.charge(0.0)
         if not episode.showed_end:
             raise UserError(
@@ -105,103 +183,104 @@ def _played(
             )
         seen.append(episode.seen)
         states.append(episode.state)
-    wide = lambda costs: np.stack([np.broadcast_to(c, len(episode.agents)) for c in costs])  # noqa: E731
-    names = episode.constraints[0] if episode.constraints else ()
-    return {
-        "observations": np.stack(seen),
-        "actions": np.stack(acted),
-        "rewards": np.stack(episode.rewards),
-        "costs": wide(episode.costs),
-        "constraints": {k: wide([c[k] for c in episode.constraints]) for k in names},
-        "each": any(np.ndim(c) for c in episode.costs),
-        "state": None if states[0] is None else np.stack(states),
-        "terminated": episode.terminated,
-    }
+    n_agents = len(episode.agents)
+    names = list(episode.constraints[0]) if episode.constraints else []
+    known_states = [state for state in states if state is not None]
+    return _Played(
+        observations=np.stack(seen),
+        actions=np.stack(actions),
+        rewards=np.stack(episode.rewards),
+        costs=_of_every_agent(episode.costs, n_agents),
+        constraints={name: _of_every_agent([costs[name] for costs in episode.constraints], n_agents) for name in names},
+        by_agent=any(np.ndim(cost) > 0 for cost in episode.costs),
+        state=np.stack(known_states) if known_states else None,
+        terminated=episode.terminated,
+    )
 
 
-def _grown(done: EpisodeStore | None, made: list[dict], told: dict, bounds, env, card: dict | None) -> EpisodeStore:
-    """The store with these episodes behind those that it has."""
-    shapes = {tuple(m[name].shape[1:] for name in KEPT) for m in made}
-    if len(shapes) > 1:
-        raise UserError(
-            f"{type(env).__name__} changes its agents or what they see between episodes; keep them the same."
-        )
-    lengths = np.array([len(m["actions"]) for m in made])
-    told_of = [x for m in made for x in (m["costs"], *m["constraints"].values())]
-    each = any(m["each"] for m in made) and not all((x == x[:, :1]).all() for x in told_of)
-    if done is not None:
-        each = each or done.costs.ndim == 2
-    names = list(made[0]["constraints"])
-    if any(list(m["constraints"]) != names for m in made):
-        raise UserError(f"{type(env).__name__} names other constraints in some episodes; name the same ones in all.")
+def _of_every_agent(costs: Sequence[float | np.ndarray], n_agents: int) -> np.ndarray:
+    """(L, N): a step's cost of the team is everybody's."""
+    return np.stack([np.broadcast_to(cost, n_agents) for cost in costs])
 
-    def charged(of: Callable[[dict], np.ndarray]) -> np.ndarray:
-        costs = np.concatenate([of(m) for m in made])
-        return costs if each else costs[:, 0]
 
-    state = None if made[0]["state"] is None else [m["state"] for m in made]
-    fresh = EpisodeStore.from_steps(
-        np.concatenate([m["observations"][:-1] for m in made]),
-        np.concatenate([m["actions"] for m in made]),
-        np.concatenate([m["rewards"] for m in made]),
-        costs={k: charged(lambda m, k=k: m["constraints"][k]) for k in names} or charged(lambda m: m["costs"]),
-        episode_ends=np.cumsum(lengths),
-        final_observations=np.stack([m["observations"][-1] for m in made]),
-        state=None if state is None else np.concatenate([s[:-1] for s in state]),
-        final_state=None if state is None else np.stack([s[-1] for s in state]),
-        terminated=np.array([m["terminated"] for m in made]),
+def _store(
+    played: list[_Played], env: Any, bounds: _Bounds, source: dict[str, Any], card: dict | None, by_agent: bool
+) -> EpisodeStore:
+    """The store of these episodes; costs are of each agent where episodes before were, or agents' costs differ."""
+    simulator = source["simulator"]
+    if len({one.shapes for one in played}) > 1:
+        raise UserError(f"{simulator} changes its agents or what they see between episodes; keep them the same.")
+    names = list(played[0].constraints)
+    if any(list(one.constraints) != names for one in played):
+        raise UserError(f"{simulator} names other constraints in some episodes; name the same ones in all.")
+    differ = any(one.by_agent for one in played) and not all(one.one_cost for one in played)
+
+    def charged(parts: list[np.ndarray]) -> np.ndarray:
+        costs = np.concatenate(parts)
+        return costs if by_agent or differ else costs[:, 0]
+
+    constraints = {name: charged([one.constraints[name] for one in played]) for name in names}
+    states = [one.state for one in played if one.state is not None]
+    return EpisodeStore.from_steps(
+        np.concatenate([one.observations[:-1] for one in played]),
+        np.concatenate([one.actions for one in played]),
+        np.concatenate([one.rewards for one in played]),
+        costs=constraints or charged([one.costs for one in played]),
+        episode_ends=np.cumsum([len(one.actions) for one in played]),
+        final_observations=np.stack([one.observations[-1] for one in played]),
+        state=np.concatenate([state[:-1] for state in states]) if states else None,
+        final_state=np.stack([state[-1] for state in states]) if states else None,
+        terminated=np.array([one.terminated for one in played]),
         card={
             "task": "recorded",
-            "simulator": told["simulator"],
-            "provenance": f"recorded of {told['policy']} in {told['simulator']}",
-            "recorded": told,
-            "agents": [str(a) for a in env.possible_agents],
-            "action_low": bounds[0],
-            "action_high": bounds[1],
+            "simulator": simulator,
+            "provenance": f"recorded of {source['policy']} in {simulator}",
+            "recorded": source,
+            "agents": [str(agent) for agent in env.possible_agents],
+            "action_low": bounds.low,
+            "action_high": bounds.high,
             **(card or {}),
         },
     )
-    return fresh if done is None else done.followed_by(fresh)
 
 
-def _before(file: Path | None, told: dict, episodes: int) -> EpisodeStore | None:
+def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> EpisodeStore | None:
     """What an interrupted recording has kept."""
     if file is None or not file.exists():
         return None
     store = EpisodeStore.load(file)
-    if store.card.get("recorded") != told:
-        raise StoreError(
-            f"'{file}' holds another recording ({store.card.get('recorded')}, not {told}); delete it or name another "
-            "file."
-        )
+    kept = store.card.get("recorded")
+    if kept != source:
+        raise StoreError(f"'{file}' holds another recording ({kept}, not {source}); delete it or name another file.")
     return store if store.episodes <= episodes else store.select(np.arange(store.episodes) < episodes)
 
 
-def _tells_state(env, seed: int) -> bool:
+def _has_state(env: Any, seed: int) -> bool:
     """PettingZoo's base class has a method that raises."""
-    if not hasattr(env, "state"):
+    read = getattr(env, "state", None)
+    if read is None:
         return False
     try:
         env.reset(seed=seed)
-        env.state()
+        read()
     except NotImplementedError:
         return False
     return True
 
 
-def _bounds(env) -> tuple[float, float, int]:
-    """(low, high, entries) of every agent's actions."""
-    spaces = [env.action_space(a) for a in env.possible_agents]
-    if any(not hasattr(s, "low") or len(s.shape) != 1 for s in spaces):
+def _bounds(env: Any) -> _Bounds:
+    name = type(env).__name__
+    spaces = [env.action_space(agent) for agent in env.possible_agents]
+    if any(getattr(space, "low", None) is None or len(space.shape) != 1 for space in spaces):
         raise UserError(
-            f"{type(env).__name__} has an action space {spaces[0]}; agents need a Box of one axis, since actions are "
-            "numbers here."
+            f"{name} has an action space {spaces[0]}; agents need a Box of one axis, since actions are numbers here."
         )
-    widths = {s.shape[0] for s in spaces}
-    low, high = min(float(s.low.min()) for s in spaces), max(float(s.high.max()) for s in spaces)
+    widths = {space.shape[0] for space in spaces}
+    low = min(float(space.low.min()) for space in spaces)
+    high = max(float(space.high.max()) for space in spaces)
     if len(widths) > 1 or not np.isfinite([low, high]).all():
         raise UserError(
-            f"{type(env).__name__} has action spaces of {sorted(widths)} entries from {low:g} to {high:g}; they must "
+            f"{name} has action spaces of {sorted(widths)} entries from {low:g} to {high:g}; they must "
             "be alike for all agents, and bounded."
         )
-    return low, high, widths.pop()
+    return _Bounds(low, high, widths.pop())

@@ -172,9 +172,10 @@ def read_table(
         notes.append(what)
     if not action:
         notes.append("actions are accelerations, differences of velocities")
-    build = _neighbourly if neighbours is not None else _team
-    how = dict(size=team) if neighbours is None else dict(k=neighbours, sight=sight or np.inf)
-    arrays = build(made, danger, bool(cost), shortest, longest, **how)
+    if neighbours is None:
+        arrays = _team(made, danger, bool(cost), shortest, longest, team)
+    else:
+        arrays = _neighbourly(made, danger, bool(cost), shortest, longest, neighbours, sight or np.inf)
     acts = arrays.pop("held") if action else made.accelerations(arrays["rows"])
     return _steps(made, arrays, acts, bool(reward), cost, danger, neighbours is not None, card or {})
 
@@ -301,19 +302,16 @@ def _file(path: Path, wanted: list[str]) -> dict[str, np.ndarray]:
         raise StoreError(f"'{path}' ends in '{kind}'; give a .csv or .parquet file.")
     _needs("pyarrow")
     import pyarrow as pa
+    from pyarrow import csv, parquet
 
     try:
         if kind == ".csv":
-            import pyarrow.csv
-
             with path.open(encoding="utf-8-sig", errors="replace") as file:
                 head = file.readline(2**20)
             between = max(",;\t|", key=head.count)  # the first of those that separate as often
-            table = pa.csv.read_csv(path, parse_options=pa.csv.ParseOptions(delimiter=between))
+            table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=between))
         else:
-            import pyarrow.parquet
-
-            with pa.parquet.ParquetFile(path) as file:
+            with parquet.ParquetFile(path) as file:
                 there = set(file.schema_arrow.names)
                 size = sum(file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups))
                 if size > 100 * path.stat().st_size + 2**28:
