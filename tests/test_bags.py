@@ -139,11 +139,11 @@ def test_three_robots_are_read_as_written(tmp_path, form):
     for i, (rate, rate_of_commands, late) in enumerate(((20.0, 8.0, 0.03), (10.0, 25.0, 0.31), (7.3, 3.1, 0.12))):
         name = f"robot_{i}"
         times = [ns(0.05 * (i + 1) + k / rate) for k in range(int(3 * rate))]
-        told = [ns(0.02 * i + late + k / rate_of_commands) for k in range(int(3 * rate_of_commands))]
+        commanded = [ns(0.02 * i + late + k / rate_of_commands) for k in range(int(3 * rate_of_commands))]
         ticks = [ns(0.01 + 0.11 * k) for k in range(30)]
-        commands, states, costs = rng.normal(size=(len(told), 3)), rng.normal(size=(len(times), 6)), rng.random(30)
+        commands, states, costs = rng.normal(size=(len(commanded), 3)), rng.normal(size=(len(times), 6)), rng.random(30)
         places = rng.normal(size=(30, 2, 2))
-        for t, (vx, vy, wz) in zip(told, commands):
+        for t, (vx, vy, wz) in zip(commanded, commands):
             messages.append(command(f"/{name}/cmd_vel", (t - START) / 1e9, vx, vy, wz))
         for t, (x, y, yaw, vx, vy, wz) in zip(times, states):
             q = tuple(0.7 * np.array(yaw_of(yaw)))  # norms cancel
@@ -158,7 +158,7 @@ def test_three_robots_are_read_as_written(tmp_path, form):
             messages.append(scalar(f"/{name}/near", moment, costs[k]))
         before, dropped[name] = None, 0
         for t, (x, y, yaw, vx, vy, wz) in zip(times, states):
-            c, j, n = near(told, t), near(ticks, t), near(ticks, t)
+            c, j, n = near(commanded, t), near(ticks, t), near(ticks, t)
             cost = max(
                 (costs[k] for k in range(30) if ticks[k] <= t and (before is None or ticks[k] > before)), default=0
             )
@@ -508,8 +508,8 @@ def test_bad_values_are_named(tmp_path, form):
     for value in (np.nan, np.inf, 1e31):
         place = [odometry("/r0/odom", 0.1 * k, y=value if k == 4 else 0.0) for k in range(6)]
         refused(re.escape(f"y of message 4 of '/r0/odom' is {value}"), **{"/r0/odom": place})
-        told = [command("/r1/cmd_vel", 0.1 * k, wz=value if k else 0.0) for k in range(6)]
-        refused(re.escape(f"cmd_wz of message 1 of '/r1/cmd_vel' is {value}"), **{"/r1/cmd_vel": told})
+        commands = [command("/r1/cmd_vel", 0.1 * k, wz=value if k else 0.0) for k in range(6)]
+        refused(re.escape(f"cmd_wz of message 1 of '/r1/cmd_vel' is {value}"), **{"/r1/cmd_vel": commands})
         refused(re.escape(f"cost of message 0 of '/hit' is {value}"), **{"/hit": [scalar("/hit", 0.0, value)]})
 
 
@@ -539,10 +539,10 @@ def test_a_message_that_is_cut_is_named(tmp_path):
     store = STORES[1]
     with rosbag1.Writer(path) as writer:
         seen = writer.add_connection("/a/odom", "nav_msgs/msg/Odometry", typestore=store)
-        told = writer.add_connection("/a/cmd_vel", kind, typestore=store)
+        connection = writer.add_connection("/a/cmd_vel", kind, typestore=store)
         writer.write(seen, START, store.serialize_ros1(build(store, "nav_msgs/msg/Odometry"), "nav_msgs/msg/Odometry"))
         whole = store.serialize_ros1(build(store, kind), kind)
-        writer.write(told, START, whole)
-        writer.write(told, START + 1, whole[:-8])
+        writer.write(connection, START, whole)
+        writer.write(connection, START + 1, whole[:-8])
     with pytest.raises(StoreError, match="message 1 of '/a/cmd_vel' is damaged"):
         read_bag(path, "/{i}")

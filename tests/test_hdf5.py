@@ -130,7 +130,7 @@ def test_d4rl_without_them_gives_up_the_last_steps(tmp_path):
     )
 
 
-def test_steps_that_do_not_lead_to_the_next_row_are_told_or_refused(tmp_path):
+def test_steps_that_do_not_lead_to_the_next_row_are_noted_or_refused(tmp_path):
     data = recorded(lengths=(40, 40))
     data["next_observations"][7, 1] += 0.5
     store = import_hdf5(write(tmp_path / "d.hdf5", data))
@@ -346,18 +346,18 @@ class Drift(gymnasium.Env):
         self.action_space = gymnasium.spaces.Box(np.float32(low), np.float32(high), (2,), np.float32)
         self.several = several
 
-    def _told(self):
+    def _seen(self):
         seen = {"place": self.x.copy(), "goal": np.float32([self.x.sum()])} if self.several else self.x.copy()
         return seen, {"cost": float(np.abs(self.x).max() > 1), "depth": {"x": self.x.copy()}}
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.x = self.np_random.normal(size=2)
-        return self._told()
+        return self._seen()
 
     def step(self, action):
         self.x = self.x + action + self.np_random.normal(size=2) / 10
-        seen, info = self._told()
+        seen, info = self._seen()
         return seen, float(-np.abs(self.x).sum()), bool(np.abs(self.x).max() > 3), False, info
 
 
@@ -430,8 +430,8 @@ def test_minari_buffers_of_eleven_parts_and_other_spaces(tmp_path, monkeypatch):
     rng = np.random.default_rng(0)
     parts = [rng.normal(size=(5, 1)).astype(np.float32) for _ in range(11)] + [rng.normal(size=(5, 2, 3))]
     actions = rng.uniform(0, 1, (4, 2)).astype(np.float32)
-    told = dict(rewards=[1.0] * 4, terminations=[False] * 4, truncations=[False] * 4, infos={"cost": [0.0, 1, 0, 2]})
-    episode = EpisodeBuffer(observations=tuple(list(p) for p in parts), actions=list(actions), **told)
+    steps = dict(rewards=[1.0] * 4, terminations=[False] * 4, truncations=[False] * 4, infos={"cost": [0.0, 1, 0, 2]})
+    episode = EpisodeBuffer(observations=tuple(list(p) for p in parts), actions=list(actions), **steps)
     spaces = {
         "observation_space": Tuple([Box(-9, 9, (1,))] * 11 + [Box(-9, 9, (2, 3), np.float64)]),
         "action_space": Box(np.float32([0, -1]), np.float32([1, 3])),
@@ -452,9 +452,9 @@ def test_minari_buffers_of_eleven_parts_and_other_spaces(tmp_path, monkeypatch):
     ]
 
 
-def space(folder, told):
+def space(folder, changes):
     file = folder / "metadata.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | told))
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
 
 
 WORSE = {
@@ -528,7 +528,7 @@ def test_minari_data_that_is_not_here_is_named(tmp_path, monkeypatch):
 
 
 # --- the command line, and training ---
-def test_an_imported_store_is_told_and_trained(tmp_path, capsys):
+def test_an_imported_store_is_described_and_trained(tmp_path, capsys):
     file, out = write(tmp_path / "circle.hdf5", recorded(lengths=(20,) * 6)), tmp_path / "mine.h5"
     arguments = ["data", "import-hdf5", str(file), "--out", str(out), "--agents", json.dumps(PAIR)]
     main([*arguments, "--cost-limit", "5", "--task", "circle"])

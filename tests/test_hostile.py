@@ -65,8 +65,8 @@ def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
     victim = tmp_path / "victim.npz"
     victim.write_text("mine")
     run = Run(shutil.copytree(trained_run.path, tmp_path / "a" / "b" / "run"))
-    told = json.loads((run.path / "config.json").read_text())
-    (run.path / "config.json").write_text(json.dumps(told | {"preset": "/../../../../victim"}))
+    config = json.loads((run.path / "config.json").read_text())
+    (run.path / "config.json").write_text(json.dumps(config | {"preset": "/../../../../victim"}))
     for record in (0, 1):
         with pytest.raises(UserError, match="no run folder that can be read"):
             evaluate(run, episodes=2, num_recorded=record)
@@ -77,8 +77,8 @@ def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
 def trained_run(tmp_path_factory):
     from ringfence.training import loop
 
-    told = {"view": "decentralized", "steps": 4, "width": 16}
-    return loop.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=told, quiet=True)[0]
+    changes = {"view": "decentralized", "steps": 4, "width": 16}
+    return loop.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=changes, quiet=True)[0]
 
 
 def test_stores_of_strangers(tmp_path):
@@ -115,8 +115,8 @@ def test_opening_a_file_takes_no_more_than_it_holds(tmp_path):
             "try:\n    EpisodeStore.load(sys.argv[1])\nexcept StoreError:\n"
             "    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)"
         )
-        told = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
-        assert int(told.stdout) < 200 * 1024  # kB
+        done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+        assert int(done.stdout) < 200 * 1024  # kB
     assert made
 
 
@@ -293,9 +293,9 @@ def test_numbers_of_strangers(trained_run, value, tmp_path):
 
 @pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"PYTHONIOENCODING": "cp1252"}, {"HOME": ""}])
 def test_terminals_of_few_letters_and_users_without_a_home(environment):
-    told = {k: v for k, v in os.environ.items() if k not in ("HOME", "RINGFENCE_HOME", "XDG_CACHE_HOME")}
+    inherited = {k: v for k, v in os.environ.items() if k not in ("HOME", "RINGFENCE_HOME", "XDG_CACHE_HOME")}
     code = "from ringfence.cli.app import main; main(['tasks'])"
-    done = subprocess.run([sys.executable, "-c", code], env={**told, **environment}, capture_output=True)
+    done = subprocess.run([sys.executable, "-c", code], env={**inherited, **environment}, capture_output=True)
     assert done.returncode == 0 and b"Traceback" not in done.stderr
 
 

@@ -1,4 +1,4 @@
-"""Recording anybody's simulator: what it told is what is kept, and an interrupted recording goes on."""
+"""Recording anybody's simulator: what it shows is what is kept, and an interrupted recording goes on."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Drift(ParallelEnv):
         chance = np.random.default_rng(seed)
         self.x, self.t, self.left = chance.normal(size=2), 0, int(chance.integers(3, 7))
         self.agents = list(self.possible_agents)
-        return self.told(), {a: {} for a in self.agents}
+        return self.shown(), {a: {} for a in self.agents}
 
-    def told(self):
+    def shown(self):
         return {a: np.array([self.x[i], self.t], np.float32) for i, a in enumerate(self.possible_agents)}
 
     def step(self, actions):
@@ -45,7 +45,7 @@ class Drift(ParallelEnv):
         if over:
             self.agents = []
         return (
-            self.told(),
+            self.shown(),
             rewards,
             both | dict.fromkeys(both, over and by_itself),
             dict.fromkeys(both, over and not by_itself),
@@ -57,7 +57,7 @@ def lean(observations, state):
     return 0.5 - 0.2 * observations[:, :1]
 
 
-def test_what_is_told_is_what_is_kept():
+def test_what_is_shown_is_what_is_kept():
     store = ringfence.record(Drift, lean, episodes=8, seed=5)
     env, ends = Drift(), np.concatenate([[0], store.episode_ends])
     for k in range(8):
@@ -82,8 +82,8 @@ def test_an_interrupted_recording_goes_on(tmp_path, monkeypatch):
     whole = ringfence.record(Drift, None, episodes=11, seed=1)
     advance, count = Progress.advance, []
 
-    def stops(self, *told):
-        advance(self, *told)
+    def stops(self, *steps):
+        advance(self, *steps)
         count.append(1)
         if len(count) == 7:
             raise KeyboardInterrupt
@@ -127,8 +127,8 @@ def test_simulators_and_policies_that_cannot_be_recorded(tmp_path):
 
     class Silent(Drift):
         def step(self, actions):
-            seen, *told = super().step(actions)
-            return (seen if self.agents else {}), *told
+            seen, *others = super().step(actions)
+            return (seen if self.agents else {}), *others
 
     for make_env, policy, said in (
         (Few, lean, "agents need a Box of one axis"),

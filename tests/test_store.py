@@ -475,8 +475,8 @@ def test_entries_that_vary_for_one_agent_alone_are_no_constants(small_store):
         episode_ends=np.arange(1, times * small_store.episodes + 1) * 25,
     )
     silent = [w for w in constant(small_store)]
-    told = constant(large)[0]
-    assert " 2," in told and " 1," not in told and (not silent or " 1," not in silent[0])
+    warning = constant(large)[0]
+    assert " 2," in warning and " 1," not in warning and (not silent or " 1," not in silent[0])
 
 
 def test_content_tells_steps_apart(small_store):

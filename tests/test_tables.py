@@ -70,7 +70,7 @@ def test_data_frames_files_and_shuffled_agents_are_the_same(tmp_path):
 
 
 def test_uneven_times_are_put_on_one_clock():
-    """Against a loop over rows: states interpolated, what was told up to half a row later held or added up."""
+    """Against a loop over rows: states interpolated, what came up to half a row later held or added up."""
     rng = np.random.default_rng(1)
     sizes = (40, 25)
     clocks = [np.sort(rng.uniform(0, 4, n)) for n in sizes]
@@ -157,9 +157,9 @@ def test_neighbours_are_those_who_are_nearest_at_that_time():
 
 def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
     """The whole way: a policy of one agent, its World from the distances, played by seven."""
-    told = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
+    options = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
     table = fleet(agents=5, steps=20) | {"gx": np.full(600, 1.5), "gy": np.full(600, -0.5)}
-    store = EpisodeStore.from_table(table, **told, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
+    store = EpisodeStore.from_table(table, **options, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
     assert store.n_agents == 1 and store.card["homogeneous"] and store.costs.any() and (store.lengths <= 10).all()
     far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
     seen = entry(store, "other0.seen") > 0
@@ -288,7 +288,7 @@ def test_units_that_disagree_are_noted():
     assert sum("times what" in note for note in notes) == 2
 
 
-def test_clocks_that_jitter_change_nothing_that_was_told():
+def test_clocks_that_jitter_change_no_action_and_no_cost():
     """Rows a few milliseconds early or late keep their own step."""
     table = fleet(steps=30)
     chance = np.random.default_rng(5)
@@ -297,16 +297,16 @@ def test_clocks_that_jitter_change_nothing_that_was_told():
     assert got.steps >= 0.9 * exact.steps
     for store in (exact, got):
         near = np.abs(store.actions[:, :, 0][:, :, None] - table["ax"][None, None]) < 1e-6
-        assert near.any(-1).all()  # every action is one that was told
+        assert near.any(-1).all()  # every action is one of the table's
     grid = {name: x.reshape(6, 30, 3) for name, x in table.items()}
     begin, held, cost = 0, 0, 0
     for run, steps in enumerate(got.lengths):
         mine = slice(begin, begin + steps)
         shifts = [k for k in range(30 - steps) if np.allclose(got.actions[mine, :, 0], grid["ax"][run, k : k + steps])]
         assert len(shifts) == 1
-        told = grid["hit"][run, shifts[0] + 1 : shifts[0] + 1 + steps]
-        np.testing.assert_array_equal(got.costs[mine], told)
-        begin, held, cost = begin + steps, held + 1, cost + told.sum()
+        costs = grid["hit"][run, shifts[0] + 1 : shifts[0] + 1 + steps]
+        np.testing.assert_array_equal(got.costs[mine], costs)
+        begin, held, cost = begin + steps, held + 1, cost + costs.sum()
     assert (
         held == 6
         and cost > 0

@@ -75,7 +75,7 @@ def import_table(
         agent: column that tells agents apart.
         state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
         episode: column that tells recordings apart.
-        action: columns of what it was told to do until its next row; accelerations by default.
+        action: columns of what it was commanded to do until its next row; accelerations by default.
         reward: column of what it earned since its row before; progress to the goal by default, or nothing.
         cost: column of danger since its row before, 0 or above; several are constraints of these names.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
@@ -99,7 +99,7 @@ def import_table(
     if limits and len(limits) != len(cost):
         raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
     bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
-    told = {
+    options = {
         "danger": None if separation is None else Separation(separation, separation / 4),
         **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
         "fastest": fastest,
@@ -109,9 +109,9 @@ def import_table(
     if layout is not None:
         if state or action or reward or goal or episode:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
-        return imported(EpisodeStore.from_layout(file, layout, **told), kept)
+        return imported(EpisodeStore.from_layout(file, layout, **options), kept)
     columns = dict(state=state, action=action, reward=reward, goal=goal, episode=episode)
-    imported(EpisodeStore.from_table(file, time=time, agent=agent, **columns, **told), kept)
+    imported(EpisodeStore.from_table(file, time=time, agent=agent, **columns, **options), kept)
 
 
 def import_bag(
@@ -287,8 +287,8 @@ def _limit(speed_limit: float | None, quantile: bool):
 def imported(store, file: Path) -> None:
     """Keep what was imported, and say what was noted."""
     each = f" of {store.card['dt']:g} s" if "dt" in store.card else ""
-    told = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
-    out.print(told, soft_wrap=True, markup=False)
+    summary = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
+    out.print(summary, soft_wrap=True, markup=False)
     for note in store.card["warnings"]:
         out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
 

@@ -1,4 +1,4 @@
-"""Read ROS bags into one table: a row for every agent and message of its odometry, with what it was told at that time.
+"""Read ROS bags into one table: a row for every agent and message of its odometry, with the command at that time.
 
 ROS 1 bags (`.bag`), ROS 2 bags (a folder with metadata.yaml, sqlite3 or mcap inside) and bare `.mcap` and `.db3` files
 are read by the library rosbags. Fields and units are those of ROS's common interfaces (nav_msgs, geometry_msgs,
@@ -157,10 +157,10 @@ def read_bag(
         columns |= {c: values[latest, i] for i, c in enumerate(COMMAND)}
         known = latest >= 0
         if joints is not None:
-            told = _joints(read[asked["joints"][k]], name)
+            joint_columns = _joints(read[asked["joints"][k]], name)
             row_times, times = clock.align(rows, read[asked["joints"][k]])
-            for column in sorted(told):
-                which, values = told[column]
+            for column in sorted(joint_columns):
+                which, values = joint_columns[column]
                 latest = _latest(row_times, times[which])
                 columns[column] = values[latest]
                 known &= latest >= 0
@@ -250,8 +250,9 @@ class _File:
 
     def start(self, read: dict[str, Topic]) -> int:
         """ns of the first message of any topic; no more of a bag's own word is believed than the messages allow."""
-        first, told = min(int(t.logged.min()) for t in read.values()), self.reader.start_time
-        return told if isinstance(told, int) and 0 <= told <= first else first
+        first = min(int(topic.logged.min()) for topic in read.values())
+        claimed = self.reader.start_time
+        return claimed if isinstance(claimed, int) and 0 <= claimed <= first else first
 
     def read(self, roles: dict[str, str]) -> dict[str, Topic]:
         """The topics by name; types are checked before messages are read."""
@@ -270,7 +271,7 @@ class _File:
                     frames[topic][message.header.frame_id] = None
             except Exception as error:  # bytes that are no such message raise anything
                 raise StoreError(
-                    f"'{self.path}': message {len(logged[topic])} of '{topic}' is damaged ({_told(error)}); copy "
+                    f"'{self.path}': message {len(logged[topic])} of '{topic}' is damaged ({_reason(error)}); copy "
                     "the bag again."
                 ) from error
             logged[topic].append(time)
@@ -388,12 +389,12 @@ def _opened(path: Path) -> Iterator[_File]:
 
 def _damaged(path: Path, error: Exception) -> StoreError:
     return StoreError(
-        f"'{path}' is truncated, damaged or no bag ({_told(error)}); copy it again, or reindex it if its recording "
+        f"'{path}' is truncated, damaged or no bag ({_reason(error)}); copy it again, or reindex it if its recording "
         "broke off."
     )
 
 
-def _told(error: Exception) -> str:
+def _reason(error: Exception) -> str:
     lines = str(error).strip().splitlines()
     return f"{type(error).__name__}: {lines[0][:120].rstrip('.')}" if lines else type(error).__name__
 
@@ -444,15 +445,15 @@ def _cost_topics(bag: _File, prefixes: list[str], cost: str) -> list[str]:
 def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, stamps: bool, notes: list[str]) -> Clock:
     """Times of all topics; refuses clocks that disagree and times that go backwards."""
     topics = [*odometry, *others]
-    told = {t.name: t.stamps for t in topics if stamps and t.stamps is not None and t.stamps.any()}
+    stamped = {t.name: t.stamps for t in topics if stamps and t.stamps is not None and t.stamps.any()}
     lags = {}  # of stamps behind the times of recording: (when, s)
     for t in topics:
-        given = told[t.name] != 0 if t.name in told else np.ones(len(t.logged), bool)
-        stamp = told.get(t.name, t.logged)
+        given = stamped[t.name] != 0 if t.name in stamped else np.ones(len(t.logged), bool)
+        stamp = stamped.get(t.name, t.logged)
         lags[t.name] = t.logged[given] / 1e9, (t.logged - stamp)[given] / 1e9
-    lead = next((t.name for t in odometry if t.name in told), odometry[0].name)
+    lead = next((t.name for t in odometry if t.name in stamped), odometry[0].name)
     for t in topics:
-        if t in odometry or t.name in told:
+        if t in odometry or t.name in stamped:
             # compared where both were recorded, since a simulator's clock may run slower than the recorder's
             when, lag = lags[t.name]
             apart = float(np.median(np.abs(lag - np.interp(when, *lags[lead]))))
@@ -464,14 +465,14 @@ def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, s
     foreign = float(np.median(np.abs(lags[lead][1]))) > CLOCK
     times = {}
     for t in topics:
-        stamp = told.get(t.name, t.logged)
+        stamp = stamped.get(t.name, t.logged)
         times[t.name] = stamp if foreign else np.where(stamp == 0, t.logged, stamp)
         back = np.flatnonzero(np.diff(times[t.name]) < 0)
         if len(back):
             k = int(back[0]) + 1
             gap = (times[t.name][k - 1] - times[t.name][k]) / 1e9
-            which = "header's stamp" if t.name in told else "time of recording"
-            remedy = "pass stamps=False or cut the bag there" if t.name in told else "cut the bag there"
+            which = "header's stamp" if t.name in stamped else "time of recording"
+            remedy = "pass stamps=False or cut the bag there" if t.name in stamped else "cut the bag there"
             raise StoreError(
                 f"'{path}': the {which} of message {k} of '{t.name}' is {gap:.3g} s earlier than that of the one "
                 f"before; times must not go backwards, so {remedy}."
@@ -482,10 +483,10 @@ def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, s
             f"stamps are {np.median(lags[lead][1]):.3g} s behind the times of recording, so they come from another "
             "clock; time counts from the first of them"
         )
-    bare = [t.name for t in odometry if t.name not in told]
+    bare = [t.name for t in odometry if t.name not in stamped]
     if bare and stamps:
         notes.append(f"{', '.join(bare)} has no stamps, so its times are those of recording")
-    return Clock(times, frozenset(told), foreign, start)
+    return Clock(times, frozenset(stamped), foreign, start)
 
 
 def _latest(rows: np.ndarray, times: np.ndarray) -> np.ndarray:
@@ -594,14 +595,14 @@ def _joints(topic: Topic, agent: str) -> dict[str, tuple[np.ndarray, np.ndarray]
                 values = np.stack([topic.values[k][field] for k in which]).astype(np.float64)
                 for j, name in enumerate(names):
                     pieces.setdefault(f"{name.removeprefix(lead)}.{kind}", []).append((which, values[:, j]))
-    told = {}
+    columns = {}
     for column, found in pieces.items():
         which, values = (np.concatenate(part) for part in zip(*found))
         if not np.isnan(values).all():
             order = np.argsort(which)
-            told[column] = which[order], values[order]
+            columns[column] = which[order], values[order]
             _finite(topic, which[order], values[order, None], [column])
-    return told
+    return columns
 
 
 def _costs(topic: Topic, rows: np.ndarray, times: np.ndarray, agent: str, notes: list[str]) -> np.ndarray:

@@ -79,11 +79,11 @@ def read_table(
     agent's times increase.
 
     `state`: columns of an agent's state, in SI units. Those named x, y, z are where it is and vx, vy, vz how fast it
-    moves in the same axes; velocities that are not there are the differences of positions. `action`: what it was told
-    at that time and did until its next row; without any, actions are its accelerations. `reward` and `cost` are what
-    came since its row before; without `reward`, it is the progress to the `goal` (columns of its x, y), in m, or 0;
-    without `cost` it follows from `danger`, a `Separation`, or is 0. Several columns of costs are constraints of these
-    names, whose limits per episode the `card`'s `constraints` tells (0 by default).
+    moves in the same axes; velocities that are not there are the differences of positions. `action`: its command at
+    that time, which it followed until its next row; without any, actions are its accelerations. `reward` and `cost`
+    are what came since its row before; without `reward`, it is the progress to the `goal` (columns of its x, y), in m,
+    or 0; without `cost` it follows from `danger`, a `Separation`, or is 0. Several columns of costs are constraints of
+    these names, whose limits per episode the `card`'s `constraints` holds (0 by default).
 
     Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
@@ -113,7 +113,7 @@ def read_table(
             "under these names."
         )
     if (neighbours is not None or danger is not None) and len(position) < 2:
-        raise UserError("state holds no x and y, which neighbours and distances are told by; rename these columns.")
+        raise UserError("state holds no x and y, which neighbours and distances follow from; rename these columns.")
     if not isinstance(danger, Separation | None):
         raise UserError(f"danger={type(danger).__name__} is not read from a table; give a Separation or a cost column.")
     wanted = [time, agent, *state, *action, *goal, *cost, *(c for c in (episode, reward) if c)]
@@ -145,7 +145,7 @@ def read_table(
     if dt is None and (far := float(np.quantile(off, 0.99))) > 0.01:
         notes.append(
             f"rows are up to {far:.2g} of a step of {step:g} s off the clock: states are interpolated, actions, costs "
-            "and rewards are those told nearest to a step"
+            "and rewards are those nearest to a step"
         )
     if action and (big := max(np.abs(values[c]).max() for c in action)) > 10 * (
         usual := max(np.quantile(np.abs(values[c]), 0.99) for c in action)
@@ -154,7 +154,7 @@ def read_table(
             f"the largest action is {big:.4g}, 99 % are below {usual:.4g}: all are learned in units of the largest"
         )
     if len(position) < 2:
-        notes.append("state holds no x and y, so nobody is told where others are relative to oneself")
+        notes.append("state holds no x and y, so nobody sees where others are relative to oneself")
     states = np.stack([values[c] for c in (*state, *goal)], 1)
     acts = np.stack([values[c] for c in action], 1) if action else np.zeros((len(rows.time), 1))
     tracks = resample(rows.recording, rows.agent, rows.time, states, acts, earned, charged, step, gap or GAP * step)
@@ -166,9 +166,9 @@ def read_table(
     if danger is not None and not cost:
         notes.append(f"costs follow from centres closer than {danger.radius:g} m")
     if not cost and danger is None:
-        notes.append("no cost was told: nothing says what is dangerous; name a column, or give a Separation")
+        notes.append("no cost was given: nothing says what is dangerous; name a column, or give a Separation")
     if not reward:
-        what = "rewards are the progress to the goal, in m" if goal else "no reward was told: it is 0 everywhere"
+        what = "rewards are the progress to the goal, in m" if goal else "no reward was given: it is 0 everywhere"
         notes.append(what)
     if not action:
         notes.append("actions are accelerations, differences of velocities")
@@ -277,8 +277,8 @@ def _columns(table: Table, wanted: Iterable[str]) -> dict[str, np.ndarray]:
     found = {name: np.asarray(get(name)) for name in wanted}
     sizes = {len(x) if x.ndim == 1 else -1 for x in found.values()}
     if len(sizes) != 1 or not sizes - {-1, 0}:
-        told = ", ".join(f"{name} {x.shape}" for name, x in found.items())
-        raise StoreError(f"The columns are not of one length above 0 ({told}); give one entry per row.")
+        shapes = ", ".join(f"{name} {x.shape}" for name, x in found.items())
+        raise StoreError(f"The columns are not of one length above 0 ({shapes}); give one entry per row.")
     return found
 
 
@@ -496,7 +496,7 @@ class _Made:
         return self.tracks.state[:, len(self.state) :] - self.place()
 
 
-def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, longest: int | None, size: int | None):
+def _team(made: _Made, danger: Separation | None, has_cost: bool, shortest: int, longest: int | None, size: int | None):
     """Episodes of a constant team: rows (W, N), their lengths and what everybody sees."""
     t = made.tracks
     rows, many, n = teams(t, size)
@@ -530,7 +530,7 @@ def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, lon
             seen.append((theirs - column[kept] * relative)[..., None])
             names.append(f"other{j}.{name}")
     cost = t.cost[kept]
-    if danger is not None and not told:
+    if danger is not None and not has_cost:
         place = made.place()[kept]
         far = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1) + 1e9 * np.eye(n)
         cost = (far.min(-1) < danger.radius).astype(float)[..., None]
@@ -538,7 +538,9 @@ def _team(made: _Made, danger: Separation | None, told: bool, shortest: int, lon
             "held": t.action[kept]}  # fmt: skip
 
 
-def _neighbourly(made: _Made, danger: Separation | None, told: bool, shortest: int, longest: int | None, k: int, sight):
+def _neighbourly(
+    made: _Made, danger: Separation | None, has_cost: bool, shortest: int, longest: int | None, k: int, sight
+):
     """Episodes of one agent each, who sees its k nearest."""
     t = made.tracks
     index, many = cut(np.bincount(t.segment, minlength=t.segment.max() + 1), shortest, longest)
@@ -557,7 +559,7 @@ def _neighbourly(made: _Made, danger: Separation | None, told: bool, shortest: i
         names += [f"other{j}.d{c}" for c in made.position] + [f"other{j}.dv{c}" for c in made.axes]
         names.append(f"other{j}.seen")
     cost = t.cost
-    if danger is not None and not told:
+    if danger is not None and not has_cost:
         cost = ((np.linalg.norm(offset[:, 0], axis=-1) < danger.radius) * there[:, 0]).astype(float)[:, None]
     rows = index[:, None]
     return {"rows": rows, "many": many, "seen": np.concatenate(parts, 1)[rows], "names": names, "cost": cost[rows],
@@ -607,7 +609,7 @@ def _steps(
     cost = dict(zip(named, np.moveaxis(cost, -1, 0))) if len(named) > 1 else cost[..., 0]
     acts = acts[steps]
     bound = float(np.abs(acts).max(initial=0.0)) or 1.0
-    told = {
+    facts = {
         "task": "table",
         "observation_names": arrays["names"],
         "hazard": danger or CostColumn(),
@@ -616,7 +618,7 @@ def _steps(
         "action_low": -bound,
         "action_high": bound,
     }
-    told |= {"homogeneous": True, "sight": arrays["sight"]} if homogeneous else {}
+    facts |= {"homogeneous": True, "sight": arrays["sight"]} if homogeneous else {}
     return {
         "observations": arrays["seen"][steps],
         "actions": acts,
@@ -624,5 +626,5 @@ def _steps(
         "costs": cost,
         "episode_ends": np.cumsum(many - 1),
         "final_observations": arrays["seen"][last],
-        "card": told | card,
+        "card": facts | card,
     }

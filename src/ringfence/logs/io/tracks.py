@@ -25,7 +25,7 @@ class Tracks:
     segment: np.ndarray  # (R,) int
     step: np.ndarray  # (R,) int, of dt seconds since the recording's first row
     state: np.ndarray  # (R, C)
-    action: np.ndarray  # (R, A): the last one told at that time
+    action: np.ndarray  # (R, A): the last one at that time
     earned: np.ndarray  # (R,): the sum of rewards
     cost: np.ndarray  # (R, K): the largest of each kind
     dt: float  # s
@@ -43,7 +43,7 @@ def resample(
     gap: float,
 ) -> Tracks:
     """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), (M, K) costs, onto steps of `dt` s.
-    States are interpolated; actions, rewards and costs belong to the step that they are told nearest to, and actions
+    States are interpolated; actions, rewards and costs belong to the step that they are nearest to, and actions
     are held. A hole of more than `gap` s ends a segment."""
     begins = np.ones(len(time), bool)
     begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
@@ -63,7 +63,7 @@ def resample(
     shift = np.concatenate([[0.0], np.cumsum(spans + 1.0)[:-1]]) - time[first]
     axis = time + shift[np.cumsum(begins) - 1]
     at = np.clip(step * dt + (origin + shift)[segment], axis[first][segment], axis[last][segment])
-    # The last one told: clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
+    # The last row in time: clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
     inside = np.diff(time)[~begins[1:]]
     late = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
     row = np.searchsorted(axis, step * dt + (origin + shift)[segment] + late, "right") - 1
