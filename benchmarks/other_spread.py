@@ -47,7 +47,7 @@ def main() -> None:
         rng = np.random.default_rng(0)
         unsure = lambda seen, state: np.clip(pilot.act(seen, state) + 0.5 * rng.normal(size=(3, 2)), -1, 1)  # noqa: E731
         card = {"task": "mpe2-spread", "observation_names": [*NAMES, *(f"silence{k}" for k in range(4))]}
-        store = ringfence.record(Spread, unsure, episodes=LOGGED, card=card)
+        store = ringfence.collect(Spread, unsure, episodes=LOGGED, card=card)
         world = ringfence.fit(store)
         run = ringfence.train("bc", store, out=there, quiet=True)[0]
         for how in ({}, {"guard": "shield", "world": world}):

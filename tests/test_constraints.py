@@ -11,7 +11,7 @@ import pytest
 from gymnasium.spaces import Box
 from pettingzoo import ParallelEnv
 
-from ringfence import guard, play, record, world
+from ringfence import collect, guard, play, world
 from ringfence.cli import app
 from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
@@ -69,7 +69,7 @@ def hurry(observations, state):
 @pytest.fixture(scope="module")
 def logs():
     names = {"observation_names": ["own.x", "own.vx"], "constraints": LIMITS, "task": "sleds", "dt": 0.2}
-    return record(Sleds, wander, episodes=250, card=names)
+    return collect(Sleds, wander, episodes=250, card=names)
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 import ringfence
 from ringfence.cli import app
+from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError
 from ringfence.logs.io.table import observe
 from ringfence.logs.io.tracks import cut, nearest, resample, teams
@@ -131,7 +134,7 @@ def test_agents_that_come_and_go_make_windows_of_constant_membership():
 
 
 def test_long_windows_are_cut_and_short_ones_left_out():
-    index, many = cut(np.array([11, 3, 8]), shortest=3, longest=5)
+    index, many = cut(np.array([11, 3, 8]), fewest=3, most=5)
     assert many.tolist() == [6, 6, 6]  # 10 steps in two, 2 steps and the rest of 7 are too short
     assert index.tolist() == [*range(6), *range(5, 11), *range(14, 20)]
     assert cut(np.array([11, 3]), 1, None)[1].tolist() == [11, 3]
@@ -159,7 +162,9 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
     """The whole way: a policy of one agent, its World from the distances, played by seven."""
     options = NAMES | dict(action=(), cost=None, goal=["gx", "gy"])
     table = fleet(agents=5, steps=20) | {"gx": np.full(600, 1.5), "gy": np.full(600, -0.5)}
-    store = EpisodeStore.from_table(table, **options, danger=Separation(0.8, 0.2), neighbours=2, sight=2.5, longest=10)
+    store = EpisodeStore.from_table(
+        table, **options, danger=Separation(0.8, 0.2), neighbours=2, sensing_radius=2.5, max_episode_steps=10
+    )
     assert store.n_agents == 1 and store.card["homogeneous"] and store.costs.any() and (store.lengths <= 10).all()
     far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
     seen = entry(store, "other0.seen") > 0
@@ -235,8 +240,8 @@ def broken(**columns):
         (broken(t=(30, fleet()["t"][27])), {}, "row 30: .* is the time of row 27 of the same agent"),
         (broken(x=(7, np.nan)), {}, r"row 7: x is nan \(1 such rows\); fill it, or drop the rows"),
         (broken(vx=(7, "fast")), {}, "row 7: vx is 'fast', no number"),
-        (broken(x=(40, 300.0)), {}, "row 40: x, y moved at .* m/s since row 37 of the same agent, more than fastest"),
-        (fleet(), {"fastest": 0.01}, "more than fastest=0.01; check the units"),
+        (broken(x=(40, 300.0)), {}, "row 40: x, y moved at .* m/s since row 37 of the same agent, more than max_speed"),
+        (fleet(), {"max_speed": 0.01}, "more than max_speed=0.01; check the units"),
         (fleet(), {"state": ["x", "yy"]}, "column of the table.*yy"),
         (fleet(), {"state": []}, "state names no column"),
         (fleet(), {"team": 4}, "No 4 agents are together for 5 steps of 0.1 s"),
@@ -244,7 +249,7 @@ def broken(**columns):
         (fleet(), {"team": 2, "neighbours": 2}, "give one of them"),
         (fleet(), {"neighbours": 0}, "neighbours=0 must be a whole number"),
         (fleet(), {"gap": 0.05}, "gap=0.05 is less than the 0.1 s between"),
-        (fleet(), {"longest": 3}, "longest=3 steps are fewer than shortest=5"),
+        (fleet(), {"max_episode_steps": 3}, "max_episode_steps=3 is less than min_episode_steps=5"),
         (fleet(), {"state": "x y"}, "state='x y' is one word"),
         (fleet(), {"state": ["x", "x", "y"]}, "names the column 'x' twice"),
         (fleet(), {"danger": Separation(1.0)}, "cost and danger both say"),
@@ -314,7 +319,7 @@ def test_clocks_that_jitter_change_no_action_and_no_cost():
     )
 
 
-@pytest.mark.parametrize("how", [{}, {"neighbours": 2, "sight": 2.5}])
+@pytest.mark.parametrize("how", [{}, {"neighbours": 2, "sensing_radius": 2.5}])
 def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
     table = fleet(agents=3)
     store = EpisodeStore.from_table(table, **NAMES, goal=["gx", "gy"], **how)
@@ -330,6 +335,30 @@ def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
         observe(store.card, {c: now[c] for c in ("x", "y", "vy")}, {"x": now["gx"], "y": now["gy"]})
     with pytest.raises(UserError, match="give one number per agent"):
         observe(store.card, {"x": now["x"][:2], "y": now["y"]})
+
+
+def test_options_of_before_work_and_warn(tmp_path, capsys):
+    now = dict(neighbours=2, sensing_radius=2.5, min_episode_steps=3, max_episode_steps=7, max_speed=50.0)
+    before = dict(neighbours=2, sight=2.5, shortest=3, longest=7, fastest=50.0)
+    wanted = EpisodeStore.from_table(fleet(), **NAMES, **now)
+    with pytest.warns(FutureWarning, match="fastest of from_table is called max_speed now"):
+        assert EpisodeStore.from_table(fleet(), **NAMES, **before).content == wanted.content
+    with pytest.raises(UserError, match="two names of one choice"):
+        EpisodeStore.from_table(fleet(), **NAMES, longest=7, max_episode_steps=7)
+    old = ["--sight", "2.5", "--shortest=3", "--longest", "7", "--fastest", "50"]
+    new = ["--sensing-radius", "2.5", "--min-episode-steps=3", "--max-episode-steps", "7", "--max-speed", "50"]
+    assert rewritten(["data", "import-table", "f.csv", *old]) == ["data", "import-table", "f.csv", *new]
+    assert rewritten(["data", "import-bag", "run", *old[:5]]) == ["data", "import-bag", "run", *new[:5]]
+    assert "'--sight' is called '--sensing-radius' now" in capsys.readouterr().err
+
+
+def test_the_radius_in_cards_of_before_is_read():
+    store = EpisodeStore.from_table(fleet(), **NAMES, neighbours=2, sensing_radius=2.5)
+    assert store.card["sensing_radius"] == 2.5
+    before = {name: value for name, value in store.card.items() if name != "sensing_radius"} | {"sight": 2.5}
+    assert dataclasses.replace(store, card=before).card == store.card
+    state = {name: np.array([0.0, 9.0]) for name in ("x", "y", "vx", "vy")}
+    np.testing.assert_array_equal(observe(before, state), observe(store.card, state))
 
 
 def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
@@ -356,7 +385,7 @@ def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):
             logs.append(command(f"/robot_{i}/cmd_vel", 0.1 * k - 0.01, vx=0.5 + 0.001 * k))
     bag = write(tmp_path / "bag", logs)
     app.main(
-        ["data", "import-bag", str(bag), "--agents", "/robot_{i}", "--separation", "1.5", "--longest", "20"]
+        ["data", "import-bag", str(bag), "--agents", "/robot_{i}", "--separation", "1.5", "--max-episode-steps", "20"]
         + ["--out", str(tmp_path / "bag.h5")]
     )
     store = EpisodeStore.load(tmp_path / "bag.h5")

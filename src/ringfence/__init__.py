@@ -22,7 +22,7 @@ _WHERE = {
     "load": "ringfence.loading.resolve",
     "Controller": "ringfence.loading.controller",
     "play": "ringfence.evaluation.play",
-    "record": "ringfence.logs.collect",
+    "collect": "ringfence.logs.collect",
     "ope": "ringfence.evaluation.ope",
     "World": "ringfence.world",
     "fit": "ringfence.training.worlds",
@@ -35,6 +35,7 @@ __all__ = list(_WHERE)
 # Names of 0.1.0, which warn where they are called.
 _OLD = {
     "judge": "ringfence.evaluation.ope.judge",
+    "record": "ringfence.logs.collect",
 }
 moved.install()
 

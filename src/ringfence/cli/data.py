@@ -60,10 +60,10 @@ def import_table(
     gap: float | None = None,
     team: int | None = None,
     neighbours: int | None = None,
-    sight: float | None = None,
-    shortest: int = 5,
-    longest: int | None = None,
-    fastest: float = 100.0,
+    sensing_radius: float | None = None,
+    min_episode_steps: int = 5,
+    max_episode_steps: int | None = None,
+    max_speed: float = 100.0,
     task: str | None = None,
 ) -> None:
     """Import a CSV or Parquet file with a row per agent and time; needs the extra `ringfence[tables]`.
@@ -86,10 +86,10 @@ def import_table(
         gap: s without a row, after which an agent was away; five steps by default.
         team: agents of an episode; by default as many as most rows have.
         neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
-        sight: m, how far such an agent sees.
-        shortest: steps of an episode, at least.
-        longest: steps of an episode, at most; longer ones are cut.
-        fastest: m/s that nothing there can do.
+        sensing_radius: m, how far such an agent sees.
+        min_episode_steps: steps of an episode, at least.
+        max_episode_steps: steps of an episode, at most; longer ones are cut.
+        max_speed: m/s that nothing there can do.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.store import EpisodeStore
@@ -101,8 +101,14 @@ def import_table(
     bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
     options = {
         "danger": None if separation is None else Separation(separation, separation / 4),
-        **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
-        "fastest": fastest,
+        "dt": dt,
+        "gap": gap,
+        "team": team,
+        "neighbours": neighbours,
+        "sensing_radius": sensing_radius,
+        "min_episode_steps": min_episode_steps,
+        "max_episode_steps": max_episode_steps,
+        "max_speed": max_speed,
         "cost": cost,
         "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **bounds},
     }
@@ -127,9 +133,9 @@ def import_bag(
     gap: float | None = None,
     team: int | None = None,
     neighbours: int | None = None,
-    sight: float | None = None,
-    shortest: int = 5,
-    longest: int | None = None,
+    sensing_radius: float | None = None,
+    min_episode_steps: int = 5,
+    max_episode_steps: int | None = None,
     stamps: bool = True,
     twist: Literal["child", "world"] = "child",
     task: str | None = None,
@@ -149,9 +155,9 @@ def import_bag(
         gap: s without odometry, after which an agent was away; five steps by default.
         team: agents of an episode; by default as many as most rows have.
         neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
-        sight: m, how far such an agent sees.
-        shortest: steps of an episode, at least.
-        longest: steps of an episode, at most; longer ones are cut.
+        sensing_radius: m, how far such an agent sees.
+        min_episode_steps: steps of an episode, at least.
+        max_episode_steps: steps of an episode, at most; longer ones are cut.
         stamps: take the times in headers; --no-stamps takes those of recording.
         twist: frame of the odometry's velocities, child (ROS's rule) or world.
         task: a name for the data; that of the store's file by default.
@@ -170,7 +176,13 @@ def import_bag(
         action=bag.action,
         cost="cost" if "cost" in bag.columns else None,
         danger=None if separation is None else Separation(separation, separation / 4),
-        **dict(dt=dt, gap=gap, team=team, neighbours=neighbours, sight=sight, shortest=shortest, longest=longest),
+        dt=dt,
+        gap=gap,
+        team=team,
+        neighbours=neighbours,
+        sensing_radius=sensing_radius,
+        min_episode_steps=min_episode_steps,
+        max_episode_steps=max_episode_steps,
         notes=bag.notes,
         card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
     )

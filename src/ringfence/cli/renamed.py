@@ -22,6 +22,12 @@ OLD_FLAGS["eval"] |= {"--record": "--num-recorded", "--step": "--checkpoint"}
 OLD_FLAGS["export"] |= {"--step": "--checkpoint"}
 OLD_FLAGS["play"] |= {"--at-once": "--num-envs"}
 OLD_FLAGS["train"] = {"--together": "--vmap-seeds"}
+OLD_FLAGS["data import-bag"] = {
+    "--longest": "--max-episode-steps",
+    "--shortest": "--min-episode-steps",
+    "--sight": "--sensing-radius",
+}
+OLD_FLAGS["data import-table"] = OLD_FLAGS["data import-bag"] | {"--fastest": "--max-speed"}
 # By today's flag.
 OLD_VALUES: dict[str, dict[str, str]] = {
     "--barrier": stored.BARRIERS,

@@ -16,12 +16,12 @@ from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils.files import writable
 from ringfence.utils.progress import Progress
-from ringfence.utils.renamed import deprecated
+from ringfence.utils.renamed import deprecated, renamed
 
 EACH = 100  # episodes after which what is there is kept
 
 
-def record(
+def collect(
     make_env: Callable[[], Any],
     policy: Callable[..., np.ndarray] | None = None,
     *,
@@ -32,7 +32,6 @@ def record(
     max_episode_steps: int = 100_000,
     card: dict | None = None,
     quiet: bool = True,
-    longest: int | None = None,
 ) -> EpisodeStore:
     """The logs of `episodes` episodes of `make_env()`, a PettingZoo `ParallelEnv` whose agents begin and end together.
 
@@ -42,12 +41,9 @@ def record(
     that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0. A
     dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0 by default).
 
-    With `out` a store's file is written every hundred episodes, and a recording of the same simulator, policy's name
+    With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy's name
     and seed goes on from there. `max_episode_steps` without an end are refused. `card` adds fields to the store's.
     """
-    if longest is not None:
-        deprecated("longest of record", "max_episode_steps")
-        max_episode_steps = longest
     whole_number("episodes", episodes, 1)
     whole_number("seed", seed, 0, 2**31)
     whole_number("max_episode_steps", max_episode_steps, 1)
@@ -69,7 +65,7 @@ def record(
         max_steps=max_episode_steps,
     )
     fresh: list[_Played] = []
-    with Progress(f"recording {source['simulator']}", episodes, begun, quiet) as bar:
+    with Progress(f"collecting {source['simulator']}", episodes, begun, quiet) as bar:
         for k in range(begun, episodes):
             fresh.append(_played(env, player, rules, seed, k))
             bar.advance(1)
@@ -83,6 +79,14 @@ def record(
                     kept.save(file)
     assert kept is not None  # the last episode is always kept
     return kept
+
+
+def record(
+    make_env: Callable[[], Any], policy: Callable[..., np.ndarray] | None = None, **options: Any
+) -> EpisodeStore:
+    """`collect`, as 0.1.0 called it."""
+    deprecated("record", "collect")
+    return collect(make_env, policy, **renamed(options, {"longest": "max_episode_steps"}, "record"))
 
 
 @dataclass(frozen=True)
@@ -245,7 +249,7 @@ def _store(
 
 
 def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> EpisodeStore | None:
-    """What an interrupted recording has kept."""
+    """What an interrupted collection has kept."""
     if file is None or not file.exists():
         return None
     store = EpisodeStore.load(file)

@@ -29,13 +29,13 @@ import h5py
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
-from ringfence.logs.io.table import Table, read_layout, read_table
+from ringfence.logs.io.table import OLD_OPTIONS, Table, read_layout, read_table
 from ringfence.logs.schema import ARRAYS, OPTIONAL, complete_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import digest_of
-from ringfence.utils.renamed import deprecated
+from ringfence.utils.renamed import deprecated, renamed
 
 FORMAT = 1
 PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
@@ -363,11 +363,13 @@ class EpisodeStore:
     def from_table(cls, table: Table, *, time: str, agent: str, state: Sequence[str], **options: Any) -> EpisodeStore:
         """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
         Parquet file; options as of `ringfence.logs.io.table.read_table`."""
+        options = renamed(options, OLD_OPTIONS, "from_table")
         return cls.from_steps(**read_table(table, time=time, agent=agent, state=state, **options))
 
     @classmethod
     def from_layout(cls, table: Table, layout: str, **options: Any) -> EpisodeStore:
         """A table in a published format, `highd` or `interaction`; options as of `from_table`."""
+        options = renamed(options, OLD_OPTIONS, "from_layout")
         return cls.from_steps(**read_layout(table, layout, **options))
 
     # --- disk ---

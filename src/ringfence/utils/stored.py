@@ -46,7 +46,7 @@ WORLD_SETTINGS = {
     "missed": "miscoverage",
 }
 SPEC = {"alike": "homogeneous"}
-CARD = {"alike": "homogeneous"}
+CARD = {"alike": "homogeneous", "sight": "sensing_radius"}
 BARRIERS = {"formula": "analytic"}
 EXECUTIONS = {"all": "centralized", "own": "decentralized"}
 PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}

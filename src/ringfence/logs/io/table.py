@@ -20,11 +20,19 @@ from ringfence.errors import StoreError, UserError, unknown, whole_number
 from ringfence.logs.io.tracks import Tracks, cut, nearest, resample, teams
 from ringfence.problem.constraints import CostColumn, Hazard, Separation
 from ringfence.problem.features import others
+from ringfence.utils import stored
 
 AXES = "xyz"
 GAP = 5.0  # steps without a row that end an episode
 LONG = 5.0  # s, a step that hardly any controller has
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
+# Options as 0.1.0 called them.
+OLD_OPTIONS = {
+    "longest": "max_episode_steps",
+    "shortest": "min_episode_steps",
+    "fastest": "max_speed",
+    "sight": "sensing_radius",
+}
 
 
 @dataclass(frozen=True)
@@ -67,10 +75,10 @@ def read_table(
     gap: float | None = None,
     team: int | None = None,
     neighbours: int | None = None,
-    sight: float | None = None,
-    shortest: int = 5,
-    longest: int | None = None,
-    fastest: float = 100.0,
+    sensing_radius: float | None = None,
+    min_episode_steps: int = 5,
+    max_episode_steps: int | None = None,
+    max_speed: float = 100.0,
     danger: Hazard | None = None,
     notes: Sequence[str] = (),
     card: dict | None = None,
@@ -88,8 +96,9 @@ def read_table(
     Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
     `team` of them is there (by default of the size with most rows), or with `neighbours`=k the whole track of one
-    agent, who sees the k nearest others within `sight` m; such agents are homogeneous, and a policy plays any number of
-    them. Episodes have `shortest` to `longest` steps. `fastest` m/s is more than anything there can do.
+    agent, who sees the k nearest others within `sensing_radius` m; such agents are homogeneous, and a policy plays any
+    number of them. Episodes have `min_episode_steps` to `max_episode_steps` steps. `max_speed` m/s is more than
+    anything there can do.
 
     The card's warnings say what was taken for what, and what was left out, after the `notes` of whoever read the
     table. `StoreError` names the first row that cannot be (counted from 0, without a header).
@@ -101,8 +110,8 @@ def read_table(
             raise UserError(f"{name}='{given}' is one word; give a list of columns.")
         if twice := [c for c in given if list(given).count(c) > 1]:
             raise UserError(f"{name} names the column '{twice[0]}' twice; name it once.")
-    _check_sizes(team, neighbours, shortest, longest)
-    for name, value in (("dt", dt), ("gap", gap), ("sight", sight), ("fastest", fastest)):
+    _check_sizes(team, neighbours, min_episode_steps, max_episode_steps)
+    for name, value in (("dt", dt), ("gap", gap), ("sensing_radius", sensing_radius), ("max_speed", max_speed)):
         if value is not None and not (isinstance(value, int | float) and 0 < value < np.inf):
             raise UserError(f"{name}={value!r} must be a number above 0.")
     if not state:
@@ -124,7 +133,7 @@ def read_table(
     zero = np.zeros(len(rows.time))
     earned = _numbers(read, reward)[rows.order] if reward else zero
     charged = np.stack([_numbers(read, c)[rows.order] for c in cost] or [zero], 1)
-    _check_units(values, rows, position, speed, fastest, notes)
+    _check_units(values, rows, position, speed, max_speed, notes)
     step = dt or float(f"{rows.step:.6g}")
     gap = gap or GAP * max(step, rows.step)
     if gap < rows.step:
@@ -173,9 +182,11 @@ def read_table(
     if not action:
         notes.append("actions are accelerations, differences of velocities")
     if neighbours is None:
-        arrays = _team(made, danger, bool(cost), shortest, longest, team)
+        arrays = _team(made, danger, bool(cost), min_episode_steps, max_episode_steps, team)
     else:
-        arrays = _neighbourly(made, danger, bool(cost), shortest, longest, neighbours, sight or np.inf)
+        arrays = _neighbourly(
+            made, danger, bool(cost), min_episode_steps, max_episode_steps, neighbours, sensing_radius or np.inf
+        )
     acts = arrays.pop("held") if action else made.accelerations(arrays["rows"])
     return _steps(made, arrays, acts, bool(reward), cost, danger, neighbours is not None, card or {})
 
@@ -202,6 +213,7 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
     `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
     are homogeneous, any number in any order.
     """
+    card = stored.card(card)
     names = card.get("observation_names") or ()
     columns = {name: np.asarray(x, np.float64) for name, x in state.items()}
     aims = {name: np.asarray(x, np.float64) for name, x in (goal or {}).items()}
@@ -213,7 +225,7 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
     slots = 1 + max((int(m[1]) for name in names if (m := re.match(r"other(\d+)\.", name))), default=-1)
     near = others(n)
     there = np.ones((n, slots), bool)
-    reach = float(card.get("sight", np.inf))
+    reach = float(card.get("sensing_radius", np.inf))
     if card.get("homogeneous"):
         zero = np.zeros(n, int)
         place = np.stack([columns[c] for c in axes], 1)
@@ -242,15 +254,18 @@ def observe(card: dict, state: Mapping[str, Any], goal: Mapping[str, Any] | None
     return np.stack([entry(name) for name in names], 1).astype(np.float32)
 
 
-def _check_sizes(team, neighbours, shortest, longest) -> None:
+def _check_sizes(team, neighbours, min_episode_steps, max_episode_steps) -> None:
     if team is not None and neighbours is not None:
         raise UserError("team and neighbours both say who an episode is of; give one of them.")
-    for name, value in (("team", team), ("neighbours", neighbours), ("longest", longest)):
+    for name, value in (("team", team), ("neighbours", neighbours), ("max_episode_steps", max_episode_steps)):
         if value is not None:
             whole_number(name, value, 1, 10**6)
-    whole_number("shortest", shortest, 1)
-    if longest is not None and longest < shortest:
-        raise UserError(f"longest={longest} steps are fewer than shortest={shortest}; give a shorter 'shortest', too.")
+    whole_number("min_episode_steps", min_episode_steps, 1)
+    if max_episode_steps is not None and max_episode_steps < min_episode_steps:
+        raise UserError(
+            f"max_episode_steps={max_episode_steps} is less than min_episode_steps={min_episode_steps}; give a smaller "
+            "min_episode_steps, too."
+        )
 
 
 # --- reading ---
@@ -411,7 +426,9 @@ def _is_text(x: bytes) -> bool:
     return True
 
 
-def _check_units(values, rows: _Rows, position: list[str], speed: list[str], fastest: float, notes: list[str]) -> None:
+def _check_units(
+    values, rows: _Rows, position: list[str], speed: list[str], max_speed: float, notes: list[str]
+) -> None:
     """Refuse rows that nothing can lie apart by, and say where velocities are not those of the positions."""
     if not position:
         return
@@ -420,12 +437,12 @@ def _check_units(values, rows: _Rows, position: list[str], speed: list[str], fas
     passed = np.where(same, np.diff(rows.time), np.inf)
     moved = np.diff(place, axis=0) / passed[:, None]
     fast = np.linalg.norm(moved, axis=1)
-    if (fast > fastest).any():
-        k = int(np.flatnonzero(fast > fastest)[np.argmin(rows.order[1:][fast > fastest])])
+    if (fast > max_speed).any():
+        k = int(np.flatnonzero(fast > max_speed)[np.argmin(rows.order[1:][fast > max_speed])])
         raise StoreError(
             f"row {int(rows.order[k + 1])}: {', '.join(position)} moved at {fast[k]:.4g} m/s since row "
-            f"{int(rows.order[k])} of the same agent, more than fastest={fastest:g}; check the units of positions (m) "
-            "and times (s), or drop the row."
+            f"{int(rows.order[k])} of the same agent, more than max_speed={max_speed:g}; check the units of positions "
+            "(m) and times (s), or drop the row."
         )
     usual = same & (fast <= np.quantile(fast[same], 0.99))  # a row that jumped says nothing of the others
     for k, c in enumerate(position):
@@ -496,16 +513,23 @@ class _Made:
         return self.tracks.state[:, len(self.state) :] - self.place()
 
 
-def _team(made: _Made, danger: Separation | None, has_cost: bool, shortest: int, longest: int | None, size: int | None):
+def _team(
+    made: _Made,
+    danger: Separation | None,
+    has_cost: bool,
+    min_episode_steps: int,
+    max_episode_steps: int | None,
+    size: int | None,
+):
     """Episodes of a constant team: rows (W, N), their lengths and what everybody sees."""
     t = made.tracks
     rows, many, n = teams(t, size)
-    index, many = cut(many, shortest, longest)
+    index, many = cut(many, min_episode_steps, max_episode_steps)
     if not len(many):
         here = np.unique(t.agent).size
         raise StoreError(
-            f"No {n} agents are together for {shortest} steps of {t.dt:g} s (the table has {here}); give another team, "
-            "a shorter 'shortest', a longer gap, or neighbours."
+            f"No {n} agents are together for {min_episode_steps} steps of {t.dt:g} s (the table has {here}); give "
+            "another team, a smaller min_episode_steps, a longer gap, or neighbours."
         )
     kept = rows[index]
     share = 1 - len(np.unique(kept)) / len(t.step)
@@ -539,18 +563,26 @@ def _team(made: _Made, danger: Separation | None, has_cost: bool, shortest: int,
 
 
 def _neighbourly(
-    made: _Made, danger: Separation | None, has_cost: bool, shortest: int, longest: int | None, k: int, sight
+    made: _Made,
+    danger: Separation | None,
+    has_cost: bool,
+    min_episode_steps: int,
+    max_episode_steps: int | None,
+    k: int,
+    sensing_radius,
 ):
     """Episodes of one agent each, who sees its k nearest."""
     t = made.tracks
-    index, many = cut(np.bincount(t.segment, minlength=t.segment.max() + 1), shortest, longest)
+    index, many = cut(np.bincount(t.segment, minlength=t.segment.max() + 1), min_episode_steps, max_episode_steps)
     if not len(many):
-        raise StoreError(f"No agent is there for {shortest} steps of {t.dt:g} s; give a shorter 'shortest'.")
+        raise StoreError(
+            f"No agent is there for {min_episode_steps} steps of {t.dt:g} s; give a smaller min_episode_steps."
+        )
     place, moving = made.place(), made.moving()
-    near = nearest(t, place, k, sight)
+    near = nearest(t, place, k, sensing_radius)
     there = near >= 0
     offset = np.where(there[..., None], place[near] - place[:, None], 0.0)
-    reach = sight if np.isfinite(sight) else float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
+    reach = sensing_radius if np.isfinite(sensing_radius) else float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
     offset[~there] = np.eye(place.shape[1])[0] * reach  # nobody is as far as one sees
     drift = np.where(there[..., None], moving[near] - moving[:, None], 0.0)
     names, parts = _own(made, moving, with_place=False)
@@ -563,7 +595,7 @@ def _neighbourly(
         cost = ((np.linalg.norm(offset[:, 0], axis=-1) < danger.radius) * there[:, 0]).astype(float)[:, None]
     rows = index[:, None]
     return {"rows": rows, "many": many, "seen": np.concatenate(parts, 1)[rows], "names": names, "cost": cost[rows],
-            "held": t.action[rows], "sight": reach}  # fmt: skip
+            "held": t.action[rows], "sensing_radius": reach}  # fmt: skip
 
 
 def _own(made: _Made, moving: np.ndarray, with_place: bool) -> tuple[list[str], list[np.ndarray]]:
@@ -618,7 +650,7 @@ def _steps(
         "action_low": -bound,
         "action_high": bound,
     }
-    facts |= {"homogeneous": True, "sight": arrays["sight"]} if homogeneous else {}
+    facts |= {"homogeneous": True, "sensing_radius": arrays["sensing_radius"]} if homogeneous else {}
     return {
         "observations": arrays["seen"][steps],
         "actions": acts,

@@ -111,23 +111,23 @@ def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int
     return order[np.repeat(chosen[window], many)].reshape(-1, size), rows[chosen], size
 
 
-def cut(rows: np.ndarray, shortest: int, longest: int | None) -> tuple[np.ndarray, np.ndarray]:
-    """(index of rows, rows of each piece): windows of so many `rows` in pieces of `shortest` to `longest` steps, each
+def cut(rows: np.ndarray, fewest: int, most: int | None) -> tuple[np.ndarray, np.ndarray]:
+    """(index of rows, rows of each piece): windows of so many `rows` in pieces of `fewest` to `most` steps, each
     of which begins with the row that the one before ends with."""
     starts = np.cumsum(rows) - rows
     steps = rows - 1
-    if longest is not None:
-        pieces = np.maximum(-(-steps // longest), 1)
+    if most is not None:
+        pieces = np.maximum(-(-steps // most), 1)
         number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        starts, steps = np.repeat(starts, pieces) + number * longest, np.repeat(steps, pieces) - number * longest
-        steps = np.minimum(steps, longest)
-    kept = steps >= shortest
+        starts, steps = np.repeat(starts, pieces) + number * most, np.repeat(steps, pieces) - number * most
+        steps = np.minimum(steps, most)
+    kept = steps >= fewest
     starts, many = starts[kept], steps[kept] + 1
     return np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(starts, many), many
 
 
-def nearest(tracks: Tracks, position: np.ndarray, k: int, sight: float) -> np.ndarray:
-    """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sight` m."""
+def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float) -> np.ndarray:
+    """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sensing_radius` m."""
     order = np.lexsort((tracks.step, tracks.recording))
     recording, step = tracks.recording[order], tracks.step[order]
     begins = np.ones(len(order), bool)
@@ -147,7 +147,7 @@ def nearest(tracks: Tracks, position: np.ndarray, k: int, sight: float) -> np.nd
         with np.errstate(invalid="ignore"):
             far = np.sqrt(((at[:, None] - at[:, :, None]) ** 2).sum(-1))
         far[:, np.arange(width), np.arange(width)] = np.inf
-        far = np.where(np.isnan(far) | (far > sight), np.inf, far)
+        far = np.where(np.isnan(far) | (far > sensing_radius), np.inf, far)
         if width > 1:
             who = np.argsort(far, -1, kind="stable")[..., : min(k, width - 1)]
             close = np.isfinite(np.take_along_axis(far, who, -1))

@@ -1,4 +1,4 @@
-"""Recording anybody's simulator: what it shows is what is kept, and an interrupted recording goes on."""
+"""Logs collected of anybody's simulator: what it shows is what is kept, and an interrupted collection goes on."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def lean(observations, state):
 
 
 def test_what_is_shown_is_what_is_kept():
-    store = ringfence.record(Drift, lean, episodes=8, seed=5)
+    store = ringfence.collect(Drift, lean, episodes=8, seed=5)
     env, ends = Drift(), np.concatenate([[0], store.episode_ends])
     for k in range(8):
         seen, _ = env.reset(seed=5 + k)
@@ -73,13 +73,13 @@ def test_what_is_shown_is_what_is_kept():
         assert store.episode_terminated[k] == over["a"] and not env.agents
     assert set(store.lengths) <= {3, 4, 5, 6} and len(set(store.lengths)) > 1 and store.costs.ndim == 2
     assert (store.card["action_low"], store.card["action_high"]) == (-2, 2) and store.card["agents"] == ["a", "b"]
-    team = ringfence.record(Drift, lean, episodes=3, cost=lambda infos: 0.5)
+    team = ringfence.collect(Drift, lean, episodes=3, cost=lambda infos: 0.5)
     assert team.costs.ndim == 1 and (team.costs == 0.5).all()
 
 
-def test_an_interrupted_recording_goes_on(tmp_path, monkeypatch):
+def test_an_interrupted_collection_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr("ringfence.logs.collect.EACH", 4)
-    whole = ringfence.record(Drift, None, episodes=11, seed=1)
+    whole = ringfence.collect(Drift, None, episodes=11, seed=1)
     advance, count = Progress.advance, []
 
     def stops(self, *steps):
@@ -90,17 +90,17 @@ def test_an_interrupted_recording_goes_on(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Progress, "advance", stops)
     with pytest.raises(KeyboardInterrupt):
-        ringfence.record(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
+        ringfence.collect(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
     assert EpisodeStore.load(tmp_path / "d.h5").episodes == 4
-    again = ringfence.record(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
+    again = ringfence.collect(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
     assert len(count) == 14 and again.content == whole.content == EpisodeStore.load(tmp_path / "d.h5").content
-    assert ringfence.record(Drift, None, episodes=5, seed=1, out=tmp_path / "d.h5").episodes == 5
+    assert ringfence.collect(Drift, None, episodes=5, seed=1, out=tmp_path / "d.h5").episodes == 5
     with pytest.raises(StoreError, match="holds another recording"):
-        ringfence.record(Drift, lean, episodes=11, seed=1, out=tmp_path / "d.h5")
+        ringfence.collect(Drift, lean, episodes=11, seed=1, out=tmp_path / "d.h5")
     assert np.abs(whole.actions).max() > 1.5
 
 
-def test_states_and_policies_with_a_memory_are_recorded():
+def test_states_and_policies_with_a_memory_are_collected():
     class Counting:
         begun = 0
 
@@ -112,11 +112,11 @@ def test_states_and_policies_with_a_memory_are_recorded():
             return np.zeros((3, 2))
 
     pilot = Counting()
-    store = ringfence.record(SimpleSpreadParallel, pilot, episodes=2)
+    store = ringfence.collect(SimpleSpreadParallel, pilot, episodes=2)
     assert pilot.begun == 2 and store.state is not None and store.lengths.tolist() == [25, 25]
 
 
-def test_simulators_and_policies_that_cannot_be_recorded(tmp_path):
+def test_simulators_and_policies_that_cannot_be_collected(tmp_path):
     class Few(Drift):
         def action_space(self, agent):
             return Discrete(5)
@@ -139,7 +139,15 @@ def test_simulators_and_policies_that_cannot_be_recorded(tmp_path):
         (object, lean, "without"),
     ):
         with pytest.raises(UserError, match=said):
-            ringfence.record(make_env, policy, episodes=2, out=tmp_path / "x.h5")
+            ringfence.collect(make_env, policy, episodes=2, out=tmp_path / "x.h5")
     with pytest.raises(UserError, match="has not ended after 2 steps"):
-        ringfence.record(Drift, lean, episodes=2, max_episode_steps=2)
+        ringfence.collect(Drift, lean, episodes=2, max_episode_steps=2)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_name_of_before_works_and_warns():
+    with pytest.warns(FutureWarning, match="record is called collect now"):
+        store = ringfence.record(Drift, lean, episodes=3, longest=7)
+    assert store.content == ringfence.collect(Drift, lean, episodes=3).content
+    with pytest.warns(FutureWarning, match="longest of record is called max_episode_steps"):
+        ringfence.record(Drift, lean, episodes=1, longest=7)
