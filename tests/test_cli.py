@@ -1,6 +1,9 @@
 """The command line: what it prints, what it refuses, and the whole job from data to page."""
 
 import json
+import os
+import shutil
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -12,6 +15,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation import rollout
 from ringfence.guards import GUARDS
 from ringfence.logs.store import EpisodeStore
+from ringfence.training.runs import Run
 
 
 def test_lists_tasks(capsys):
@@ -156,3 +160,27 @@ def test_the_whole_job(tmp_path, monkeypatch, capsys):
     told = capsys.readouterr().out
     assert "BC, full guard, learned" in told and "ICBF split, shielded, learned" in told
     assert "of 1000 held-out steps" in told
+
+
+def test_the_doctor_works_where_jax_finds_no_device():
+    """The one moment that it is for."""
+    code = "from ringfence.cli.app import main; main(['doctor'])"
+    environment = {**os.environ, "JAX_PLATFORMS": "tpu"}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and "Traceback" not in done.stderr
+    line = next(line for line in done.stdout.splitlines() if line.startswith("devices"))
+    assert "none (" in line and line.endswith(
+        "JAX_PLATFORMS=tpu asks for what is not here; unset it, or set JAX_PLATFORMS=cpu."
+    )
+
+
+def test_a_folder_of_runs_is_what_it_holds(tmp_path):
+    """From Python, as the command line resolves it."""
+    for seed in (0, 1):
+        (tmp_path / "toy" / "bc" / f"seed-{seed}").mkdir(parents=True)
+        (tmp_path / "toy" / "bc" / f"seed-{seed}" / "config.json").write_text("{}")
+    with pytest.raises(UserError, match=r"holds 2 runs; name one of them: .*seed-0.*seed-1'\.$"):
+        Run.of(tmp_path / "toy")
+    shutil.rmtree(tmp_path / "toy" / "bc" / "seed-1")
+    assert Run.of(str(tmp_path)).path == tmp_path / "toy" / "bc" / "seed-0"
+    assert Run.of(tmp_path / "nothing").path == tmp_path / "nothing", "refused where its config is read"

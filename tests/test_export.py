@@ -21,8 +21,9 @@ from ringfence.deploy import export as exporting
 from ringfence.errors import UserError
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
+from ringfence.logs.store import EpisodeStore
 from ringfence.proposals.base import Constant
-from ringfence.training import loop
+from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 
 SHIELD = dict(guard="shield", horizon=1, correction_steps=3, margin=4.0)
@@ -283,3 +284,43 @@ def test_the_c_example_plays_the_file(run, small_store, tmp_path):
     acted = np.array([[float(x) for x in line.split()] for line in out.splitlines()])
     controller = Controller(run)
     np.testing.assert_allclose(acted, [controller.act(**row).ravel() for row in rows], atol=1e-4)
+
+
+def test_metadata_is_json_where_nothing_was_told_yet(played, small_store, tmp_path):
+    """JSON has no NaN; what `float` reads as one stands in its place, for programs of other languages, too."""
+
+    def refuse(word):
+        pytest.fail(f"JSON has no {word}")
+
+    costs = {"near": played["costs"], "far": 1.0 - played["costs"]}
+    card = {**small_store.card, "constraints": {"near": 1.0, "far": 20.0}}
+    state = {"state": played["state"]}
+    named = [played[name] for name in ("observations", "actions", "rewards")]
+    store = EpisodeStore.from_episodes(*named, costs, card=card, **state)
+    (run,) = loop.train("bc", store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path)
+    options = {**SHIELD, "adapt": 0.1, "world": worlds.fit(store, labels="costs", **QUICK_WORLD)}
+    file = exporting.export(run, tmp_path / "p.stablehlo", "stablehlo", **options)
+    with zipfile.ZipFile(file) as packed:
+        metadata = json.loads(packed.read("metadata.json"), parse_constant=refuse)
+    assert metadata["initial"]["memory.cost"] == "NaN" and np.isnan(np.asarray("NaN", np.float32))
+    initial = {"a": np.array([np.nan, np.inf, 1.0], np.float32), "b": np.zeros(3), "c": np.zeros((0,))}
+    assert [exporting._short(x) for x in initial.values()] == [["NaN", "Infinity", 1.0], 0.0, 0.0]
+    assert exporting._flat(initial) == {"initial.a": "NaN Infinity 1.0", "initial.b": "0.0", "initial.c": "0.0"}
+
+
+def test_the_c_example_reads_what_streams_do_not(tmp_path):
+    """`operator>>` of C++ ends at NaN and leaves 0; the lines of the example do not."""
+    if not shutil.which("g++"):
+        pytest.skip("no g++")
+    lines = (Path(__file__).parents[1] / "examples" / "export_cpp" / "play.cpp").read_text().splitlines()
+    first = next(k for k, line in enumerate(lines) if "std::vector<float> given" in line)
+    reads = "\n".join(lines[first : first + 2])
+    code = (
+        "#include <cstdlib>\n#include <iostream>\n#include <iterator>\n#include <sstream>\n#include <vector>\n"
+        f'int main() {{ std::istringstream initial("NaN 2 -Infinity");\n{reads}\n'
+        "for (float x : given) std::cout << x << ' '; }"
+    )
+    (tmp_path / "a.cpp").write_text(code)
+    subprocess.run(["g++", "-std=c++17", str(tmp_path / "a.cpp"), "-o", str(tmp_path / "a")], check=True)
+    out = subprocess.run([tmp_path / "a"], capture_output=True, text=True, check=True).stdout
+    assert out.split() == ["nan", "2", "-inf"]

@@ -313,3 +313,19 @@ def test_ctrl_c_is_not_swallowed():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split() == ["heard", "finished", "heard"]
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_who_may_read_a_file_follows_the_umask(umask, tmp_path):
+    """Though safetensors writes 0600 whatever is asked for."""
+    from safetensors.numpy import save_file
+
+    from ringfence.utils.files import whole
+
+    before = os.umask(umask)
+    try:
+        with whole(tmp_path / "w.safetensors") as temporary:
+            save_file({"x": np.zeros(3)}, temporary)
+    finally:
+        os.umask(before)
+    assert (tmp_path / "w.safetensors").stat().st_mode & 0o777 == 0o666 & ~umask

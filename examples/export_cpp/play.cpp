@@ -6,7 +6,6 @@
 #include <cmath>
 #include <cstdlib>
 #include <iostream>
-#include <iterator>
 #include <map>
 #include <random>
 #include <sstream>
@@ -40,7 +39,8 @@ int main(int argc, char** argv) {
     const auto tensor = info.GetTensorTypeAndShapeInfo();
     std::vector<float> values(tensor.GetElementCount(), name == "cost" ? NAN : 0.0f);  // NaN: nobody told a cost
     std::istringstream initial(told("initial." + name));  // one number for all entries, or every one of them
-    std::vector<float> given{std::istream_iterator<float>(initial), {}};
+    std::vector<float> given;
+    for (std::string word; initial >> word;) given.push_back(std::strtof(word.c_str(), nullptr));  // streams read no NaN
     for (size_t k = 0; k < values.size() && !given.empty(); ++k) values[k] = given[given.size() > 1 ? k : 0];
     ins.push_back(name), shapes[name] = tensor.GetShape();
     const bool whole = tensor.GetElementType() == ONNX_TENSOR_ELEMENT_DATA_TYPE_INT32;

@@ -486,17 +486,16 @@ def _some_runs(paths: list[Path]) -> list[Run]:
 
 def _runs(paths: list[Path]) -> list[Run]:
     """The runs in folders, or in folders of them."""
-    from ringfence.training.runs import Run
+    from ringfence.training.runs import runs_below
 
-    found = []
+    found: list[Run] = []
     for path in paths:
         if not path.exists():
             raise UserError(f"'{path}' does not exist; give a folder that `ringfence train` made.")
-        files = [path / "config.json"] if (path / "config.json").exists() else sorted(path.rglob("config.json"))
-        files = [f for f in files if not any(p.startswith(".") for p in f.relative_to(path).parts)]  # half-copied
-        if not files:
+        below = runs_below(path)
+        if not below:
             raise UserError(f"'{path}' holds no run; give a folder that `ringfence train` made.")
-        found += [Run(f.parent) for f in files]
+        found += below
     return found
 
 

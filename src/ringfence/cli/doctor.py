@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata as metadata
+import os
 
 from rich.console import Console
 from rich.markup import escape
 
 from ringfence.errors import UserError
+from ringfence.utils.environment import device_problem
 
 out = Console(highlight=False)
 
@@ -22,7 +24,7 @@ def doctor() -> None:
         out.print(f"{name:12} {escape(str(versions[name]))}")
     for name, version in versions["packages"].items():
         out.print(f"{name:12} {version}")
-    out.print(f"{'devices':12} {', '.join(versions['devices'])}")
+    out.print(f"{'devices':12} {escape(_devices(versions['devices']))}", soft_wrap=True)
     out.print(f"{'cache':12} {escape(str(cache_dir()))}", soft_wrap=True)
     from ringfence.report import video
 
@@ -42,3 +44,12 @@ def doctor() -> None:
             out.print(f"{package:12} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
             out.print(f"{package:12} [yellow]missing[/], for {use}: pip install 'ringfence\\[{extra}]'")
+
+
+def _devices(found: list[str]) -> str:
+    """Devices in words; where JAX finds none, why, and what to do."""
+    if found:
+        return ", ".join(found)
+    chosen = os.environ.get("JAX_PLATFORMS")
+    remedy = f"JAX_PLATFORMS={chosen} asks for what is not here; unset it, or" if chosen else ""
+    return f"none ({device_problem()}); {remedy} set JAX_PLATFORMS=cpu."

@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -295,9 +296,28 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
 
 
 def _short(x: np.ndarray) -> Any:
-    """An array as one number where all its entries are that number, else as nested lists."""
-    first = x.flat[0] if x.size else 0
-    return np.asarray(first).item() if (x == first).all() else x.tolist()
+    """An array as one number where all its entries are that number, else as nested lists.
+
+    JSON has no word for NaN or infinity: they are the strings "NaN", "Infinity" and "-Infinity", which `float` and
+    `numpy.asarray` read.
+    """
+    first = x.flat[0] if x.size else np.zeros((), x.dtype)[()]
+    same = bool(np.array_equal(x, np.full_like(x, first), equal_nan=x.dtype.kind == "f"))
+    return _jsonable(first.item() if same else x.tolist())
+
+
+def _jsonable(value: Any) -> Any:
+    """Numbers, and nested lists of them, as JSON can hold them."""
+    if isinstance(value, list):
+        return [_jsonable(one) for one in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
+def _json(metadata: dict[str, Any], indent: int | None = None) -> str:
+    """Metadata as JSON that every reader takes."""
+    return json.dumps(metadata, indent=indent, allow_nan=False)
 
 
 # --- formats ---
@@ -311,7 +331,7 @@ def _write_stablehlo(step: Step, metadata: dict[str, Any], file: Path) -> None:
     with _without_locations():
         program = jax_export.export(jax.jit(step.call), platforms=["cpu"], disabled_checks=checks)(*step.avals)
     contents = {
-        "metadata.json": json.dumps(metadata, indent=1).encode(),
+        "metadata.json": _json(metadata, indent=1).encode(),
         "policy.mlirbc": program.mlir_module_serialized,
         "policy.jax": bytes(program.serialize()),
     }
@@ -334,15 +354,15 @@ def _without_locations() -> Iterator[None]:
 
 def _write_onnx(step: Step, metadata: dict[str, Any], file: Path) -> None:
     model = as_onnx(step)
-    for name, text in {"ringfence": json.dumps(metadata), **_flat(step.initial)}.items():
+    for name, text in {"ringfence": _json(metadata), **_flat(step.initial)}.items():
         model.metadata_props.add(key=name, value=text)
     file.write_bytes(model.SerializeToString())
 
 
 def _flat(initial: dict[str, np.ndarray]) -> dict[str, str]:
     """Initial memory as a program without a JSON reader takes it: one number for all entries, or every one of them."""
-    flat = {name: np.asarray(_short(x)).reshape(-1) for name, x in initial.items()}
-    return {f"initial.{name}": " ".join(str(number.item()) for number in x) for name, x in flat.items()}
+    flat = {name: np.asarray(_short(x), object).reshape(-1) for name, x in initial.items()}
+    return {f"initial.{name}": " ".join(map(str, numbers)) for name, numbers in flat.items()}
 
 
 def as_onnx(step: Step) -> Any:

@@ -16,7 +16,7 @@ from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.logs.provenance import other_data
 from ringfence.report.pooling import Line, Result, mean_of, pool
-from ringfence.training.runs import Run
+from ringfence.training.runs import Run, runs_below
 
 SPLITS = ("test", "validation")
 NAMES = {
@@ -86,8 +86,9 @@ def _distinct(runs: Iterable[Run | str | Path]) -> list[Run]:
     """Folders become runs; the same folder named twice counts once."""
     found: dict[Path, Run] = {}
     for each in runs:
-        run = Run.of(each)
-        found.setdefault(run.path.resolve(), run)
+        below = [] if isinstance(each, Run) else runs_below(Path(each))
+        for run in below or [Run.of(each)]:
+            found.setdefault(run.path.resolve(), run)
     return list(found.values())
 
 

@@ -40,10 +40,16 @@ class Run:
 
     @classmethod
     def of(cls, run: Run | str | Path) -> Run:
-        """A run, or the one in the folder that is named."""
+        """A run, the one in the folder that is named, or the only one below it."""
         if not isinstance(run, Run | str | Path) or not str(getattr(run, "path", run)).strip():
             raise UserError(f"{str(run)[:60]!r} is no run; give the folder that `ringfence train` made.")
-        return run if isinstance(run, Run) else cls(Path(run))
+        if isinstance(run, Run):
+            return run
+        below = runs_below(Path(run))
+        if len(below) > 1:
+            names = ", ".join(f"'{one.path}'" for one in below[:3])
+            raise UserError(f"'{run}' holds {len(below)} runs; name one of them: {names}{', …' * (len(below) > 3)}.")
+        return below[0] if below else cls(Path(run))
 
     @property
     def config(self) -> dict[str, Any]:
@@ -126,6 +132,14 @@ class Run:
         """Keep a result beside the others, whoever else adds some at the same time."""
         with alone(self.path / ".results.lock"):
             write_json(self.path / "results.json", {**self.results, variant: result})
+
+
+def runs_below(folder: Path) -> list[Run]:
+    """The run in a folder, or those in folders of it, in order; hidden folders are half-copied."""
+    if (folder / "config.json").exists():
+        return [Run(folder)]
+    files = sorted(folder.rglob("config.json")) if folder.is_dir() else []
+    return [Run(f.parent) for f in files if not any(p.startswith(".") for p in f.relative_to(folder).parts)]
 
 
 def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:

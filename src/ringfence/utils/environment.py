@@ -21,12 +21,21 @@ def environment() -> dict:
         "ringfence": __version__,
         "python": platform.python_version(),
         "packages": {p: metadata.version(p) for p in packages},
-        "devices": [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
+        "devices": [] if device_problem() else [f"{d.platform}: {d.device_kind}" for d in jax.devices()],
         "processor": processor(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "system": platform.platform(terse=True),
         "git": _git(),
     }
+
+
+def device_problem() -> str:
+    """Why JAX finds no device; empty where it finds some."""
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        return (str(error).splitlines() or [type(error).__name__])[0]
+    return ""
 
 
 def processor() -> str:

@@ -26,14 +26,17 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
 
     A full disk or a folder that cannot be written becomes a `UserError`; whatever stood at `path` stays as it was. A
     link is followed; what is no regular file (a device, a folder, a pipe) is refused. What a killed writer of the same
-    file left behind is removed.
+    file left behind is removed. Who may read it follows the umask, whatever the library that writes it thinks.
     """
     path = writable(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         _sweep(path)
+        temporary.touch()
+        mode = temporary.stat().st_mode & 0o777  # the umask itself can only be read by changing it for all threads
         yield temporary
+        temporary.chmod(mode)
         os.replace(temporary, path)
     except OSError as error:
         _remove(temporary)
