@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test docs lint types clean
+.PHONY: demo test versions docs lint types clean
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Ringfence needs Python 3.11 or newer, found " + sys.version.split()[0] + "; run make PYTHON=python3.12") if sys.version_info < (3, 11) else None'
@@ -23,6 +23,10 @@ demo: $(VENV)/.ready
 
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+# The suite on every Python that is here, with the newest packages and with the oldest JAX that the bounds allow.
+versions:
+	.ci/versions
 
 # The site: warnings are errors, and what was built is looked at as a reader without a network would.
 docs: $(VENV)/.docs
