@@ -110,7 +110,7 @@ QUESTIONS = (
     ),
 )
 
-ADAPT, STEADY = "+adapt-learned", "+steady+adapt-learned"
+ADAPT, STEADY = "+adapt-learned", "+low_temperature+adapt-learned"
 OF_ROBOTS = (
     Question("a guard (`adapt`), under BC", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
     Question("danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-formula"), ROBOT_KEYS),
@@ -119,7 +119,9 @@ OF_ROBOTS = (
     Question(
         "ICBF, not return-conditioned BC", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
     ),
-    Question("ICBF under `full`, not BC", ("icbf", f"default+steady{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS),
+    Question(
+        "ICBF under `full`, not BC", ("icbf", f"default+low_temperature{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS
+    ),
     Question(
         "the barrier in training (ICBF, not MADIFF)",
         ("icbf", f"default{STEADY}"),
@@ -197,7 +199,7 @@ ROBOTS: dict[str, Row] = {
     "our MADIFF (low temperature)": ("madiff", f"default{STEADY}"),
     "ICBF (low temperature)": ("icbf", f"default{STEADY}"),
     "BC, `full`": ("bc", f"default{FULL}"),
-    "ICBF (low temperature), `full`": ("icbf", f"default+steady{FULL}"),
+    "ICBF (low temperature), `full`": ("icbf", f"default+low_temperature{FULL}"),
     "MPC from a zero proposal (`mpc`), `full`": ("mpc", f"default{FULL}"),
     "MPC from a zero proposal, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }

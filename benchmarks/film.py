@@ -5,7 +5,7 @@
     ringfence eval $RUN --agents 64 --episodes 1 --num-recorded 1 --guard shield
     python benchmarks/film.py $RUN default+agents64 $RUN default+shield-learned+agents64 --out docs/images/crossing.gif
 
-docs/images/rollout.gif is of seed 0 of madiff, mujoco+steady, and of icbf, mujoco+adaptive, both of
+docs/images/rollout.gif is of seed 0 of madiff, mujoco+low_temperature, and of icbf, mujoco+adaptive, both of
 halfcheetah_2x3-good in results/mujoco (revision 3). Recordings are not in the repository.
 """
 

@@ -81,7 +81,7 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
     if not missing:
         return
     store, _ = make(task)
-    how = {"planner": "steady"} if task.protocol and algorithm == "icbf" else {}
+    how = {"planner": "low_temperature"} if task.protocol and algorithm == "icbf" else {}
     with tempfile.TemporaryDirectory() as folder:
         (run,) = loop.train(algorithm, store, seeds=(0,), out=folder, quiet=True)
         for value in missing:

@@ -29,9 +29,9 @@ ROBOTS = {
     "adapt, learned": ("bc", "default+adapt-learned"),
     "full, analytic": ("bc", "default+full-formula"),
     "**full, learned**": ("bc", "default+full-learned"),
-    "`icbf` (low temperature)": ("icbf", "default+steady"),
-    "`icbf`, adapt, analytic": ("icbf", "default+steady+adapt-formula"),
-    "`icbf`, adapt, learned": ("icbf", "default+steady+adapt-learned"),
+    "`icbf` (low temperature)": ("icbf", "default+low_temperature"),
+    "`icbf`, adapt, analytic": ("icbf", "default+low_temperature+adapt-formula"),
+    "`icbf`, adapt, learned": ("icbf", "default+low_temperature+adapt-learned"),
 }
 OWN = {
     "BC": ("bc", "default"),

@@ -3,8 +3,8 @@
     python benchmarks/robot_planner.py            # writes results/performance/robot_planner.json; a quarter of an hour
 
 Training is what `ringfence train icbf TASK` does with the task's preset, reading the data, the critic and compilation
-included; playing is `ringfence eval --planner steady --guard adapt --episodes 20`. Each in a process of its own, on
-all cores.
+included; playing is `ringfence eval --planner low_temperature --guard adapt --episodes 20`. Each in a process of its
+own, on all cores.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ if what == "train":
     training.train("icbf", make(task)[0], folder=lambda seed: folder, changes=changes, quiet=True)
 else:
     guard = {"guard": what} if what != "none" else {}
-    evaluate(Run(folder), episodes=20, split="validation", planner="steady", **guard)
+    evaluate(Run(folder), episodes=20, split="validation", planner="low_temperature", **guard)
 print(json.dumps([time.perf_counter() - begun, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20]))
 """
 
@@ -54,7 +54,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             for what, name in (
                 ("train", "icbf, training one seed"),
-                ("none", "icbf, 20 episodes, steady"),
+                ("none", "icbf, 20 episodes, low_temperature"),
                 ("adapt", "icbf, 20 episodes, shield that adapts"),
             ):
                 command = [sys.executable, "-c", MEASURED, what, task, f"{folder}/run", str(a.steps)]

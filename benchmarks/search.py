@@ -54,7 +54,7 @@ class Study:
     limit: float  # on the mean cost of an episode
     settings: dict[tuple[str, str], list[dict]]  # algorithm, preset ("": the task's) -> changes of settings 1 to 3
     file: str
-    planner: str = "plain"
+    planner: str = "default"
     safe: tuple[str, ...] = SAFE  # ranked by the rule of the leaderboard
     # Algorithm -> tasks on which settings 0, 1 and 4 were tried, too.
     further: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -135,7 +135,7 @@ STUDIES = {
             ("icbf", "mujoco"): [{"barrier_weight": 3.0}, {"discount": 0.99}, {"condition": "advantage"}],
         },
         "robots.csv",
-        planner="steady",
+        planner="low_temperature",
         safe=(*SAFE, "madiff"),  # since it is played under guard
     ),
 }
@@ -151,8 +151,8 @@ def one(job: tuple) -> dict:
 
     store, _ = make(registry.get(name))
     begun = time.perf_counter()
-    played = planner if algorithm in ("icbf", "madiff") else "plain"
-    guard = {"guard": "adapt"} if played == "steady" else {}  # robots' planners
+    played = planner if algorithm in ("icbf", "madiff") else "default"
+    guard = {"guard": "adapt"} if played == "low_temperature" else {}  # robots' planners
     with tempfile.TemporaryDirectory() as folder:
         (run,) = loop.train(
             algorithm, store, preset=preset or None, seeds=(SEED,), changes=changes, out=folder, quiet=True

@@ -1,7 +1,7 @@
 """What was tried on validation resets, as a table: one row per evaluation of the given run folders.
 
     ringfence train icbf halfcheetah_2x3-good --out runs/trials --set barrier_weight=3
-    ringfence eval runs/trials --split validation --episodes 10 --planner steady --guard adapt
+    ringfence eval runs/trials --split validation --episodes 10 --planner low_temperature --guard adapt
     python benchmarks/trials.py runs/trials/*/*/*          # writes results/tuning/mujoco.csv
 
 `changes` are the config fields that differ from the algorithm's defaults, `planner` the options that do.

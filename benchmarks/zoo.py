@@ -55,7 +55,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as there:
         for name in zoo.names():
             task, run = name.split("/")[0], zoo.pretrained(name, there)
-            planner = "steady" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "plain"
+            planner = "low_temperature" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "default"
             for guard in ("none", GUARDS[task]):
                 result = evaluate(run, episodes=EPISODES[task], guard=guard, planner=planner)
                 files = [zoo.FOLDER / f"{name}.safetensors", zoo.FOLDER / f"{name}-world.safetensors"]

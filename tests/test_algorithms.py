@@ -44,7 +44,7 @@ TINY = {
     "ma-cql": dict(steps=12, batch=32, width=16, cql_actions="policy"),
     "fisor": dict(steps=12, batch=32, width=16, candidates=2),
 }  # fmt: skip
-QUICK = {"episodes": 4, "steps": 2}
+QUICK = {"episodes": 4, "sampling_steps": 2}
 
 
 def job_of(name):
@@ -73,7 +73,7 @@ def test_contract(name, trained):
     state = env.reset(jax.random.key(0), 5)
     actions = []
     for _ in range(2):
-        _, policy = load(run, steps=2)
+        _, policy = load(run, sampling_steps=2)
         _, out = policy.act(policy.start(5), env.observe(state), env.global_state(state), jax.random.key(1))
         actions.append(np.asarray(out.action))
     assert actions[0].shape == (5, 3, 2) and np.abs(actions[0]).max() <= 1.0
@@ -179,7 +179,7 @@ def test_gradient_depths(small_store, small_world, gradient):
         dict(),
         dict(num_samples=3, guard="select", danger="both"),
         dict(replan=2, sampler="dpm++"),
-        dict(num_samples=2, select=True, ascent=5.0, guidance=1.0, sampler="ddpm", correction_steps=2),
+        dict(num_samples=2, select=True, value_guidance=5.0, cfg_scale=1.0, sampler="ddpm", correction_steps=2),
     ],
 )
 def test_planner_options(trained, options):
@@ -190,9 +190,9 @@ def test_planner_options(trained, options):
 
 
 def test_a_controller_acts_like_the_policy(trained, small_store):
-    how = dict(planner="climbing", guard="select", steps=2, num_samples=2, correction_steps=1)
+    how = dict(planner="value_guided", guard="select", sampling_steps=2, num_samples=2, correction_steps=1)
     pilot = Controller(trained["icbf"], **how)
-    assert pilot.policy.proposal.options.ascent == 100.0 and pilot.policy.guard.options.num_samples == 2
+    assert pilot.policy.proposal.options.value_guidance == 100.0 and pilot.policy.guard.options.num_samples == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
     assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["strange"].dtype == bool
@@ -223,7 +223,7 @@ def test_a_controller_acts_like_the_policy(trained, small_store):
     ],
 )
 def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said):
-    pilot = Controller(trained["madiff"], steps=2)
+    pilot = Controller(trained["madiff"], sampling_steps=2)
     with pytest.raises(UserError, match=said):
         pilot.act(seen, state)
 
@@ -233,14 +233,14 @@ def test_names_of_variants_follow_values(trained):
     run = Run(trained["icbf"].path)
     for options, name in (
         ({"guard": "select", "num_samples": 3}, "split+select-learned+num_samples3"),
-        ({"planner": "climbing", "steps": 2}, "split+climbing+steps2"),
+        ({"planner": "value_guided", "sampling_steps": 2}, "split+value_guided+sampling_steps2"),
         ({"margin": 0, "horizon": "2", "guard": "shield"}, "split+shield-learned+horizon2+margin0.0"),
-        ({"ascent": "1e1"}, "split+ascent10.0"),
+        ({"value_guidance": "1e1"}, "split+value_guidance10.0"),
         ({"guard": "adapt", "danger": "formula", "adapt": 0.2}, "split+adapt-formula+adapt0.2"),
     ):
-        assert evaluate(run, episodes=1, **{"steps": 2, **options})["variant"].replace("+steps2", "") == (
-            name.replace("+steps2", "")
-        )
+        assert evaluate(run, episodes=1, **{"sampling_steps": 2, **options})["variant"].replace(
+            "+sampling_steps2", ""
+        ) == (name.replace("+sampling_steps2", ""))
 
 
 @pytest.mark.parametrize(
@@ -340,7 +340,7 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
     with pytest.raises(UserError, match="danger is read by nothing without a guard"):
         evaluate(run, danger="formula")
     with pytest.raises(UserError, match="1 to 20 steps"):
-        evaluate(run, steps=21)
+        evaluate(run, sampling_steps=21)
     with pytest.raises(UserError, match="trained with observe"):
         evaluate(run, execution="decentralized")
     with pytest.raises(UserError, match="carry='all'"):
@@ -410,13 +410,13 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     store = own_store
     how = job_of("icbf") | {"changes": {**TINY["icbf"], "steps": 2}}
     run = loop.train("icbf", store, out=tmp_path, **how)[0]
-    _, policy = load(run, guard="select", num_samples=2, steps=2)
+    _, policy = load(run, guard="select", num_samples=2, sampling_steps=2)
     seen = jnp.asarray(store.observations[:4])
     _, out = policy.act(policy.start(4), seen, None, jax.random.key(0))
     assert out.action.shape == (4, 3, 2)
     with pytest.raises(UserError, match="only as data"):
         evaluate(run)
-    pilot = Controller(run, steps=2)
+    pilot = Controller(run, sampling_steps=2)
     assert pilot.act(store.observations[0]).shape == (3, 2)
     wide = store.observations.shape[2]
     for seen, state, said in (
@@ -429,7 +429,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     del told["widths"], told["team"], told["spec"]["homogeneous"]  # as older versions wrote it
     del told["data"]["observation_names"]
     (run.path / "config.json").write_text(json.dumps(told))
-    pilot = Controller(run, steps=2)
+    pilot = Controller(run, sampling_steps=2)
     assert pilot.act(store.observations[0]).shape == (3, 2)
     with pytest.raises(UserError, match="has 3 entries, this run reads entry"):
         pilot.act(store.observations[0][:, :3])
@@ -551,10 +551,10 @@ def test_damaged_run_folders_are_refused(tmp_path):
 def test_no_more_is_recorded_than_was_played(trained):
     with pytest.raises(UserError, match="num_recorded=-1 must be a whole number"):
         evaluate(trained["madiff"], episodes=2, num_recorded=-1)
-    evaluate(trained["madiff"], episodes=2, steps=2, num_recorded=4)
-    with np.load(trained["madiff"].path / "rollout-default+steps2.npz") as kept:
+    evaluate(trained["madiff"], episodes=2, sampling_steps=2, num_recorded=4)
+    with np.load(trained["madiff"].path / "rollout-default+sampling_steps2.npz") as kept:
         assert {len(kept[k]) for k in kept} == {2}
-    _, policy = load(trained["madiff"], steps=2)  # more than are played in one batch
+    _, policy = load(trained["madiff"], sampling_steps=2)  # more than are played in one batch
     played = rollout.rollout(policy, registry.get("simple_spread-random").env, rollout.CHUNK + 3, num_recorded=51)
     assert len(played["plans"]) == 51 and len(played["states"]) == rollout.CHUNK + 3
 
@@ -577,12 +577,15 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--set", "planner=climbing"], "write --planner climbing"),
+        (["--set", "planner=value_guided"], "write --planner value_guided"),
         (["--set", "checkpoint=12"], "write --checkpoint 12"),
         (["--set", "quiet=1"], "Unknown option of planner or guard 'quiet'"),
-        (["--steps", "3", "--set", "steps=2"], "--steps 3 and --set steps=2 both set steps"),
-        (["--set", "steps=3", "--set", "steps=2"], "--set gives steps twice, 3 and 2"),
-        (["--set", "steps=3", "--set", "num_samples=2", "horizon=x"], "horizon='x' cannot be read as int"),
+        (
+            ["--sampling-steps", "3", "--set", "sampling_steps=2"],
+            "3 and --set sampling_steps=2 both set sampling_steps",
+        ),
+        (["--set", "replan=3", "--set", "replan=2"], "--set gives replan twice, 3 and 2"),
+        (["--set", "sampling_steps=3", "--set", "num_samples=2", "horizon=x"], "horizon='x' cannot be read as int"),
         (["--record", "-1"], "num_recorded=-1 must be a whole number"),
         (["--checkpoint", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],

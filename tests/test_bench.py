@@ -120,7 +120,7 @@ def test_playing_again_does_not_change_what_training_took(made, tmp_path):
 
 
 def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
-    cell = grid.Cell("simple_spread-expert", "bc", "default", 0, (), (("default", "plain"),))
+    cell = grid.Cell("simple_spread-expert", "bc", "default", 0, (), (("default", "default"),))
     result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "step": 7}
     Run(cell.folder(tmp_path)).add_result("default", result)
     assert cell.state(tmp_path, 4) == "to do"
@@ -130,7 +130,7 @@ def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
 
 @pytest.mark.parametrize(("task", "state"), [("ant_4x2-poor", "to do"), ("halfcheetah_2x3-poor", "done")])
 def test_a_result_that_hides_falls_is_played_again(tmp_path, task, state):
-    cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "plain"),))
+    cell = grid.Cell(task, "bc", "mujoco", 0, (), (("mujoco", "default"),))
     result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}}
     Run(cell.folder(tmp_path)).add_result("mujoco", result)
     assert cell.state(tmp_path, 4) == state

@@ -142,17 +142,17 @@ def test_a_cell_that_failed_after_an_evaluation_keeps_its_row_and_is_named(folde
 
 def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
     for task, preset in ((EXPERT, "expert"), (MEDIUM, "default")):
-        results = {preset: summary([1] * 4, [0] * 4, task), f"{preset}+plans8": summary([2] * 4, [0] * 4, task)}
+        results = {preset: summary([1] * 4, [0] * 4, task), f"{preset}+num_samples8": summary([2] * 4, [0] * 4, task)}
         for seed in (0, 1):
             cell(folder, results, "omar", preset, seed, task)
     board = read(folder)
     labels = {e.method.label for e in board.entries if e.algorithm == "omar"}
-    assert labels == {"OMAR", "OMAR plans8"}
+    assert labels == {"OMAR", "OMAR num_samples8"}
     assert {m.label for m in aggregate(board).methods} == {"BC"} | labels
     assert not [m for m in board.missing if "omar" in m.job]
     assert {e.variant for e in board.entries if e.algorithm == "omar" and e.task == EXPERT} == {
         "expert",
-        "expert+plans8",
+        "expert+num_samples8",
     }
 
 

@@ -158,7 +158,7 @@ def test_memory_costs_and_noise(run, small_store, small_world, tmp_path):
 
 
 def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_path):
-    options = {"steps": 2, "sampler": "ddpm"}
+    options = {"sampling_steps": 2, "sampler": "ddpm"}
     steps = played(planner, small_store, noisy=True, **options)
     call, told = of_stablehlo(exporting.export(planner, tmp_path / "p", "stablehlo", **options))
     assert sum(x["name"].startswith("noise.") for x in told["inputs"]) == 3  # the first noise, and one for every step
@@ -168,7 +168,7 @@ def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_
 
 
 def test_a_followed_plan_is_remembered(planner, small_store, tmp_path):
-    options = {"steps": 2, "replan": 3}
+    options = {"sampling_steps": 2, "replan": 3}
     call, told = of_stablehlo(exporting.export(planner, tmp_path / "p", "stablehlo", **options))
     assert {"memory.plan", "memory.age"} <= {x["name"] for x in told["inputs"]}
     assert apart(call, told, played(planner, small_store, noisy=True, **options)) <= 1e-5

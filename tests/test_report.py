@@ -114,7 +114,7 @@ def test_page_is_whole_and_self_contained(runs, tmp_path):
     text = page.read_text()
     assert not re.search(r"https?://|//cdn|@import|<script[^>]+src=|<link(?![^>]+href=\"data:)", text)
     assert "<title>A &amp; B</title>" in text and "by hand &lt;b&gt;" in text
-    for row in ("BC", "ICBF-Diffuser", "split+plans4", "behaviour data", "do-nothing"):
+    for row in ("BC", "ICBF-Diffuser", "split+num_samples4", "behaviour data", "do-nothing"):
         assert row in text
     assert "Validation results" in text and "return − 159.8" in text
     assert text.count("<tr class") == 6  # three methods, one on validation, two references
@@ -170,7 +170,7 @@ def test_a_run_that_is_older_than_a_field_had_its_default(runs):
 def test_seeds_are_pooled(runs):
     (section,) = sections(runs)
     bc, plain, chosen = section.tables["test"]
-    assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+plans4"]
+    assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+num_samples4"]
     episodes = [r.results["split"]["per_episode"] for r in runs[:2]]
     returns, costs = (np.array([t[k] for t in episodes]) for k in ("return", "cost"))
     assert plain.seeds == (0, 1) and plain.episodes == 40
@@ -198,7 +198,9 @@ def test_the_commands_name_another_number_of_agents(runs):
 
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
-    said = r"ICBF-Diffuser split\+plans4 is the only one of 3 .*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
+    said = (
+        r"ICBF-Diffuser split\+num_samples4 is the only one of 3 .*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
+    )
     assert re.search(f'class="headline">{said}', text)
 
 
@@ -300,7 +302,7 @@ def test_runs_without_results_are_refused(tmp_path):
 def test_players_keep_the_chosen_plan_first(runs):
     (section,) = sections(runs)
     many, one = animation.players(section)
-    assert (many["label"], one["label"]) == ("ICBF-Diffuser split+plans4", "ICBF-Diffuser split")
+    assert (many["label"], one["label"]) == ("ICBF-Diffuser split+num_samples4", "ICBF-Diffuser split")
     kept = np.load(runs[0].path / "rollout-split+plans4.npz")
     steps, shown, rows, agents = many["episodes"][1]["shape"]
     packed = animation.unpack(many["episodes"][1]["plans"]).reshape(steps, shown, rows, agents, 2)

@@ -16,9 +16,9 @@ def test_every_name_of_a_suite_reads_back(name):
 
 
 def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
-    wanted = "steady+shield-formula-own+temperature0.5+trust_radius2.0+horizon7+agents4"
+    wanted = "low_temperature+shield-formula-own+temperature0.5+trust_radius2.0+horizon7+agents4"
     first = PolicySpec.of(
-        planner="steady",
+        planner="low_temperature",
         guard="shield",
         danger="formula",
         sight="own",
@@ -35,7 +35,7 @@ def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
         sight="own",
         danger="formula",
         guard="shield",
-        planner="steady",
+        planner="low_temperature",
     )
     assert first == other == PolicySpec.parse(wanted) and first.name == wanted
     assert hash(first) == hash(other)
@@ -47,8 +47,9 @@ def test_names_of_results_are_understood():
         trust_radius=2.0, target_return=1.0,
     )  # fmt: skip
     assert spec == PolicySpec.of(
-        planner="steady", guard="shield", danger="formula", sight="own", horizon=7, trust_radius=2.0, target=1.0
-    )
+        planner="low_temperature", guard="shield", danger="formula", sight="own", horizon=7, trust_radius=2.0,
+        target_return=1.0,
+    )  # fmt: skip
     assert PolicySpec.of(execution="decentralized").plan_options == (("execution", "decentralized"),)
     for twice in ({"horizon": 7, "rows": 7}, {"barrier": "learned", "danger": "learned"}):
         with pytest.raises(UserError, match="two names of one choice"):
@@ -60,6 +61,22 @@ def test_options_of_before_are_read_and_said():
     assert PolicySpec.parse("shield-learned+rows7+futureFalse") == wanted
     with pytest.warns(FutureWarning, match="rows of the guard is called horizon now"):
         assert PolicySpec.of(guard="shield", rows=7, terminal_value=False) == wanted
+
+
+def test_planners_of_before_are_read_and_said():
+    wanted = PolicySpec.of(planner="value_guided", cfg_scale=1.2, target_return=-1.0, sampling_steps=3)
+    assert PolicySpec.parse("climbing+steps3+guidance1.2+target-1.0") == wanted
+    assert PolicySpec.parse(wanted.name) == wanted and PolicySpec.parse("plain") == PolicySpec.of()
+    with pytest.warns(FutureWarning) as said:
+        assert PolicySpec.of(planner="climbing", guidance=1.2, target=-1.0, steps=3) == wanted
+    assert "planner 'climbing' is called 'value_guided' now" in str(said[0].message)
+    assert "guidance of the planner is called cfg_scale now" in str(said[1].message)
+
+
+def test_flags_of_before_are_rewritten(capsys):
+    for command in ("eval", "play", "export", "ope"):
+        assert rewritten([command, "run", "--steps", "3"])[2:] == ["--sampling-steps", "3"]
+        assert rewritten([command, "--guidance=1", "--target=2"])[1:] == ["--cfg-scale=1", "--target-return=2"]
 
 
 def test_commands_of_before_are_rewritten(capsys):
@@ -74,14 +91,14 @@ def test_what_a_result_is_called():
     assert PolicySpec.of().variant("split") == "split"
     guarded = PolicySpec.of(guard="shield", checkpoint=40)
     assert guarded.variant("split", "validation") == "split+shield-learned@validation@step40"
-    assert PolicySpec.of(planner="steady", steps=3).without_plans().name == "plain"
+    assert PolicySpec.of(planner="low_temperature", sampling_steps=3).without_plans().name == "default"
 
 
 @pytest.mark.parametrize(
     "options, message",
     [
         ({"guard": "shild"}, "did you mean 'shield'"),
-        ({"planner": "stedy"}, "did you mean 'steady'"),
+        ({"planner": "low_temprature"}, "did you mean 'low_temperature'"),
         ({"rws": 3}, "Unknown option of planner or guard 'rws'"),
         ({"danger": "formula"}, "danger is read by nothing without a guard"),
         ({"sight": "own"}, "sight is read by nothing without a guard"),
@@ -94,7 +111,7 @@ def test_bad_choices_are_refused(options, message):
         PolicySpec.of(**options)
 
 
-@pytest.mark.parametrize("name", ["learned-shield", "plain+", "agentsx", "horizon"])
+@pytest.mark.parametrize("name", ["learned-shield", "default+", "agentsx", "horizon"])
 def test_a_name_that_says_nothing_is_refused(name):
     with pytest.raises(UserError, match="says nothing of planner or guard"):
         PolicySpec.parse(name)

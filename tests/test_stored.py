@@ -15,6 +15,7 @@ from ringfence.utils import schemas, stored
 RESULTS = Path(__file__).parents[1] / "results"
 OLD = {
     "episodes": 4,
+    "variant": "split+climbing+steps10+plans1@validation",
     "avoidable_cost": 0.5,
     "avoidable_interval": [0.0, 1.0],
     "avoidable_violation_upper": 0.25,
@@ -31,6 +32,7 @@ OLD = {
 }
 NEW = {
     "episodes": 4,
+    "variant": "split+value_guided+sampling_steps10+num_samples1@validation",
     "cost_safe_start": 0.5,
     "cost_safe_start_interval": [0.0, 1.0],
     "violation_upper_safe_start": 0.25,
@@ -60,12 +62,12 @@ def test_a_result_is_read_under_todays_names():
 
 def test_a_run_gives_todays_names_and_keeps_its_file_until_the_next_result(tmp_path):
     file = tmp_path / "results.json"
-    text = json.dumps({"split+climbing": OLD})
+    text = json.dumps({"split+climbing@validation": OLD})
     file.write_text(text)
     run = Run(tmp_path)
-    assert run.results == {"split+climbing": NEW} and file.read_text() == text
+    assert run.results == {"split+value_guided@validation": NEW} and file.read_text() == text
     run.add_result("split", NEW)
-    assert json.loads(file.read_text()) == {"split+climbing": NEW, "split": NEW}
+    assert json.loads(file.read_text()) == {"split+value_guided@validation": NEW, "split": NEW}
 
 
 @pytest.mark.parametrize(
@@ -88,11 +90,11 @@ def test_a_reference_row_gets_no_guard():
 
 def test_tables_are_read_under_todays_names(tmp_path):
     file = tmp_path / "table.csv"
-    file.write_text('who,danger,options,infeasible\ncloning,formula,"rows=3 future=True",0.5\n')
+    file.write_text('who,danger,options,infeasible\ncloning,formula,"rows=3 future=True guidance=1.0",0.5\n')
     row = {
         "method": "BC",
         "barrier": "analytic",
-        "options": "horizon=3 terminal_value=True",
+        "options": "horizon=3 terminal_value=True cfg_scale=1.0",
         "infeasible_rate": "0.5",
     }
     assert stored.table(file) == [row]

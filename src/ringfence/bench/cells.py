@@ -131,8 +131,8 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     """Whether a result was played as a spec stands for on a task today: with its options of planner and guard, given
     the planner's defaults, and in a World of today's settings. What labels come from follows from the data."""
     plan = PlanOptions(**{**defaults, **PLANNERS[spec.planner], **dict(spec.plan_options)})
-    usual = names.planner_options(dataclasses.asdict(PlanOptions()))
-    wanted = names.planner_options(dataclasses.asdict(plan))
+    usual = dataclasses.asdict(PlanOptions())
+    wanted = dataclasses.asdict(plan)
     if stored["options"] and {**usual, **stored["options"]} != wanted:
         return False
     guard = stored.get("guard_options") or {}

@@ -8,6 +8,7 @@ from ringfence import algos
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.loading.spec import PolicySpec
+from ringfence.proposals.options import DEFAULT
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,7 @@ class Entry:
 
     algorithm: str
     preset: str = ""  # empty: the one made for the task where there is one, else the default
-    evaluations: tuple[str, ...] = ("plain",)  # how its runs are played, as names of PolicySpec
+    evaluations: tuple[str, ...] = (DEFAULT,)  # how its runs are played, as names of PolicySpec
     tiers: tuple[str, ...] = ()  # empty: all
 
     def plays(self, tier: str) -> bool:
@@ -55,7 +56,9 @@ _SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium
 _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
 
 # How a proposal is played for its own sake, and under the cheapest guard.
-_ALONE, _ADAPTED = ("plain", "shield-learned"), ("plain", "adapt-learned")
+_ALONE, _ADAPTED = (DEFAULT, "shield-learned"), (DEFAULT, "adapt-learned")
+_COOL = "low_temperature"
+_ICBF_GUARDS = ("adapt-learned", "adapt-formula", "full-learned")
 _RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 
 SUITES = {
@@ -86,9 +89,9 @@ SUITES = {
             Entry("fisor"),
             Entry("omar"),
             Entry("ma-cql"),
-            Entry("madiff", evaluations=("plain", "steady")),
+            Entry("madiff", evaluations=(DEFAULT, _COOL)),
             Entry("icbf", "mujoco-paper"),
-            Entry("icbf", evaluations=("plain", "steady")),
+            Entry("icbf", evaluations=(DEFAULT, _COOL)),
         ),
         episodes=20,
     ),
@@ -96,10 +99,10 @@ SUITES = {
     "guards": Suite(
         _SPREAD,
         (
-            Entry("bc", evaluations=("plain", "shield-learned", "shield-formula", "full-learned")),
+            Entry("bc", evaluations=(DEFAULT, "shield-learned", "shield-formula", "full-learned")),
             Entry("mpc", evaluations=("full-learned",)),
-            Entry("icbf", "split", ("plain", "select-learned", "shield-learned", "full-learned")),
-            Entry("icbf", "split-0", ("plain", "select-learned", "shield-learned")),
+            Entry("icbf", "split", (DEFAULT, "select-learned", "shield-learned", "full-learned")),
+            Entry("icbf", "split-0", (DEFAULT, "select-learned", "shield-learned")),
             Entry("madiff", "default", _ALONE),
             Entry("madiff", "long", _ALONE),
             Entry("madiff", "own", _ALONE),
@@ -113,11 +116,9 @@ SUITES = {
     "guards-mujoco": Suite(
         _ROBOTS,
         (
-            Entry("bc", evaluations=("plain", "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
-            Entry(
-                "icbf", evaluations=("steady", "steady+adapt-learned", "steady+adapt-formula", "steady+full-learned")
-            ),
-            Entry("madiff", evaluations=("steady", "steady+adapt-learned")),
+            Entry("bc", evaluations=(DEFAULT, "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
+            Entry("icbf", evaluations=(_COOL, *(f"{_COOL}+{guard}" for guard in _ICBF_GUARDS))),
+            Entry("madiff", evaluations=(_COOL, f"{_COOL}+adapt-learned")),
             *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
             Entry(
                 "mpc", evaluations=("full-learned", "full-learned+trust_radius2.0")
@@ -128,7 +129,7 @@ SUITES = {
     # Homogeneous agents, each by itself; danger that is decided ten steps ahead.
     "crossing": Suite(
         _CROSSING + tuple(f"crossing_unicycle-{tier}" for tier in _TIERS),
-        (Entry("bc", evaluations=("plain", "shield-learned")),),
+        (Entry("bc", evaluations=(DEFAULT, "shield-learned")),),
         episodes=1000,
     ),
     "crossing-guards": Suite(
@@ -137,7 +138,7 @@ SUITES = {
             Entry(
                 "bc",
                 evaluations=(
-                    "plain",
+                    DEFAULT,
                     "shield-learned",
                     "shield-learned+horizon1",
                     *(f"shield-learned+horizon{k}+terminal_valueFalse" for k in (1, 3, 7, 15)),
@@ -165,7 +166,7 @@ SUITES = {
             Entry(
                 "bc",
                 evaluations=tuple(
-                    (f"{how}+" if how else "") + f"agents{n}" if n else how or "plain"
+                    (f"{how}+" if how else "") + f"agents{n}" if n else how or DEFAULT
                     for how in ("", "shield-learned", "full-learned")
                     for n in (0, 2, 4, 6)
                 ),
@@ -173,9 +174,9 @@ SUITES = {
         ),
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
-    "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=("plain", "shield-learned-own", "full-learned-own")),)),
+    "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=(DEFAULT, "shield-learned-own", "full-learned-own")),)),
     "own-sight-mujoco": Suite(
-        _ROBOTS, (Entry("bc", evaluations=("plain", "adapt-learned-own", "full-learned-own")),), episodes=20
+        _ROBOTS, (Entry("bc", evaluations=(DEFAULT, "adapt-learned-own", "full-learned-own")),), episodes=20
     ),
 }
 

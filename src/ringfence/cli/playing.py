@@ -41,20 +41,21 @@ class Playing:
     """kept from danger, in units of its source: calibrated margins, or the hazard's safe margin."""
     horizon: int | None = None
     """rows that the guard predicts and judges."""
-    steps: int | None = None
+    sampling_steps: int | None = None
     """of the sampler."""
     sampler: str | None = None
     """ddim, ddpm or dpm++."""
-    guidance: float | None = None
+    cfg_scale: float | None = None
     """ω of classifier-free guidance."""
-    target: float | None = None
+    target_return: float | None = None
     """return condition, as a normal score."""
     temperature: float | None = None
     """scale of the first noise."""
     replan: int | None = None
     """steps for which a plan is followed."""
     set: Assignments = field(default_factory=list)
-    """any other option of planner or guard, e.g. --set correction_steps=20 ascent=10; docs/evaluation.md lists them."""
+    """any other option of planner or guard, e.g. --set correction_steps=20 value_guidance=10; docs/evaluation.md lists
+    them."""
 
     def arguments(self) -> dict[str, Any]:
         """What was given, as arguments of `PolicySpec.of`; refused before any run is played."""
@@ -62,7 +63,7 @@ class Playing:
 
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
         given = {name: value for name, value in given.items() if value is not None}
-        assigned = renamed(assignments(self.set), stored.GUARD_OPTIONS, "--set")
+        assigned = renamed(assignments(self.set), stored.OPTIONS, "--set")
         flags = {"episodes", "split", "num_recorded", "checkpoint", *_FLAGS_ALONE}
         for name, value in assigned.items():
             if name in flags:

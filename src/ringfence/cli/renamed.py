@@ -15,6 +15,9 @@ OLD_FLAGS: dict[str, dict[str, str]] = {
         "--sight": "--execution",
         "--rows": "--horizon",
         "--plans": "--num-samples",
+        "--steps": "--sampling-steps",
+        "--guidance": "--cfg-scale",
+        "--target": "--target-return",
     }
     for command in ("eval", "play", "export", "ope")
 }

@@ -79,7 +79,7 @@ def export(
     out: str | Path,
     format: str = "onnx",
     checkpoint: int | None = None,
-    planner: str = "plain",
+    planner: str = "default",
     **options: Any,
 ) -> Path:
     """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, needs the extra

@@ -32,7 +32,7 @@ def evaluate(
     *,
     episodes: int = 200,
     split: Split = "test",
-    planner: str = "plain",
+    planner: str = "default",
     num_recorded: int = 0,
     quiet: bool = True,
     checkpoint: int | None = None,

@@ -33,7 +33,7 @@ def play(
     make_env: Callable[[], Any],
     *,
     episodes: int = 20,
-    planner: str = "plain",
+    planner: str = "default",
     split: str = "test",
     seed: int = 0,
     cost: Cost | None = None,

@@ -16,10 +16,11 @@ from ringfence.evaluation import evaluate
 from ringfence.guards import Pilot
 from ringfence.guards.wrap import Callback
 from ringfence.loading.resolve import Resolved, resolve
-from ringfence.loading.spec import PLAIN, PolicySpec
+from ringfence.loading.spec import PolicySpec
 from ringfence.problem.constraints import CostColumn
 from ringfence.problem.homogeneous import local_features
 from ringfence.proposals.base import act_with
+from ringfence.proposals.options import DEFAULT
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
@@ -85,7 +86,7 @@ def _unsafe_by_formula(job: Job) -> Unsafe:
 
 
 def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:
-    if options or planner != PLAIN:
+    if options or planner != DEFAULT:
         raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
     world = pilot.policy.guarded.guard.world
     spec = world.spec

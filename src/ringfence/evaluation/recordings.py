@@ -21,7 +21,8 @@ Recording = dict[str, np.ndarray]
 def write(folder: Path, variant: str, played: Recording, episodes: int) -> None:
     """Keep the first episodes, if any; what was recorded before, and its film, would show another evaluation."""
     for kind in ("npz", "gif"):
-        (folder / f"rollout-{variant}.{kind}").unlink(missing_ok=True)
+        while file := kept(folder, variant, kind):
+            file.unlink()
     if episodes:
         with whole(folder / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
             first: dict[str, Any] = {name: array[:episodes] for name, array in played.items()}
@@ -30,9 +31,7 @@ def write(folder: Path, variant: str, played: Recording, episodes: int) -> None:
 
 def read(folder: Path, variant: str) -> Recording | None:
     """What was kept, or None if nothing was."""
-    file = folder / f"rollout-{variant}.npz"
-    if not file.exists():
-        file = _of_before(folder, variant)
+    file = kept(folder, variant, "npz")
     if file is None:
         return None
     try:
@@ -43,9 +42,12 @@ def read(folder: Path, variant: str) -> Recording | None:
     return arrays
 
 
-def _of_before(folder: Path, variant: str) -> Path | None:
-    """The file that an older version wrote, under the variant's name of then."""
-    files = sorted(folder.glob("rollout-*.npz"))
+def kept(folder: Path, variant: str, kind: str) -> Path | None:
+    """The recording (npz) or the film (gif) of a variant, which an older version wrote under the name of then."""
+    file = folder / f"rollout-{variant}.{kind}"
+    if file.exists():
+        return file
+    files = sorted(folder.glob(f"rollout-*.{kind}"))
     return next((f for f in files if stored.variant(f.stem.removeprefix("rollout-")) == variant), None)
 
 

@@ -25,7 +25,7 @@ class Controller:
     several threads at once.
     """
 
-    def __init__(self, run: Run | str, planner: str = "plain", seed: int = 0, **options):
+    def __init__(self, run: Run | str, planner: str = "default", seed: int = 0, **options):
         keep_programs()
         self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(whole_number("seed", seed, 0, 2**31 - 1))

@@ -68,7 +68,7 @@ class Resolved:
         return self.spec.variant(self.job.preset, split)
 
 
-def load(run: Run | str, checkpoint: int | None = None, planner: str = "plain", **options: Any) -> tuple[Job, Policy]:
+def load(run: Run | str, checkpoint: int | None = None, planner: str = "default", **options: Any) -> tuple[Job, Policy]:
     """(job, policy) of a finished run.
 
     `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards

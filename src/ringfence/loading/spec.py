@@ -13,27 +13,26 @@ import numpy as np
 
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.guards import DANGERS, GUARDS, GuardOptions
-from ringfence.proposals.options import PLANNERS, PlanOptions
+from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils import stored
 from ringfence.utils.config import fields_of, read_text
-from ringfence.utils.renamed import renamed
+from ringfence.utils.renamed import deprecated, renamed
 from ringfence.world import World
 
 SIGHTS = ("all", "own")
-PLAIN = "plain"  # the planner that is not named, and the name of a spec without any choice
 Options = tuple[tuple[str, Any], ...]
 
 
 @dataclass(frozen=True)
 class PolicySpec:
     """A run, and how it is to be played. `of` makes one from names and options and refuses what cannot be; `name` says
-    it in one word, e.g. `steady+shield-learned+horizon7+agents4`, and `parse` reads that back. Neither the order in
-    which options were given nor how their values were spelled makes another spec."""
+    it in one word, e.g. `low_temperature+shield-learned+horizon7+agents4`, and `parse` reads that back. Neither the
+    order in which options were given nor how their values were spelled makes another spec."""
 
     run: Run | None = None
     checkpoint: int | None = None  # the step of the one that is played; None: the last
-    planner: str = PLAIN  # a named set of PlanOptions
+    planner: str = DEFAULT  # a named set of PlanOptions
     plan_options: Options = ()  # given beside it, in the order of the fields
     guard: str = "none"  # a named set of GuardOptions
     guard_options: Options = ()
@@ -48,7 +47,7 @@ class PolicySpec:
         run: Run | str | Path | None = None,
         *,
         checkpoint: int | None = None,
-        planner: str = PLAIN,
+        planner: str = DEFAULT,
         guard: str = "none",
         danger: str | None = None,
         sight: str | None = None,
@@ -59,11 +58,14 @@ class PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
         Unknown names are refused, and so is what nothing would read.
 
-        The names under which results are read (utils/stored.py) are understood, too: `barrier` (learned, analytic,
-        both) for `danger`, `execution` (centralized, decentralized) of a guard for `sight`, planners and options."""
-        planner = _TO_PLANNER.get(planner, planner)
+        Names of before are understood with a warning. The names under which results are read (utils/stored.py) are
+        understood, too: `barrier` (learned, analytic, both) for `danger`, `execution` (centralized, decentralized) of
+        a guard for `sight`."""
+        if planner in stored.PLANNERS:
+            deprecated(f"planner '{planner}'", f"'{stored.PLANNERS[planner]}'")
+            planner = stored.PLANNERS[planner]
         options = renamed(options, stored.GUARD_OPTIONS, "the guard")
-        options = {_TO_OPTION.get(name, name): value for name, value in _once(options).items()}
+        options = renamed(options, stored.PLANNER_OPTIONS, "the planner")
         barrier = options.pop("barrier", None)
         if barrier is not None:
             _apart("barrier", "danger", danger)
@@ -117,18 +119,18 @@ class PolicySpec:
 
     @property
     def name(self) -> str:
-        """Planner, guard with its danger and sight, and the options given beside them; `plain` without any."""
-        parts = [] if self.planner == PLAIN else [self.planner]
+        """Planner, guard with its danger and sight, and the options given beside them; `default` without any."""
+        parts = [] if self.planner == DEFAULT else [self.planner]
         if self.guarded:
             parts.append(f"{self.guard}-{self.danger}" + ("-own" if self.sight == "own" else ""))
         parts += [f"{name}{value}" for name, value in self.plan_options + self.guard_options]
         if self.agents is not None:
             parts.append(f"agents{self.agents}")
-        return "+".join(parts) or PLAIN
+        return "+".join(parts) or DEFAULT
 
     def variant(self, preset: str, split: str = "test") -> str:
         """The name of a result: whose preset it is, how it was played, and what is not as in every table."""
-        name = preset if self.name == PLAIN else f"{preset}+{self.name}"
+        name = preset if self.name == DEFAULT else f"{preset}+{self.name}"
         if split != "test":
             name += f"@{split}"
         return name if self.checkpoint is None else f"{name}@step{self.checkpoint}"
@@ -139,22 +141,12 @@ class PolicySpec:
 
     def without_plans(self) -> PolicySpec:
         """The same of a policy that draws no plans, which reads no choice of planners."""
-        return replace(self, planner=PLAIN, plan_options=())
+        return replace(self, planner=DEFAULT, plan_options=())
 
 
 # From today's names of results to those of the fields here.
-_TO_PLANNER = {new: old for old, new in stored.PLANNERS.items()}
 _TO_BARRIER = {new: old for old, new in stored.BARRIERS.items()}
 _TO_SIGHT = {new: old for old, new in stored.EXECUTIONS.items()}
-_TO_OPTION = {new: old for old, new in stored.PLANNER_OPTIONS.items()}
-
-
-def _once(options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Options without two names of one."""
-    for new, old in _TO_OPTION.items():
-        if new in options:
-            _apart(new, old, options.get(old))
-    return options
 
 
 def _apart(new: str, old: str, given: Any) -> None:

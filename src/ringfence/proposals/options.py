@@ -14,12 +14,12 @@ from ringfence.utils.config import AtLeastOne, Count, NonNegative, check_bounds
 class PlanOptions:
     """Evaluation-time choices of how plans are drawn."""
 
-    steps: Count = 5  # sampler steps
+    sampling_steps: Count = 5  # of the sampler
     sampler: diffusion.Sampler = "ddim"
-    guidance: float = 1.2  # ω of classifier-free guidance; 1 switches it off
-    target: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
+    cfg_scale: float = 1.2  # ω of classifier-free guidance; 1 switches it off
+    target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
     temperature: NonNegative = 1.0  # scale of the first noise
-    ascent: NonNegative = 0.0  # gradient guidance: steps of x̂0 along the plan's value, in units of its deviation
+    value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
     replan: AtLeastOne = 1  # steps that a plan is followed for
@@ -27,8 +27,8 @@ class PlanOptions:
 
     def __post_init__(self):
         check_bounds(self)
-        if self.persist != 1.0 and not self.ascent:
-            raise UserError(f"persist={self.persist} is read by nothing that was asked for; set ascent.")
+        if self.persist != 1.0 and not self.value_guidance:
+            raise UserError(f"persist={self.persist} is read by nothing that was asked for; set value_guidance.")
 
 
 def plan_defaults(config) -> dict:
@@ -36,12 +36,14 @@ def plan_defaults(config) -> dict:
     return {"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {}
 
 
+DEFAULT = "default"
+
 # Named sets of evaluation-time choices, made on validation resets; docs/evaluation.md.
 PLANNERS: dict[str, dict] = {
-    "plain": {},
+    DEFAULT: {},
     # Value steers the samples.
-    "climbing": {"steps": 10, "guidance": 1.0, "ascent": 100.0, "persist": 0.5},
+    "value_guided": {"sampling_steps": 10, "cfg_scale": 1.0, "value_guidance": 100.0, "persist": 0.5},
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
     # gradient on value, which rises with the very speed that is limited.
-    "steady": {"temperature": 0.3},
+    "low_temperature": {"temperature": 0.3},
 }

@@ -62,7 +62,7 @@ class Planner(eqx.Module):
             raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
         if o.execution == "centralized" and self.observe == "single":
             raise UserError("execution='centralized' needs a model trained with observe='all' or 'mixed'.")
-        diffusion.timesteps(len(self.alpha_bar), o.steps)
+        diffusion.timesteps(len(self.alpha_bar), o.sampling_steps)
 
     def start(self, batch: int) -> PyTree:
         n, d = self.spec.n_agents, self.spec.feature_dim
@@ -146,15 +146,15 @@ class Planner(eqx.Module):
         mask = diffusion.known_entries(visible, self.history, rows)
         known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
         bar = np.asarray(self.alpha_bar)
-        target = jnp.full(b, o.target)
-        predict = diffusion.guided(self.networks["denoiser"], bar, target, o.guidance, self.prediction, self.clip)
+        target = jnp.full(b, o.target_return)
+        predict = diffusion.guided(self.networks["denoiser"], bar, target, o.cfg_scale, self.prediction, self.clip)
 
         def inpaint(x: Array) -> Array:
             return jnp.where(mask, known, x)
 
         def steered(x: Array, k: Array) -> Array:
             clean = inpaint(predict(x, k))
-            if o.ascent > 0:
+            if o.value_guidance > 0:
                 slope = jax.grad(lambda c: self.merit(inpaint(c)).sum())(clean)
                 size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
                 slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
@@ -163,7 +163,7 @@ class Planner(eqx.Module):
             return self.normaliser.apply(self.agreed(self.normaliser.invert(clean))) if o.reconcile else clean
 
         shape = (b, rows, n, d)
-        x = diffusion.sample(steered, inpaint, shape, bar, key, o.steps, o.sampler, o.temperature)
+        x = diffusion.sample(steered, inpaint, shape, bar, key, o.sampling_steps, o.sampler, o.temperature)
         return self.agreed(self.normaliser.invert(x))
 
     def agreed(self, x: Array) -> Array:
@@ -173,4 +173,4 @@ class Planner(eqx.Module):
     def merit(self, clean: Array) -> Array:
         """(B,) what gradient guidance climbs: value in deviations of the data's."""
         ahead = self.agreed(self.normaliser.invert(clean))[:, self.history + 1 :]
-        return self.options.ascent * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]
+        return self.options.value_guidance * plan_value(self.critic, ahead, self.discount) / self.critic["value"][1, 1]

@@ -34,10 +34,15 @@ def of_row(row: Row) -> Recorded | None:
     for run, result in sorted(row.members, key=_seed):
         arrays = recordings.read(run.path, result["variant"])
         if arrays is not None:
-            options = row.members[0][1].get("options") or {}
-            size = (options.get("plans", 0), options.get("value_guidance", 0.0))
+            options = result.get("options") or {}
+            size = (_plans(arrays), options.get("value_guidance", 0.0))
             return Recorded(row, run, arrays, size)
     return None
+
+
+def _plans(arrays: recordings.Recording) -> int:
+    """How many plans every step drew."""
+    return arrays["plans"].shape[2] if "plans" in arrays else 0
 
 
 def _seed(member: tuple[Run, Result]) -> int:
@@ -74,8 +79,8 @@ def films(section: Section[Row]) -> list[dict[str, Any]]:
     found = []
     for row in section.rows:
         for run, result in sorted(row.members, key=_seed):
-            file = run.path / f"rollout-{result['variant']}.gif"
-            if row.split == "test" and file.exists():
+            file = recordings.kept(run.path, result["variant"], "gif")
+            if row.split == "test" and file is not None:
                 gif = base64.b64encode(file.read_bytes()).decode()
                 found.append({"label": row.label, "seed": run.config["seed"], "gif": gif})
                 break

@@ -22,6 +22,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.logs.provenance import other_data
+from ringfence.proposals.options import DEFAULT
 from ringfence.report.pooling import Result
 from ringfence.report.table import NAMES, NEEDED, config_of, differing, place, plain_variant
 from ringfence.training.runs import Run
@@ -259,7 +260,7 @@ def _planned(suite: str, task: str, job: str) -> bool:
 def _lacking(suite: str, cell: Cell, run: Run) -> list[str]:
     """Evaluations of the suite that a run does not have."""
     preset = run.config["preset"]
-    known = {v.removeprefix(preset).removeprefix("+") or "plain" for v in run.results if v.startswith(preset)}
+    known = {v.removeprefix(preset).removeprefix("+") or DEFAULT for v in run.results if v.startswith(preset)}
     _, job, _ = cell.place
     entries = [e for e in _suite(suite) if _entry_job(e) == job and e.plays(_tier(cell.task))]
     return [name for e in entries for name in e.evaluations if name not in known]

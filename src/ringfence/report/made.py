@@ -139,9 +139,8 @@ def _how(result: Result, run: Run) -> str:
 
 
 def _planner_options(planner: str) -> dict[str, Any]:
-    """Those of a named planner, under today's names."""
-    planners = {stored.PLANNERS.get(name, name): options for name, options in PLANNERS.items()}
-    return stored.planner_options(dataclasses.asdict(PlanOptions()) | planners.get(planner, {}))
+    """Those of a named planner."""
+    return dataclasses.asdict(PlanOptions()) | PLANNERS.get(planner, {})
 
 
 def _guard_options(result: Result, task: Task | None) -> dict[str, Any]:

@@ -39,6 +39,7 @@ GUARD_OPTIONS = {
     "rows": "horizon",
     "future": "terminal_value",
 }
+OPTIONS = GUARD_OPTIONS | PLANNER_OPTIONS  # of those who play
 WORLD_SETTINGS = {
     "sight": "execution",
     "members": "num_ensemble",
@@ -87,6 +88,8 @@ def result(stored: Mapping[str, Any]) -> dict[str, Any]:
     ):
         if column in found:
             found[column] = rename(found[column])
+    if isinstance(found.get("variant"), str):
+        found["variant"] = variant(found["variant"])
     return found
 
 
@@ -95,19 +98,23 @@ def results(stored: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]
     return {variant(name): result(one) for name, one in stored.items()}
 
 
-_OLD_OPTION = re.compile(rf"({'|'.join(GUARD_OPTIONS)})(\d.*|(?:True|False).*)")
+_OLD_OPTION = re.compile(rf"({'|'.join(OPTIONS)})(-?\d.*|(?:True|False).*)")
+_OLD_PLANNER = re.compile(rf"({'|'.join(PLANNERS)})(@.*)?")
 
 
 def variant(name: str) -> str:
-    """A result's name under today's names of options, e.g. `default+shield-learned+horizon7`."""
+    """A result's name under today's names of planners and options, e.g. `default+shield-learned+horizon7`."""
     preset, *parts = name.split("+")
     return "+".join([preset, *map(choice, parts)])
 
 
 def choice(part: str) -> str:
     """A part of such a name."""
-    found = _OLD_OPTION.fullmatch(part)
-    return part if found is None else GUARD_OPTIONS[found[1]] + found[2]
+    if found := _OLD_OPTION.fullmatch(part):
+        return OPTIONS[found[1]] + found[2]
+    if found := _OLD_PLANNER.fullmatch(part):
+        return PLANNERS[found[1]] + (found[2] or "")
+    return part
 
 
 def planner_options(stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -160,7 +167,7 @@ def rows(stored: Iterable[Mapping[str, str]]) -> list[dict[str, str]]:
         if "variant" in row:
             row["variant"] = variant(row["variant"])
         if "options" in row:
-            row["options"] = re.sub(r"\b(\w+)=", lambda m: f"{GUARD_OPTIONS.get(m[1], m[1])}=", row["options"])
+            row["options"] = re.sub(r"\b(\w+)=", lambda m: f"{OPTIONS.get(m[1], m[1])}=", row["options"])
         found.append(row)
     return found
 

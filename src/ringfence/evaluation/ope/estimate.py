@@ -42,7 +42,7 @@ def ope(
     ahead: int = 3,
     rollout_episodes: int = 128,
     rollout_steps: int = 100,
-    planner: str = "plain",
+    planner: str = "default",
     compare: bool = True,
     seed: int = 0,
     quiet: bool = True,
