@@ -97,10 +97,10 @@ class Way:
 ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
 MEMBERS = {f"an ensemble of {k}": Way(world={"members": k}) for k in (1, 5)}
 RETAIN = {"condition (3), not a margin": Way({"condition": "retain"})}
-FORMULA = {"danger by the true formula": Way({"danger": "formula"})}
+FORMULA = {"danger by the true formula": Way({"barrier": "analytic"})}
 TRUE = {
     "the true dynamics": Way(other=by_simulator),
-    "the true dynamics and formula": Way({"danger": "formula"}, other=by_simulator),
+    "the true dynamics and formula": Way({"barrier": "analytic"}, other=by_simulator),
 }
 V = {"the last row judged by V": Way({"terminal_value": True})}
 V_ALONE = {"by V alone": Way({"terminal_value": False}, other=by_value)}
@@ -169,7 +169,8 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
     there = {r["way"] for r in read(out) if (r["task"], r["proposal"], r["guard"]) == study}
     if {"default", *ways} <= there:
         return
-    task, sight = registry.get(name), "own" if guard.endswith(OWN) else None
+    task = registry.get(name)
+    execution = "decentralized" if guard.endswith(OWN) else None
     episodes = 20 if task.protocol else 200
     store, _ = make(task)
     with tempfile.TemporaryDirectory() as folder:
@@ -178,8 +179,8 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
 
         def played(way: Way) -> dict:
             with way.fitted():
-                world = way.other(worlds.fit(store, sight=sight, **way.world))
-            _, policy = load(run, world=world, guard=guard.removesuffix(OWN), sight=sight, **way.options)
+                world = way.other(worlds.fit(store, execution=execution, **way.world))
+            _, policy = load(run, world=world, guard=guard.removesuffix(OWN), execution=execution, **way.options)
             return evaluate_policy(policy, task, episodes, "test", 0)[0]
 
         usual = None

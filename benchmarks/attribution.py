@@ -47,7 +47,7 @@ GUARDS = {
     "none": "",
     "select": "+select-learned",
     "shield": "+shield-learned",
-    "shield, analytic": "+shield-formula",
+    "shield, analytic": "+shield-analytic",
     "full": "+full-learned",
 }
 
@@ -69,7 +69,7 @@ QUESTIONS = (
     Question(
         "danger learned, not the formula, in that shield",
         ("bc", f"default{SHIELD}"),
-        ("bc", "default+shield-formula"),
+        ("bc", "default+shield-analytic"),
     ),
     Question("`full`, not the shield alone", ("bc", f"default{FULL}"), ("bc", f"default{SHIELD}")),
     Question("BC under `full`, not MPC from a zero proposal", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
@@ -113,7 +113,9 @@ QUESTIONS = (
 ADAPT, STEADY = "+adapt-learned", "+low_temperature+adapt-learned"
 OF_ROBOTS = (
     Question("a guard (`adapt`), under BC", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
-    Question("danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-formula"), ROBOT_KEYS),
+    Question(
+        "danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-analytic"), ROBOT_KEYS
+    ),
     Question("`full`, not `adapt`", ("bc", f"default{FULL}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
     Question("ICBF, not BC", ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
     Question(

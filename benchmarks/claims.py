@@ -109,10 +109,10 @@ def same_safety() -> tuple[bool, str]:
     """Learned danger beside the formula, under cloning: Simple Spread's shield and the robots' adapting one."""
     share, left = [], []
     for task in tasks_of("guards"):
-        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in DANGERS)
+        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS)
         share.append(learned / formula)
         left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
-    kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in DANGERS]
+    kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in BARRIERS]
     ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
     return ok, (
         f"at least {100 * min(share):.1f} % of the return on every tier, at most {max(left):.3f} cost left; robots' "
@@ -120,7 +120,6 @@ def same_safety() -> tuple[bool, str]:
     )
 
 
-DANGERS = ("learned", "formula")  # in names of variants
 BARRIERS = ("learned", "analytic")
 NAIVE = "naive controller"
 
@@ -201,7 +200,7 @@ def learned_sees_more() -> tuple[bool, str]:
 
 def own_shield_leaves(most: float) -> Callable[[], tuple[bool, str]]:
     def check():
-        row = ("bc", "default+shield-learned-own")
+        row = ("bc", "default+shield-learned-decentralized")
         left = max(mean("own-sight", task, row, "cost_safe_start") for task in tasks_of("own-sight"))
         return left <= most, f"at most {left:.3f} on four tiers"
 
@@ -426,7 +425,7 @@ CLAIMS = (
         "docs/guard.md",
         "keep 17 of 18 limits under `adapt`",
         "results/own-sight-mujoco/table.csv",
-        robots_kept("bc", "default+adapt-learned-own", 17, "own-sight-mujoco"),
+        robots_kept("bc", "default+adapt-learned-decentralized", 17, "own-sight-mujoco"),
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
     Claim(

@@ -34,7 +34,7 @@ TASK, OTHER, STATES, CLOSE = "simple_spread-expert", "simple_spread-medium-repla
 POLICIES = (
     ("cloning", "bc", {}),
     ("cloning, `shield`, learned", "bc", {"guard": "shield"}),
-    ("cloning, `shield`, formula", "bc", {"guard": "shield", "danger": "formula"}),
+    ("cloning, `shield`, formula", "bc", {"guard": "shield", "barrier": "analytic"}),
     ("cloning, `adapt`, learned", "bc", {"guard": "adapt"}),
     ("cloning, `full`, learned", "bc", {"guard": "full"}),
     ("`madiff`", "madiff", {}),

@@ -89,7 +89,7 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
                 _play(name, GUARDED[algorithm], "none", value, run, out, **how)
                 continue
             guard = {"guard": "adapt", "rate": value / 2000} if task.protocol else {"guard": "shield", "margin": value}
-            guard |= {"danger": "learned", "world": worlds.fit(store)}
+            guard |= {"barrier": "learned", "world": worlds.fit(store)}
             _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **guard)
 
 

@@ -18,25 +18,25 @@ RESULTS = Path(__file__).resolve().parent.parent / "results"
 # Columns: their heads, and their rows.
 SPREAD = {
     "BC": ("bc", "default"),
-    "shield, analytic": ("bc", "default+shield-formula"),
+    "shield, analytic": ("bc", "default+shield-analytic"),
     "**shield, learned**": ("bc", "default+shield-learned"),
     "**full, learned**": ("bc", "default+full-learned"),
     "MPC from a zero proposal (`mpc`), full, learned": ("mpc", "default+full-learned"),
 }
 ROBOTS = {
     "BC": ("bc", "default"),
-    "adapt, analytic": ("bc", "default+adapt-formula"),
+    "adapt, analytic": ("bc", "default+adapt-analytic"),
     "adapt, learned": ("bc", "default+adapt-learned"),
-    "full, analytic": ("bc", "default+full-formula"),
+    "full, analytic": ("bc", "default+full-analytic"),
     "**full, learned**": ("bc", "default+full-learned"),
     "`icbf` (low temperature)": ("icbf", "default+low_temperature"),
-    "`icbf`, adapt, analytic": ("icbf", "default+low_temperature+adapt-formula"),
+    "`icbf`, adapt, analytic": ("icbf", "default+low_temperature+adapt-analytic"),
     "`icbf`, adapt, learned": ("icbf", "default+low_temperature+adapt-learned"),
 }
 OWN = {
     "BC": ("bc", "default"),
-    "shield, learned, decentralized": ("bc", "default+shield-learned-own"),
-    "full, learned, decentralized": ("bc", "default+full-learned-own"),
+    "shield, learned, decentralized": ("bc", "default+shield-learned-decentralized"),
+    "full, learned, decentralized": ("bc", "default+full-learned-decentralized"),
 }
 # Crossing's rows: algorithm and variant, and their words.
 BESIDE = {
@@ -52,7 +52,7 @@ WAYS = BESIDE | {
     },
     "bc default+shield-learned+horizon1": "shield, ℓ and V, 1 row",
     "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
-    "bc default+shield-formula+horizon15+terminal_valueFalse": "shield, analytic, 15 rows",
+    "bc default+shield-analytic+horizon15+terminal_valueFalse": "shield, analytic, 15 rows",
     "bc default+full-learned": "**full**",
     "bc default+full-learned+margin1.0": "full, a margin of 1",
     "bc default+full-learned+trust_radius2.0+margin1.0": "full, a margin of 1, climbing anywhere",
@@ -82,8 +82,8 @@ TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16,
 SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 OWN_ROBOTS = {
     "BC": ("bc", "default"),
-    "adapt, learned, decentralized": ("bc", "default+adapt-learned-own"),
-    "full, learned, decentralized": ("bc", "default+full-learned-own"),
+    "adapt, learned, decentralized": ("bc", "default+adapt-learned-decentralized"),
+    "full, learned, decentralized": ("bc", "default+full-learned-decentralized"),
 }
 
 

@@ -135,8 +135,8 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         None,
     ),
     "BC + guard, *analytic*": (
-        ("guards", "bc", "default+shield-formula"),
-        ("guards-mujoco", "bc", "+adapt-formula"),
+        ("guards", "bc", "default+shield-analytic"),
+        ("guards-mujoco", "bc", "+adapt-analytic"),
         None,
     ),
     "**BC + guard**": (

@@ -34,16 +34,16 @@ ROWS = (
     ("BC", "none", "none", {}, 1),
     ("BC", "shield", "learned", {"terminal_value": False}, 1),
     ("BC", "shield", "learned", {}, 1),
-    ("BC", "shield", "formula", {}, 1),
+    ("BC", "shield", "analytic", {}, 1),
     ("BC", "full", "learned", {}, 5),
     ("BC", "full", "learned", {"horizon": 3, "terminal_value": True}, 5),
-    ("BC", "full", "formula", {}, 5),
+    ("BC", "full", "analytic", {}, 5),
     ("naive controller", "none", "none", {}, 1),
     ("naive controller", "shield", "learned", {"terminal_value": False}, 1),
     ("naive controller", "shield", "learned", {}, 1),
     ("naive controller", "shield", "learned", {"horizon": 7}, 1),
     ("naive controller", "shield", "learned", {"horizon": 10}, 1),
-    ("naive controller", "shield", "formula", {}, 1),
+    ("naive controller", "shield", "analytic", {}, 1),
 )
 HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
 AT = {name: k for k, name in enumerate(yard.NAMES)}
@@ -68,13 +68,13 @@ def main() -> None:
     run = ringfence.train("bc", logs_of_both, out=ROOT / "runs")[0]
     there = {tuple(r.values())[:4]: list(r.values()) for r in stored.table(OUT)} if OUT.exists() else {}
     rows = [logs(store)]
-    for method, guard, danger, options, part in ROWS:
+    for method, guard, barrier, options, part in ROWS:
         words = " ".join(f"{k}={v}" for k, v in options.items())
-        if kept := there.get((method, guard, danger, words)):
+        if kept := there.get((method, guard, barrier, words)):
             rows.append(kept)
             continue
         episodes = max(100, most // part)
-        asked = {} if guard == "none" else {"guard": guard, "danger": danger, **options}
+        asked = {} if guard == "none" else {"guard": guard, "barrier": barrier, **options}
         if method == "BC":
             r = ringfence.play(
                 run, yard.Yard, episodes=episodes, num_envs=100, **asked, **({"world": world} if asked else {})
@@ -85,7 +85,7 @@ def main() -> None:
             r = ringfence.play(pilot, yard.Yard, episodes=episodes, num_envs=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]
         bound = upper_bound(round(r["violation_rate"] * episodes), episodes)
-        rows.append([method, guard, danger, words, episodes, *measured, bound])
+        rows.append([method, guard, barrier, words, episodes, *measured, bound])
         print(rows[-1], flush=True)
         write(rows)
     write(rows)

@@ -177,7 +177,7 @@ def test_gradient_depths(small_store, small_world, gradient):
     "options",
     [
         dict(),
-        dict(num_samples=3, guard="select", danger="both"),
+        dict(num_samples=3, guard="select", barrier="both"),
         dict(replan=2, sampler="dpm++"),
         dict(num_samples=2, select=True, value_guidance=5.0, cfg_scale=1.0, sampler="ddpm", correction_steps=2),
     ],
@@ -236,7 +236,7 @@ def test_names_of_variants_follow_values(trained):
         ({"planner": "value_guided", "sampling_steps": 2}, "split+value_guided+sampling_steps2"),
         ({"margin": 0, "horizon": "2", "guard": "shield"}, "split+shield-learned+horizon2+margin0.0"),
         ({"value_guidance": "1e1"}, "split+value_guidance10.0"),
-        ({"guard": "adapt", "danger": "formula", "adapt": 0.2}, "split+adapt-formula+adapt0.2"),
+        ({"guard": "adapt", "barrier": "analytic", "adapt": 0.2}, "split+adapt-analytic+adapt0.2"),
     ):
         assert evaluate(run, episodes=1, **{"sampling_steps": 2, **options})["variant"].replace(
             "+sampling_steps2", ""
@@ -337,8 +337,8 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
             loop.train(name, blank, out=tmp_path, changes=TINY[name])
     with pytest.raises(UserError, match="planner"):
         evaluate(run, planner="gaurded")
-    with pytest.raises(UserError, match="danger is read by nothing without a guard"):
-        evaluate(run, danger="formula")
+    with pytest.raises(UserError, match="barrier is read by nothing without a guard"):
+        evaluate(run, barrier="analytic")
     with pytest.raises(UserError, match="1 to 20 steps"):
         evaluate(run, sampling_steps=21)
     with pytest.raises(UserError, match="trained with observe"):

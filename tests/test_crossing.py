@@ -182,7 +182,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20
     result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, correction_steps=1, horizon=1)
-    assert result["agents"] == 3 and result["sight"] == "own" and 0 <= result["infeasible_rate"] <= 1
+    assert result["agents"] == 3 and result["execution"] == "decentralized" and 0 <= result["infeasible_rate"] <= 1
     assert 0 <= result["agent_violation_rate"] <= result["violation_rate"]
     assert result["variant"] == "default+shield-learned+correction_steps1+horizon1+agents3"
     assert evaluate(run, episodes=2)["agents"] == 8
@@ -196,8 +196,8 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     np.testing.assert_allclose(pilot.act(seen[order]), acted[order], atol=1e-6)
     mine = guard(lambda seen, state: np.zeros((len(seen), 2)), world, agents=5)
     assert mine.act(seen).shape == (5, 2) and mine.info["infeasible"].shape == ()
-    with pytest.raises(UserError, match="no sight='all'"):
-        evaluate(run, episodes=2, guard="shield", world=world, sight="all")
+    with pytest.raises(UserError, match="no execution='centralized'"):
+        evaluate(run, episodes=2, guard="shield", world=world, execution="centralized")
     with pytest.raises(UserError, match="say with agents="):
         guard(lambda seen, state: np.zeros((len(seen), 2)), world)
 

@@ -182,7 +182,10 @@ def test_agents_who_are_alike(own_store, tmp_path):
     run = loop.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
     call, told = of_stablehlo(exporting.export(run, tmp_path / "5", "stablehlo", agents=5))
     assert told["inputs"] == [{"name": "observations", "shape": [5, 14], "dtype": "float32"}] and told["n_agents"] == 5
-    assert told["names"] == {"observations": list(own_store.card["observation_names"])} and told["sight"] == "own"
+    assert (
+        told["names"] == {"observations": list(own_store.card["observation_names"])}
+        and told["execution"] == "decentralized"
+    )
     seen = own_store.observations[:5, 0]
     action = Controller(run, agents=5).act(seen)
     np.testing.assert_allclose(call({"observations": seen})["action"], action, atol=1e-6)

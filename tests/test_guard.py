@@ -12,7 +12,7 @@ import ringfence
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
-from ringfence.guards import Danger, Guard, GuardOptions
+from ringfence.guards import BarrierSource, Guard, GuardOptions
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
@@ -29,8 +29,8 @@ def bound(small_world):
     return constraints.bind(constraints.Separation(), small_world.spec.feature_names, 3)
 
 
-def make(world, bound, source="formula", **options) -> Guard:
-    return Guard(Danger(world, source, bound, False), GuardOptions(**options))
+def make(world, bound, source="analytic", **options) -> Guard:
+    return Guard(BarrierSource(world, source, bound, False), GuardOptions(**options))
 
 
 @pytest.fixture(scope="module")
@@ -128,13 +128,15 @@ def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, optio
     world = dataclasses.replace(small_world, card=card)
     for policy in (ringfence.guard(lambda seen, state: 0, world, **options).policy.guarded,
                    ringfence.guard(Constant(world.spec), world, **options)):  # fmt: skip
-        assert policy.guard.danger.terminal_value == policy.guard.options.terminal_value == future
+        assert policy.guard.barrier.terminal_value == policy.guard.options.terminal_value == future
     assert not build(Constant(world.spec), world, None, "shield", "learned", {}, **options).guard.options.terminal_value
 
 
 def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
-    guard = Guard(Danger(small_world, "formula", bound, False), GuardOptions(correction_steps=10, max_correction=0.1))
+    guard = Guard(
+        BarrierSource(small_world, "analytic", bound, False), GuardOptions(correction_steps=10, max_correction=0.1)
+    )
     plan = jnp.full((64, 3, 3, 2), 0.95)
     kept = eqx.filter_jit(guard.shielded)(present, plan, jnp.full((64, 1), 9.0))
     moved = jnp.abs(kept - plan)
@@ -150,7 +152,7 @@ def test_the_best_of_the_safe_ones_is_taken():
 
 def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     """Nobody's action depends on what another one sees or would do."""
-    world = worlds.fit(small_store, sight="own", **QUICK_WORLD)
+    world = worlds.fit(small_store, execution="decentralized", **QUICK_WORLD)
     assert world.alone and world.map.view == "decentralized"
     seen = jnp.asarray(small_store.observations[:16])
     bound = constraints.bind(constraints.Separation(), world.spec.feature_names, 3)
@@ -185,7 +187,7 @@ def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
 
 
 def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
-    policy = build(Constant(small_world.spec), small_world, constraints.Separation(), "adapt", "formula")
+    policy = build(Constant(small_world.spec), small_world, constraints.Separation(), "adapt", "analytic")
     seen, state = small_store.observations[:2], small_store.state[:2]
     memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))
     assert (memory["margin"] == np.float32(0.6)).all()  # nobody chose the first state
@@ -196,10 +198,10 @@ def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
 
 
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
-    danger = Danger(small_world, "learned", None, False)
+    barrier = BarrierSource(small_world, "learned", None, False)
     rows = jnp.stack([present, present], 1)[:, None]
-    near = danger.along(rows, jnp.zeros((64, 1, 1, 3)))
-    far = danger.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.strange))
+    near = barrier.along(rows, jnp.zeros((64, 1, 1, 3)))
+    far = barrier.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.strange))
     np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
 
 
@@ -224,8 +226,10 @@ def test_entries_of_actions_that_an_agent_has_not_stay_where_they_are(small_worl
 
 def test_the_smaller_of_both(small_world, bound, present):
     rows, spread = jnp.stack([present, present], 1)[:, None], jnp.zeros((64, 1, 1, 3))
-    scores = {s: Danger(small_world, s, bound, False).along(rows, spread) for s in ("formula", "learned", "both")}
-    np.testing.assert_array_equal(scores["both"], jnp.minimum(scores["formula"], scores["learned"]))
+    scores = {
+        s: BarrierSource(small_world, s, bound, False).along(rows, spread) for s in ("analytic", "learned", "both")
+    }
+    np.testing.assert_array_equal(scores["both"], jnp.minimum(scores["analytic"], scores["learned"]))
 
 
 def test_any_callable_is_guarded(small_world, small_store):
@@ -243,7 +247,7 @@ def test_any_callable_is_guarded(small_world, small_store):
         with pytest.raises(UserError, match=said):
             ringfence.guard(lambda *_, wrong=wrong: wrong, small_world).act(seen, state)
     with pytest.raises(UserError, match="needs a formula that the World's view can read"):
-        ringfence.guard(lambda *_: np.zeros((3, 2)), small_world, danger="formula")
+        ringfence.guard(lambda *_: np.zeros((3, 2)), small_world, barrier="analytic")
     with pytest.raises(UserError, match="give a callable"):
         ringfence.guard(3, small_world)
     with pytest.raises(UserError, match="for a World"):
@@ -259,12 +263,14 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
         load(run, guard="shield", world=other)
     with pytest.raises(UserError, match="needs the World of its data"):
         load(run, guard="shield")  # nothing that this package regenerates
-    alone = worlds.fit(small_store, sight="own", **QUICK_WORLD)
-    with pytest.raises(UserError, match="fitted with sight=own, the guard is to have sight=all"):
+    alone = worlds.fit(small_store, execution="decentralized", **QUICK_WORLD)
+    with pytest.raises(
+        UserError, match="fitted with execution=decentralized, the guard is to have execution=centralized"
+    ):
         load(run, guard="shield", world=alone)
     same = worlds.fit(small_store, **QUICK_WORLD)
     result = evaluate(run, episodes=2, guard="shield", world=same)
-    assert result["guard"] == "shield" and result["danger"] == "learned" and 0 <= result["infeasible_rate"] <= 1
+    assert result["guard"] == "shield" and result["barrier"] == "learned" and 0 <= result["infeasible_rate"] <= 1
     assert registry.get("simple_spread-random").name == result["task"]
 
 
@@ -284,7 +290,7 @@ def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_p
     )
     assert run_worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
     monkeypatch.setattr(run_worlds, "_made_here", lambda run: True)
-    monkeypatch.setattr(run_worlds, "_of_data", lambda run, sight, quiet: "the task's")
+    monkeypatch.setattr(run_worlds, "_of_data", lambda run, execution, quiet: "the task's")
     assert run_worlds.for_guard(far) == "the task's"
     assert run_worlds.for_guard(usual).values.discount == 0.9
     assert run_worlds.of_run(far).values.discount == 0.8

@@ -16,12 +16,12 @@ def test_every_name_of_a_suite_reads_back(name):
 
 
 def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
-    wanted = "low_temperature+shield-formula-own+temperature0.5+trust_radius2.0+horizon7+agents4"
+    wanted = "low_temperature+shield-analytic-decentralized+temperature0.5+trust_radius2.0+horizon7+agents4"
     first = PolicySpec.of(
         planner="low_temperature",
         guard="shield",
-        danger="formula",
-        sight="own",
+        barrier="analytic",
+        execution="decentralized",
         agents=4,
         horizon="7",
         trust_radius=2,
@@ -32,8 +32,8 @@ def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
         agents=4,
         trust_radius=2.0,
         horizon=7.0,
-        sight="own",
-        danger="formula",
+        execution="decentralized",
+        barrier="analytic",
         guard="shield",
         planner="low_temperature",
     )
@@ -46,10 +46,9 @@ def test_names_of_results_are_understood():
         planner="low_temperature", guard="shield", barrier="analytic", execution="decentralized", horizon=7,
         trust_radius=2.0, target_return=1.0,
     )  # fmt: skip
-    assert spec == PolicySpec.of(
-        planner="low_temperature", guard="shield", danger="formula", sight="own", horizon=7, trust_radius=2.0,
-        target_return=1.0,
-    )  # fmt: skip
+    assert spec == PolicySpec.parse(
+        "low_temperature+shield-analytic-decentralized+target_return1.0+trust_radius2.0+horizon7"
+    )
     assert PolicySpec.of(execution="decentralized").plan_options == (("execution", "decentralized"),)
     for twice in ({"horizon": 7, "rows": 7}, {"barrier": "learned", "danger": "learned"}):
         with pytest.raises(UserError, match="two names of one choice"):
@@ -79,12 +78,25 @@ def test_flags_of_before_are_rewritten(capsys):
         assert rewritten([command, "--guidance=1", "--target=2"])[1:] == ["--cfg-scale=1", "--target-return=2"]
 
 
+def test_barriers_and_executions_of_before_are_read_and_said():
+    wanted = PolicySpec.of(guard="shield", barrier="analytic", execution="decentralized")
+    assert PolicySpec.parse("shield-formula-own") == wanted
+    with pytest.warns(FutureWarning) as said:
+        assert PolicySpec.of(guard="shield", danger="formula", sight="own") == wanted
+    said = "; ".join(str(warning.message) for warning in said)
+    assert "danger of the guard is called barrier now" in said and "barrier=formula is called barrier=analytic" in said
+    assert "sight of the guard is called execution now" in said
+
+
 def test_commands_of_before_are_rewritten(capsys):
     old = ["eval", "run", "--guard", "shield", "--danger", "formula", "--sight=own", "--planner", "steady"]
     new = ["eval", "run", "--guard", "shield", "--barrier", "analytic", "--execution=decentralized", "--planner"]
     assert rewritten(old) == [*new, "low_temperature"]
     assert "'--danger' is called '--barrier' now" in capsys.readouterr().err
-    assert rewritten(["fit", "data.h5", "--sight", "own"]) == ["fit", "data.h5", "--sight", "own"]
+    new = ["fit", "data.h5", "--execution", "decentralized"]
+    assert rewritten(["fit", "data.h5", "--sight", "own"]) == new == rewritten(new)
+    metres = ["data", "table", "data.csv", "--sight", "2.5"]  # how far agents see
+    assert rewritten(metres)[-2:] == ["--sight", "2.5"]
 
 
 def test_what_a_result_is_called():
@@ -100,8 +112,7 @@ def test_what_a_result_is_called():
         ({"guard": "shild"}, "did you mean 'shield'"),
         ({"planner": "low_temprature"}, "did you mean 'low_temperature'"),
         ({"rws": 3}, "Unknown option of planner or guard 'rws'"),
-        ({"danger": "formula"}, "danger is read by nothing without a guard"),
-        ({"sight": "own"}, "sight is read by nothing without a guard"),
+        ({"barrier": "analytic"}, "barrier is read by nothing without a guard"),
         ({"agents": 0}, "agents=0 must be a whole number"),
         ({"horizon": "seven"}, "horizon"),
     ],

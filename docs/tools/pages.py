@@ -54,7 +54,7 @@ REFERENCE = {
     "Guards": (
         "ringfence.guards.policy",
         "ringfence.guards.filter",
-        "ringfence.guards.danger",
+        "ringfence.guards.barrier",
         "ringfence.guards.wrap",
     ),
     "Planners": ("ringfence.proposals.planner",),

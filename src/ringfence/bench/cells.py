@@ -138,11 +138,11 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     guard = stored.get("guard_options") or {}
     if not spec.guarded:
         return not guard
-    options = GuardOptions(**options_of(spec.guard, spec.danger, task.guard, **dict(spec.guard_options)))
+    options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **dict(spec.guard_options)))
     wanted = names.guard_options(dataclasses.asdict(options))
     usual = names.guard_options(dataclasses.asdict(GuardOptions()))
     played = {**usual, **guard}  # an option newer than the result had its default then
-    world = Settings(**worlds.usual(task, worlds.sight_of(task, spec.sight)))
+    world = Settings(**worlds.usual(task, worlds.execution_of(task, spec.execution)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
     known = names.world_settings(dataclasses.asdict(world))
     known = {k: v for k, v in known.items() if k not in ("labels", "barrier")}

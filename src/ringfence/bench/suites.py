@@ -58,7 +58,7 @@ _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.val
 # How a proposal is played for its own sake, and under the cheapest guard.
 _ALONE, _ADAPTED = (DEFAULT, "shield-learned"), (DEFAULT, "adapt-learned")
 _COOL = "low_temperature"
-_ICBF_GUARDS = ("adapt-learned", "adapt-formula", "full-learned")
+_ICBF_GUARDS = ("adapt-learned", "adapt-analytic", "full-learned")
 _RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 
 SUITES = {
@@ -99,7 +99,7 @@ SUITES = {
     "guards": Suite(
         _SPREAD,
         (
-            Entry("bc", evaluations=(DEFAULT, "shield-learned", "shield-formula", "full-learned")),
+            Entry("bc", evaluations=(DEFAULT, "shield-learned", "shield-analytic", "full-learned")),
             Entry("mpc", evaluations=("full-learned",)),
             Entry("icbf", "split", (DEFAULT, "select-learned", "shield-learned", "full-learned")),
             Entry("icbf", "split-0", (DEFAULT, "select-learned", "shield-learned")),
@@ -116,7 +116,7 @@ SUITES = {
     "guards-mujoco": Suite(
         _ROBOTS,
         (
-            Entry("bc", evaluations=(DEFAULT, "adapt-learned", "adapt-formula", "full-learned", "full-formula")),
+            Entry("bc", evaluations=(DEFAULT, "adapt-learned", "adapt-analytic", "full-learned", "full-analytic")),
             Entry("icbf", evaluations=(_COOL, *(f"{_COOL}+{guard}" for guard in _ICBF_GUARDS))),
             Entry("madiff", evaluations=(_COOL, f"{_COOL}+adapt-learned")),
             *(Entry(name, evaluations=_ADAPTED) for name in _RIVALS),
@@ -142,7 +142,7 @@ SUITES = {
                     "shield-learned",
                     "shield-learned+horizon1",
                     *(f"shield-learned+horizon{k}+terminal_valueFalse" for k in (1, 3, 7, 15)),
-                    "shield-formula+horizon15+terminal_valueFalse",
+                    "shield-analytic+horizon15+terminal_valueFalse",
                     "full-learned",
                     "full-learned+margin1.0",
                     "full-learned+trust_radius2.0+margin1.0",
@@ -174,9 +174,13 @@ SUITES = {
         ),
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
-    "own-sight": Suite(_SPREAD, (Entry("bc", evaluations=(DEFAULT, "shield-learned-own", "full-learned-own")),)),
+    "own-sight": Suite(
+        _SPREAD, (Entry("bc", evaluations=(DEFAULT, "shield-learned-decentralized", "full-learned-decentralized")),)
+    ),
     "own-sight-mujoco": Suite(
-        _ROBOTS, (Entry("bc", evaluations=(DEFAULT, "adapt-learned-own", "full-learned-own")),), episodes=20
+        _ROBOTS,
+        (Entry("bc", evaluations=(DEFAULT, "adapt-learned-decentralized", "full-learned-decentralized")),),
+        episodes=20,
     ),
 }
 

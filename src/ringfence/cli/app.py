@@ -98,7 +98,7 @@ def train(
 def fit(
     data: Positional[str],
     seed: int = 0,
-    sight: Literal["all", "own"] | None = None,
+    execution: Literal["centralized", "decentralized"] | None = None,
     set: Assignments = [],  # noqa: B006
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
@@ -110,8 +110,8 @@ def fit(
     Args:
         data: a task (its data set is regenerated if need be) or a store's file.
         seed: of the fit, and of which episodes are held out.
-        sight: all for guards that see the team (default), own for agents that each guard their own action by their
-            own view (always so of homogeneous agents).
+        execution: centralized for guards that see the team (default), decentralized for agents that each guard their
+            own action by their own view (always so of homogeneous agents).
         set: settings of the World, e.g. --set barrier_updates=3000 labels=formula.
         out_file: keep the World in a file, too, for `ringfence eval --world`.
         report: write the card as an HTML page: are these logs enough?
@@ -122,7 +122,7 @@ def fit(
     report = None if report is None else writable(report)
     store = _store(data)
     settings: dict[str, Any] = dict(assignments(set))
-    made = worlds.fit(store, seed=seed, sight=sight, quiet=False, **settings)
+    made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
     out.print(str(made.card), soft_wrap=True, markup=False)
     if out_file is not None:
         print(world.save(made, out_file))
@@ -355,7 +355,7 @@ def ope(
     found = _runs([run])[0]
     store = _store(data)
     evaluation.check(found, store)
-    world = worlds.fit(store, seed=seed + 1, sight=PolicySpec.of(found, **given).sight, quiet=False)
+    world = worlds.fit(store, seed=seed + 1, execution=PolicySpec.of(found, **given).execution, quiet=False)
     sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     result = evaluation.ope(found, store, evaluation_world=world, quiet=False, **sizes, **given)
     for line in result.summary():

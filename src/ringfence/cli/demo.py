@@ -39,10 +39,10 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     world = run_worlds.of_run(planner)
     console.print(str(world.card), soft_wrap=True, markup=False)
     rows["BC"] = evaluate(cloned, **protocol)
-    rows["BC, shielded, formula"] = evaluate(cloned, guard="shield", danger="formula", world=world, **protocol)
-    rows["BC, shielded, learned"] = evaluate(cloned, guard="shield", danger="learned", world=world, **protocol)
+    rows["BC, shielded, formula"] = evaluate(cloned, guard="shield", barrier="analytic", world=world, **protocol)
+    rows["BC, shielded, learned"] = evaluate(cloned, guard="shield", barrier="learned", world=world, **protocol)
     rows["ICBF split"] = evaluate(planner, **protocol, **fewer)
-    guided = PolicySpec.of(planner, planner="value_guided", guard="shield", danger="learned", **fewer)
+    guided = PolicySpec.of(planner, planner="value_guided", guard="shield", barrier="learned", **fewer)
     rows["ICBF split, shielded, learned"] = evaluate_spec(guided, **protocol)
     rounds: dict[str, Any] = {"optimizer_steps": 2} if quick else {}
     rows["BC, full guard, learned"] = evaluate(cloned, guard="full", world=world, **protocol, **rounds)

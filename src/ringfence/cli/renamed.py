@@ -24,6 +24,7 @@ OLD_FLAGS: dict[str, dict[str, str]] = {
 OLD_FLAGS["eval"] |= {"--record": "--num-recorded", "--step": "--checkpoint"}
 OLD_FLAGS["export"] |= {"--step": "--checkpoint"}
 OLD_FLAGS["play"] |= {"--at-once": "--num-envs"}
+OLD_FLAGS["fit"] = {"--sight": "--execution"}
 OLD_FLAGS["train"] = {"--together": "--vmap-seeds"}
 OLD_FLAGS["data import-bag"] = {
     "--longest": "--max-episode-steps",

@@ -103,7 +103,7 @@ def export(
 def _constraints(policy: Policy) -> list[str]:
     """The named ones that a guard's margins follow apart."""
     inner = agent_policy(policy)
-    return list(inner.guard.danger.limits) if isinstance(inner, Guarded) else []
+    return list(inner.guard.barrier.limits) if isinstance(inner, Guarded) else []
 
 
 # --- the function ---
@@ -281,8 +281,8 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "provenance": data["provenance"],
         "planner_options": dataclasses.asdict(plan_options) if plan_options else {},
         "guard_options": dataclasses.asdict(guard.options) if guard else {},
-        "danger": spec.danger if guard else "none",
-        "sight": worlds.sight_of(job.task, "own" if guard and guard.world.alone else None),
+        "barrier": spec.barrier if guard else "none",
+        "execution": worlds.execution_of(job.task, "decentralized" if guard and guard.world.alone else None),
         "world": digest_of(sorted(named_arrays(guard.world).items())) if guard else None,
         "n_agents": job.team,
         "names": {k: list(x) for k, (x, count) in names.items() if x is not None and len(x) == count},

@@ -96,7 +96,7 @@ class SafeMuJoCo:
             "dynamics_updates": 40_000,
             "barrier_width": 128,
             "barrier_updates": 20_000,
-            "missed": 0.02,
+            "miscoverage": 0.02,
         }
 
     @property

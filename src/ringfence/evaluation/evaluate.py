@@ -40,7 +40,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Evaluate a run folder and add the result to its results.json, under the variant's name.
 
-    The first `num_recorded` episodes are kept for films. `planner`, `guard`, `danger`, `sight`, `world` and other
+    The first `num_recorded` episodes are kept for films. `planner`, `guard`, `barrier`, `execution`, `world` and other
     options are as in `load`. The result tells the `step` of the checkpoint that was played; where training is
     unfinished, a line on stderr says so.
     """
@@ -94,8 +94,8 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "planner": spec.planner,
         "options": {} if options is None else dataclasses.asdict(options),
         "guard": "none" if guard is None else spec.guard,
-        "danger": "none" if guard is None else spec.danger,
-        "sight": worlds.sight_of(resolved.job.task, spec.sight),
+        "barrier": "none" if guard is None else spec.barrier,
+        "execution": worlds.execution_of(resolved.job.task, spec.execution),
         "agents": resolved.job.team,
         "guard_options": {} if guard is None else dataclasses.asdict(guard.options),
         **({} if guard is None else {"world_settings": dataclasses.asdict(guard.world.card.settings)}),

@@ -50,8 +50,8 @@ def play(
     `num_envs` of them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
     7 000 001 + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
     `max_episode_steps` (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's
-    noise. `planner` and `options` (guard, danger, sight, world, ...) are as in `evaluate.load`. `keep` adds the result
-    to the run's results.json, as `ringfence eval` does, for reports.
+    noise. `planner` and `options` (guard, barrier, execution, world, ...) are as in `ringfence.load`. `keep` adds the
+    result to the run's results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a

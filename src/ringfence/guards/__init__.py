@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
-from ringfence.guards.danger import DANGERS, Danger
+from ringfence.guards.barrier import BARRIERS, BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.guards.policy import Guarded, options_of
 from ringfence.guards.wrap import Pilot, guard
 
-__all__ = ["DANGERS", "GUARDS", "Danger", "Guard", "GuardOptions", "Guarded", "Pilot", "guard", "options_of"]
+__all__ = [
+    "BARRIERS",
+    "GUARDS",
+    "BarrierSource",
+    "Guard",
+    "GuardOptions",
+    "Guarded",
+    "Pilot",
+    "guard",
+    "options_of",
+]

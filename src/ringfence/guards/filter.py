@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from ringfence.guards.danger import Danger
+from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.options import GuardOptions
 from ringfence.nets.mlp import MLP
 from ringfence.problem.constraints import lowest
@@ -57,12 +57,12 @@ class Guard(eqx.Module):
     """The four operations on proposals (B, P, K, N, A), actions in [−1, 1]. Where the World is `alone`, every agent
     judges and corrects its own actions by its own view of things, and hears of nobody."""
 
-    danger: Danger
+    barrier: BarrierSource
     options: GuardOptions = eqx.field(static=True)
 
     @property
     def world(self) -> World:
-        return self.danger.world
+        return self.barrier.world
 
     def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
@@ -82,7 +82,7 @@ class Guard(eqx.Module):
             plan=plan,
             chosen=chosen,
             rows=rows,
-            safety=self.danger.along(ahead, spread)[:, 0].min((1, 3)),
+            safety=self.barrier.along(ahead, spread)[:, 0].min((1, 3)),
             short=(missing < -TOLERANCE).any(1),
             strange=spread[:, 0, 0] > self.world.strange,
         )
@@ -114,14 +114,14 @@ class Guard(eqx.Module):
 
     def clear(self, rows: Array, spread: Array, margin: Array) -> Array:
         """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst."""
-        return lowest(self.danger.along(rows, spread) - _over(margin, 2))
+        return lowest(self.barrier.along(rows, spread) - _over(margin, 2))
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
         """(B, K, N) how much predicted rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
         or negative."""
         if self.options.condition == "margin":
             return jnp.minimum(clear, 0.0)
-        now = lowest(self.danger.now(present, present) - _over(margin, 0))[:, None]
+        now = lowest(self.barrier.now(present, present) - _over(margin, 0))[:, None]
         before = jnp.concatenate([now, clear[:, :-1]], 1)
         return jnp.minimum(clear - (1.0 - self.options.alpha) * before, 0.0)
 
@@ -245,7 +245,7 @@ class Guard(eqx.Module):
         share of unsafe steps tends to `rate` as long as a margin within the bounds can prevent them.
         """
         rate = self.options.rate
-        limits = self.danger.limits
+        limits = self.barrier.limits
         if limits:
             rate = jnp.array([0.5 * limit / self.world.spec.episode_length for limit in limits.values()])
         moved = margin + self.options.adapt * (unsafe - rate)

@@ -19,7 +19,7 @@ Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions
 
 @dataclass(frozen=True)
 class GuardOptions:
-    """Every choice of a guard. Margins are in the unit of the danger's source (danger.py)."""
+    """Every choice of a guard. Margins are in the unit of the danger's source (barrier.py)."""
 
     num_samples: Samples = 1  # proposals that are asked for
     select: bool = False  # among them; else the first is followed

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.guards.danger import Danger
+from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.problem import constraints, normalise
@@ -44,7 +44,7 @@ class Guarded(eqx.Module):
     def start(self, batch: int) -> PyTree:
         options = self.guard.options
         spec = self.guard.world.spec
-        constraints = max(1, len(self.guard.danger.limits))
+        constraints = max(1, len(self.guard.barrier.limits))
         shape = (batch, spec.n_agents, constraints) if self.guard.world.alone else (batch, constraints)
         memory = {
             "inner": self.proposal.start(batch),
@@ -67,7 +67,7 @@ class Guarded(eqx.Module):
         costs = {name: _of_team(c) for name, c in cost.items()}
         if "costs" not in memory:
             return {**memory, "cost": functools.reduce(jnp.maximum, costs.values())}
-        names = self.guard.danger.limits
+        names = self.guard.barrier.limits
         for name in costs:
             if name not in names:
                 raise unknown("constraint", name, names)
@@ -112,7 +112,7 @@ class Guarded(eqx.Module):
     def _was_unsafe(self, memory: PyTree, present: Array) -> Array:
         """(B, C) bool, or (B, N, C) of agents who are alone: what the step to the present cost, or is judged by the
         guard itself where its cost is not known."""
-        judged = self.guard.danger.now(memory["before"], present) < 0
+        judged = self.guard.barrier.now(memory["before"], present) < 0
         if not self.guard.world.alone:
             judged = judged.any(-2)
         axes = (1,) * (judged.ndim - 2)
@@ -155,11 +155,11 @@ def _of_team(cost: Array) -> Array:
 Named = Mapping[str, Mapping[str, Any]]  # options by a guard's name
 
 
-def options_of(name: str, danger: str, usual: Named = MappingProxyType({}), **changes: Any) -> dict[str, Any]:
+def options_of(name: str, barrier: str, usual: Named = MappingProxyType({}), **changes: Any) -> dict[str, Any]:
     """Fields of GuardOptions that a named guard has, where `usual` holds what a task's simulator asks for by name. The
     margin, unless another is asked for, is a calibrated one of what is learned; of a formula less than its safe margin,
     which is what examples of safety have."""
-    margin = {"margin": 1.0} if danger == "learned" else {}
+    margin = {"margin": 1.0} if barrier == "learned" else {}
     return {**GUARDS[name], **margin, **usual.get(name, {}), **changes}
 
 
@@ -187,7 +187,7 @@ def build(
     world: World,
     hazard: constraints.Hazard | None,
     name: str,
-    danger: str,
+    barrier: str,
     usual: Named | None = None,
     **changes: Any,
 ) -> Guarded:
@@ -196,12 +196,12 @@ def build(
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
     if usual is None:
-        looks = danger == "learned" and not {"horizon", "terminal_value"} & set(changes)
+        looks = barrier == "learned" and not {"horizon", "terminal_value"} & set(changes)
         usual = far_sighted(world) if looks else {}
-    options = build_config(GuardOptions, options_of(name, danger, usual, **changes), "the guard")
+    options = build_config(GuardOptions, options_of(name, barrier, usual, **changes), "the guard")
     if not options.judges:
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
-    return Guarded(proposal, Guard(Danger(world, danger, bound, options.terminal_value), options))
+    return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value), options))

@@ -17,7 +17,7 @@ from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
-from ringfence.utils.renamed import renamed
+from ringfence.utils.renamed import renamed, renamed_values
 from ringfence.world import World
 
 
@@ -117,7 +117,7 @@ def guard(
     world: World,
     *,
     guard: str = "shield",
-    danger: str = "learned",
+    barrier: str = "learned",
     hazard: constraints.Hazard | None = None,
     seed: int = 0,
     agents: int | None = None,
@@ -128,16 +128,17 @@ def guard(
     policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
     which gives a `Pilot`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
-    GUARDS, `danger` formula, learned or both, `options` fields of GuardOptions; `hazard` is the formula's definition,
-    where one is to be used.
+    GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one,
+    where that is to be used.
     """
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
-    options = renamed(options, stored.GUARD_OPTIONS, "the guard")
+    options = renamed(options, stored.GUARD_OPTIONS | {"danger": "barrier"}, "the guard")
+    barrier = renamed_values({"barrier": options.pop("barrier", barrier)}, stored.VALUES)["barrier"]
     if isinstance(policy, PerAgent):
-        return PerAgent(build(policy.one, world, hazard, guard, danger, **options), policy.agents)
+        return PerAgent(build(policy.one, world, hazard, guard, barrier, **options), policy.agents)
     if isinstance(policy, Policy):
-        return build(policy, world, hazard, guard, danger, **options)
+        return build(policy, world, hazard, guard, barrier, **options)
     if not callable(policy):
         raise UserError(
             f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
@@ -147,5 +148,5 @@ def guard(
         raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
     if agents not in (None, spec.n_agents) and not spec.homogeneous:
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
-    guarded = build(Nothing(), world, hazard, guard, danger, **options)
+    guarded = build(Nothing(), world, hazard, guard, barrier, **options)
     return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)

@@ -17,7 +17,7 @@ from ringfence.utils.compilation import keep_programs
 class Controller:
     """A trained policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
 
-    controller = Controller("runs/…/seed-0", guard="shield", danger="learned")
+    controller = Controller("runs/…/seed-0", guard="shield", barrier="learned")
     controller.reset()                             # at the start of every episode
     action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
 

@@ -72,8 +72,9 @@ def load(run: Run | str, checkpoint: int | None = None, planner: str = "default"
     """(job, policy) of a finished run.
 
     `planner` is a named set of options of those who draw plans (proposals.options.PLANNERS), `guard` one of guards
-    (guards.GUARDS), `danger` what the guard knows danger by, `sight` whether it sees the whole team ("all") or every
-    agent guards its own action by its own view ("own", the only one of homogeneous agents), `world` the World it
+    (guards.GUARDS), `barrier` what the guard knows danger by, `execution` whether it sees the whole team
+    ("centralized") or every agent guards its own action by its own view ("decentralized", the only one of homogeneous
+    agents), `world` the World it
     reads (default: that of the run's data and seed), `agents` how many play, where they are homogeneous. Other options
     are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
@@ -94,14 +95,14 @@ def resolve(spec: PolicySpec) -> Resolved:
     step, policy = _trained(run, job, world, spec)
     plans = isinstance(policy, Planner)
     if spec.guarded:
-        sight = worlds.sight_of(job.task, spec.sight)
-        world = run_worlds.for_guard(run, sight, spec.world, read=world, quiet=False)
+        execution = worlds.execution_of(job.task, spec.execution)
+        world = run_worlds.for_guard(run, execution, spec.world, read=world, quiet=False)
         usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
         options = dict(spec.guard_options)
-        policy = build(policy, world, job.hazard.hazard, spec.guard, spec.danger, usual, **options)
+        policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, **options)
     spec = spec if plans else spec.without_plans()
     # Homogeneous agents see for themselves anyway.
-    spec = dataclasses.replace(spec, sight=None) if job.task.homogeneous else spec
+    spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
 
 

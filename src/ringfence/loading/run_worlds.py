@@ -20,7 +20,7 @@ def of_run(run: Run, quiet: bool = True) -> World:
 
 def for_guard(
     run: Run,
-    sight: str | None = None,
+    execution: str | None = None,
     world: World | str | Path | None = None,
     read: World | None = None,
     quiet: bool = True,
@@ -29,22 +29,22 @@ def for_guard(
     training read, so that all proposals of a task are judged alike. Of data that this package does not regenerate it
     is the one in the run's folder, or has to be given. `read`: what training read, if it is loaded already."""
     homogeneous = run.config["spec"].get("homogeneous", False)
-    sight = sight or ("own" if homogeneous else "all")
+    execution = execution or ("decentralized" if homogeneous else "centralized")
     if world is not None:
         world = world if isinstance(world, World) else load(world)
-        _of_same(run, world, sight)
+        _of_same(run, world, execution)
         return world
-    if (run.path / GUARD).exists() and (kept := load(run.path / GUARD)).alone == (sight == "own"):
+    if (run.path / GUARD).exists() and (kept := load(run.path / GUARD)).alone == (execution == "decentralized"):
         return kept
     if read is not None or (run.path / WORLD).exists():
         found = read or of_run(run, quiet)
         # Training may ask for another view, or for values that look less far.
-        wanted = Settings(**usual(registry.TASKS[run.config["task"]], sight)) if _made_here(run) else None
+        wanted = Settings(**usual(registry.TASKS[run.config["task"]], execution)) if _made_here(run) else None
         settings = found.card.settings
         same = wanted is None or (wanted.view, wanted.discount) == (settings.view, settings.discount)
-        if same and found.alone == (sight == "own"):
+        if same and found.alone == (execution == "decentralized"):
             return found
-    return _of_data(run, sight, quiet)
+    return _of_data(run, execution, quiet)
 
 
 def _made_here(run: Run) -> bool:
@@ -52,24 +52,25 @@ def _made_here(run: Run) -> bool:
     return regenerated(run.config["data"]) and run.config["task"] in registry.TASKS
 
 
-def _of_data(run: Run, sight: str | None, quiet: bool) -> World:
+def _of_data(run: Run, execution: str | None, quiet: bool) -> World:
     """The World of a run's data and seed, where that is regenerated."""
     config = run.config
     if not _made_here(run):
+        flag = " --execution decentralized" if execution == "decentralized" else ""
         raise UserError(
             f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
-            f"STORE --out FILE{' --sight own' if sight == 'own' else ''}` and name it with world=FILE."
+            f"STORE --out FILE{flag}` and name it with world=FILE."
         )
     from ringfence.datasets.make import make
 
     card = config["data"]
     size = card.get("size", card.get("transitions"))
     store, _ = make(registry.get(config["task"]), size, card.get("seed", 0), must_keep=False)
-    return fit(store, seed=config["seed"], sight=sight, quiet=quiet)
+    return fit(store, seed=config["seed"], execution=execution, quiet=quiet)
 
 
-def _of_same(run: Run, world: World, sight: str) -> None:
-    """Refuse a World of other data, or of another sight."""
+def _of_same(run: Run, world: World, execution: str) -> None:
+    """Refuse a World of other data, or of another execution."""
     config = run.config
     here, there = config["data"].get("content"), world.card.data
     apart = config["task"] != there.task or (here is not None and here != there.content)
@@ -78,8 +79,8 @@ def _of_same(run: Run, world: World, sight: str) -> None:
             f"The World is of '{there.task}', the run '{run.path}' of other data ('{config['task']}'); fit one to the "
             "data that the run was trained on."
         )
-    if world.alone != (sight == "own"):
+    if world.alone != (execution == "decentralized"):
         raise UserError(
-            f"The World was fitted with sight={'own' if world.alone else 'all'}, the guard is to have sight={sight}; "
-            f"fit one with `ringfence fit STORE --sight {sight}`."
+            f"The World was fitted with execution={world.card.settings.execution}, the guard is to have "
+            f"execution={execution}; fit one with `ringfence fit STORE --execution {execution}`."
         )

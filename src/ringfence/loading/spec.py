@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError, unknown, whole_number
-from ringfence.guards import DANGERS, GUARDS, GuardOptions
+from ringfence.guards import BARRIERS, GUARDS, GuardOptions
 from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils import stored
 from ringfence.utils.config import fields_of, read_text
-from ringfence.utils.renamed import deprecated, renamed
+from ringfence.utils.renamed import deprecated, renamed, renamed_values
 from ringfence.world import World
 
-SIGHTS = ("all", "own")
+EXECUTIONS = ("centralized", "decentralized")
 Options = tuple[tuple[str, Any], ...]
 
 
@@ -36,8 +36,8 @@ class PolicySpec:
     plan_options: Options = ()  # given beside it, in the order of the fields
     guard: str = "none"  # a named set of GuardOptions
     guard_options: Options = ()
-    danger: str = "learned"  # what the guard knows danger by
-    sight: str | None = None  # all: the guard sees the team; own: every agent guards itself; None: as the task
+    barrier: str = "learned"  # what the guard knows danger by
+    execution: str | None = None  # decentralized: every agent guards itself; None: as the task
     world: World | Path | None = field(default=None, compare=False)  # None: that of the run's data and seed
     agents: int | None = None  # who play, where agents are homogeneous; None: as many as in the logs
 
@@ -49,36 +49,34 @@ class PolicySpec:
         checkpoint: int | None = None,
         planner: str = DEFAULT,
         guard: str = "none",
-        danger: str | None = None,
-        sight: str | None = None,
+        barrier: str | None = None,
+        execution: str | None = None,
         world: World | str | Path | None = None,
         agents: int | None = None,
         **options: Any,
     ) -> PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
-        Unknown names are refused, and so is what nothing would read.
+        Unknown names are refused, and so is what nothing would read. `execution` is the guard's, and without one the
+        planner's.
 
-        Names of before are understood with a warning. The names under which results are read (utils/stored.py) are
-        understood, too: `barrier` (learned, analytic, both) for `danger`, `execution` (centralized, decentralized) of
-        a guard for `sight`."""
+        Names of before are understood with a warning."""
+        choices = _choices(barrier, execution, options)
+        barrier = choices.get("barrier")
+        execution = choices.get("execution")
         if planner in stored.PLANNERS:
             deprecated(f"planner '{planner}'", f"'{stored.PLANNERS[planner]}'")
             planner = stored.PLANNERS[planner]
         options = renamed(options, stored.GUARD_OPTIONS, "the guard")
         options = renamed(options, stored.PLANNER_OPTIONS, "the planner")
-        barrier = options.pop("barrier", None)
-        if barrier is not None:
-            _apart("barrier", "danger", danger)
-            danger = _TO_BARRIER.get(barrier, barrier)
         guards = guard != "none" or any(f.name in options for f in dataclasses.fields(GuardOptions))
-        if guards and options.get("execution") in _TO_SIGHT:
-            _apart("execution", "sight", sight)
-            sight = _TO_SIGHT[options.pop("execution")]
+        if execution is not None and not guards:
+            options["execution"] = execution
+            execution = None
         _known("planner", planner, PLANNERS)
         _known("guard", guard, GUARDS)
-        _known("sight", sight or "all", SIGHTS)
-        if danger is not None:
-            _known("danger", danger, DANGERS)
+        _known("execution", execution or "centralized", EXECUTIONS)
+        if barrier is not None:
+            _known("barrier", barrier, BARRIERS)
         guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
         plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
         for name in options:
@@ -93,13 +91,13 @@ class PolicySpec:
             plan_options=_options(PlanOptions, {k: v for k, v in options.items() if k not in guard_names}),
             guard=guard,
             guard_options=_options(GuardOptions, {k: v for k, v in options.items() if k in guard_names}),
-            danger=danger or "learned",
-            sight=sight,
+            barrier=barrier or "learned",
+            execution=execution,
             world=world if world is None or isinstance(world, World) else Path(world),
             agents=agents,
         )
         if not spec.guarded:
-            unread = {"danger": danger is not None, "sight": sight == "own", "world": world is not None}
+            unread = {"barrier": barrier is not None, "world": world is not None}
             for name, given in unread.items():
                 if given:
                     raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
@@ -119,10 +117,11 @@ class PolicySpec:
 
     @property
     def name(self) -> str:
-        """Planner, guard with its danger and sight, and the options given beside them; `default` without any."""
+        """Planner, guard with its barrier and execution, and the options given beside them; `default` without any."""
         parts = [] if self.planner == DEFAULT else [self.planner]
         if self.guarded:
-            parts.append(f"{self.guard}-{self.danger}" + ("-own" if self.sight == "own" else ""))
+            alone = "-decentralized" if self.execution == "decentralized" else ""
+            parts.append(f"{self.guard}-{self.barrier}{alone}")
         parts += [f"{name}{value}" for name, value in self.plan_options + self.guard_options]
         if self.agents is not None:
             parts.append(f"agents{self.agents}")
@@ -144,14 +143,13 @@ class PolicySpec:
         return replace(self, planner=DEFAULT, plan_options=())
 
 
-# From today's names of results to those of the fields here.
-_TO_BARRIER = {new: old for old, new in stored.BARRIERS.items()}
-_TO_SIGHT = {new: old for old, new in stored.EXECUTIONS.items()}
-
-
-def _apart(new: str, old: str, given: Any) -> None:
-    if given is not None:
-        raise UserError(f"{new} and {old} are two names of one choice; give {new} alone.")
+def _choices(barrier: str | None, execution: str | None, options: dict[str, Any]) -> dict[str, str]:
+    """What a guard is asked for beside its options, under today's names; those of before leave `options`."""
+    given = {"barrier": barrier, "execution": execution} | {name: options.pop(name, None) for name in stored.GUARD}
+    return renamed_values(
+        renamed({name: value for name, value in given.items() if value is not None}, stored.GUARD, "the guard"),
+        stored.VALUES,
+    )
 
 
 def _known(kind: str, name: Any, known: Any) -> None:
@@ -178,7 +176,7 @@ def _typed(kind: type, name: str, value: Any, default: Any) -> Any:
     return int(value) if whole and not isinstance(default, bool) else value
 
 
-_GUARD = re.compile(rf"({'|'.join(GUARDS)})-({'|'.join(DANGERS)})(-own)?")
+_GUARD = re.compile(rf"({'|'.join(GUARDS)})-({'|'.join(BARRIERS)})(-decentralized)?")
 _AGENTS = re.compile(r"agents(\d+)")
 
 
@@ -189,9 +187,9 @@ def _part(part: str, name: str) -> Iterator[tuple[str, Any]]:
         yield "planner", part
     elif found := _GUARD.fullmatch(part):
         yield "guard", found[1]
-        yield "danger", found[2]
+        yield "barrier", found[2]
         if found[3]:
-            yield "sight", "own"
+            yield "execution", "decentralized"
     elif found := _AGENTS.fullmatch(part):
         yield "agents", int(found[1])
     else:

@@ -16,6 +16,7 @@ from ringfence.utils.config import build_config
 from ringfence.world import Settings, World
 from ringfence.world import load as load_world
 from ringfence.world.fit import fit_view
+from ringfence.world.settings import settings_named
 
 WORLD = "world.safetensors"  # in a run folder: the World that training read
 GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
@@ -25,8 +26,9 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     """The settings of a World of this data: the task's own where it has some, and labels from its costs if they tell
     safe steps from unsafe ones, else from its formula; without either, no barrier."""
     task = task or registry.from_store(store)
-    sight = sight_of(task, changes.pop("sight", None))
-    settings = usual(task, sight)
+    changes = settings_named(changes)
+    execution = execution_of(task, changes.pop("execution", None))
+    settings = usual(task, execution)
     costs = store.costs > 0
     if not (costs.any() and not costs.all()) and "labels" not in changes and "barrier" not in changes:
         formula = not isinstance(task.hazard, constraints.CostColumn)
@@ -34,20 +36,24 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     return build_config(Settings, {**settings, **changes}, "the World")
 
 
-def sight_of(task: Task, wanted: str | None = None) -> str:
-    """Whether guards see the team ("all") or every agent guards itself ("own"): as wanted; by default the team, but
-    homogeneous agents know nothing but what each of them sees."""
-    if task.homogeneous and wanted == "all":
+def execution_of(task: Task, wanted: str | None = None) -> str:
+    """Whether guards see the team ("centralized") or every agent guards itself ("decentralized"): as wanted; by
+    default the team, but homogeneous agents know nothing but what each of them sees."""
+    if task.homogeneous and wanted == "centralized":
         raise UserError(
-            f"The agents of '{task.name}' are homogeneous and see for themselves, so there is no sight='all'; leave it "
-            "out."
+            f"The agents of '{task.name}' are homogeneous and see for themselves, so there is no "
+            "execution='centralized'; leave it out."
         )
-    return wanted or ("own" if task.homogeneous else "all")
+    return wanted or ("decentralized" if task.homogeneous else "centralized")
 
 
-def usual(task: Task, sight: str) -> dict:
+def usual(task: Task, execution: str) -> dict:
     """What a task asks of its World by default: the fields of `Settings` that are not as everywhere."""
-    return {"view": "decentralized" if sight == "own" else "pruned", **task.world, "sight": sight}
+    return {
+        "view": "decentralized" if execution == "decentralized" else "pruned",
+        **settings_named(task.world),
+        "execution": execution,
+    }
 
 
 def fit(

@@ -47,6 +47,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     "export": ("deploy.export",),
     "features": ("problem.features",),
     "files": ("utils.files",),
+    "guards.danger": ("guards.barrier",),
     "hazards": ("problem.constraints",),
     "judging": ("evaluation.ope.judge", "evaluation.ope"),
     "normalise": ("problem.normalise",),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 from ringfence.errors import UserError
+
+T = TypeVar("T")
 
 
 def renamed(given: Mapping[str, Any], names: Mapping[str, str], of: str, warn: bool = True) -> dict[str, Any]:
@@ -20,6 +22,15 @@ def renamed(given: Mapping[str, Any], names: Mapping[str, str], of: str, warn: b
         if today != name and warn:
             deprecated(f"{name} of {of}", today)
         found[today] = value
+    return found
+
+
+def renamed_values(given: Mapping[str, T], values: Mapping[str, Mapping[str, T]], warn: bool = True) -> dict[str, T]:
+    """The same with today's names of values; `values` maps those of before to them, by what they are values of."""
+    found = {name: values.get(name, {}).get(value, value) for name, value in given.items()}
+    for name, value in given.items():
+        if found[name] != value and warn:
+            deprecated(f"{name}={value}", f"{name}={found[name]}")
     return found
 
 

@@ -50,6 +50,7 @@ SPEC = {"alike": "homogeneous"}
 CARD = {"alike": "homogeneous", "sight": "sensing_radius"}
 BARRIERS = {"formula": "analytic"}
 EXECUTIONS = {"all": "centralized", "own": "decentralized"}
+GUARD = {"danger": "barrier", "sight": "execution"}  # beside its options
 PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}
 METHODS = {
     "cloning": "BC",
@@ -99,6 +100,7 @@ def results(stored: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]
 
 
 _OLD_OPTION = re.compile(rf"({'|'.join(OPTIONS)})(-?\d.*|(?:True|False).*)")
+_OLD_GUARD = re.compile(r"([a-z]+)-(learned|formula|analytic|both)(-own)?(@.*)?")
 _OLD_PLANNER = re.compile(rf"({'|'.join(PLANNERS)})(@.*)?")
 
 
@@ -114,6 +116,9 @@ def choice(part: str) -> str:
         return OPTIONS[found[1]] + found[2]
     if found := _OLD_PLANNER.fullmatch(part):
         return PLANNERS[found[1]] + (found[2] or "")
+    if found := _OLD_GUARD.fullmatch(part):
+        alone = "-decentralized" if found[3] else ""
+        return f"{found[1]}-{BARRIERS.get(found[2], found[2])}{alone}{found[4] or ''}"
     return part
 
 

@@ -10,7 +10,7 @@ import msgspec
 
 from ringfence.utils.config import build_config
 from ringfence.utils.renamed import deprecated
-from ringfence.world.settings import Settings
+from ringfence.world.settings import Settings, settings_named
 
 JUDGED = 3  # steps ahead that the margin is calibrated for
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
@@ -125,7 +125,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Card:
         """The card of a file. What it does not name stays in `unread`; msgspec.ValidationError where a part is none."""
-        settings = build_config(Settings, stored["settings"], "the World")
+        settings = build_config(Settings, settings_named(stored["settings"], warn=False), "the World")
         parts = {name: value for name, value in stored.items() if name != "settings"}
         card = msgspec.structs.replace(msgspec.convert(parts, cls), settings=settings)
         return msgspec.structs.replace(card, unread=_beyond(stored, card.to_json()))
@@ -175,9 +175,7 @@ def summary(card: Card) -> list[str]:
 
 
 def _of_data(card: Card) -> Iterator[str]:
-    line = (
-        f"World of '{card.data.task}', seed {card.seed}, sight {card.settings.sight}: {card.data.episodes} episodes, "
-    )
+    line = f"World of '{card.data.task}', seed {card.seed}, {card.settings.execution}: {card.data.episodes} episodes, "
     held_out = card.held_out
     if held_out is None:
         yield line + "judged on none."

@@ -24,6 +24,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, PyTree, Spec
+from ringfence.utils import stored
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
@@ -47,6 +48,10 @@ PARTS = {
 }
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}
 
+# Names of the cache's files follow from the names of 0.1.0, so that what was fitted then is found.
+_NAME_OF_BEFORE = {new: old for old, new in stored.WORLD_SETTINGS.items()}
+_EXECUTION_OF_BEFORE = {new: old for old, new in stored.EXECUTIONS.items()}
+
 T = TypeVar("T")
 
 
@@ -68,7 +73,7 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
-    content = [validate.VERSION, store.content, features.to_dict(map), settings.missed, settings.barrier]
+    content = [validate.VERSION, store.content, features.to_dict(map), settings.miscoverage, settings.barrier]
     content += [store.limits] if store.limits else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
@@ -89,7 +94,7 @@ def _fitted(
 ) -> World:
     begun = time.perf_counter()
     settings = parts.settings
-    if settings.sight == "own":
+    if settings.execution == "decentralized":
         map = features.alone(map)
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
     logged = Logged.of(store, map, held_out(store, parts.seed), labels)
@@ -102,9 +107,9 @@ def _fitted(
     danger = None
     if each:
         danger = cbf.Worst(tuple(each), tuple(labels)) if logged.several else each[0]
-    world = World(acts, worth, danger, jnp.ones(()), map, spec, settings.sight == "own", Card())
+    world = World(acts, worth, danger, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, settings.missed, settings.loss)
+    found = validate.validate(world, logged, settings.miscoverage, settings.loss)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
@@ -161,7 +166,7 @@ def _dynamics(logged: Logged, moved: str, blank: dynamics.Dynamics, parts: _Part
 
 def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, quiet: bool) -> values.Values:
     settings = parts.settings
-    alone = settings.sight == "own"
+    alone = settings.execution == "decentralized"
 
     def fit(key: Key) -> values.Values:
         return values.fit_values(
@@ -277,8 +282,17 @@ class _Parts:
 
     def file(self, name: str, of: Sequence[str], content: list[Any]) -> Path:
         """Where what depends on the settings of the parts `of` and on `content` is kept."""
-        fields = {field: getattr(self.settings, field) for part in of for field in PARTS[part]}
-        about = [FORMAT, name, content, self.settings.view, self.settings.sight, fields, self.seed]
+        names = [field for part in of for field in PARTS[part]]
+        fields = {_NAME_OF_BEFORE.get(field, field): getattr(self.settings, field) for field in names}
+        about = [
+            FORMAT,
+            name,
+            content,
+            self.settings.view,
+            _EXECUTION_OF_BEFORE[self.settings.execution],
+            fields,
+            self.seed,
+        ]
         if self.formula and {"label", "future"} & set(of):
             about.append(self.formula)
         code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]

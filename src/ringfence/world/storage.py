@@ -33,7 +33,7 @@ def blank_world(
 ) -> World:
     """The shapes of a World, with barriers of the named constraints; nothing is computed, since programs for so many
     small arrays take seconds to compile."""
-    alone = settings.sight == "own"
+    alone = settings.execution == "decentralized"
 
     def shapes() -> World:
         acts = dynamics.blank_dynamics(map, spec.action_dim, settings.members, settings.dynamics_width)
@@ -83,7 +83,7 @@ def _read(path: Path, map_of: MapOf) -> World:
     spec = Spec.of(stored.spec(about["spec"]))
     settings = card.settings
     map = map_of(spec.task, settings.view, card.data.hazard) or features.from_dict(dict(about["map"]))
-    if settings.sight == "own":
+    if settings.execution == "decentralized":
         map = features.alone(map)
     if map.names != spec.feature_names:
         raise UserError(f"'{path}' is a World of another view; fit it again.")

@@ -48,7 +48,7 @@ def ope(
     quiet: bool = True,
     **options: Any,
 ) -> OPEResult:
-    """What logs say of a policy: a run as `ringfence.load` plays it (guard, danger, sight, world, ...).
+    """What logs say of a policy: a run as `ringfence.load` plays it (guard, barrier, execution, world, ...).
 
     store: logs of the run's task, best those that it was not trained on (`trained_on` of the result says whether it
     was). `evaluation_world` is the World that predicts (default: fitted to these logs with seed + 1). The policy is
@@ -70,7 +70,7 @@ def ope(
     check(run, store)
     spec = PolicySpec.of(run, planner=planner, **options)
     resolved = resolve(spec)
-    world = evaluation_world or worlds.fit(store, seed=seed + 1, sight=spec.sight, quiet=quiet)
+    world = evaluation_world or worlds.fit(store, seed=seed + 1, execution=spec.execution, quiet=quiet)
     if not (world.card.data.content == store.content and world.spec.action_dim == store.actions.shape[2]):
         raise UserError("evaluation_world is of other logs; leave it out, and one is fitted to these.")
 

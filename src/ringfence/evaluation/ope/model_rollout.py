@@ -15,7 +15,7 @@ import numpy as np
 
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.result import Mean, ModelRollout
-from ringfence.guards import Danger
+from ringfence.guards import BarrierSource
 from ringfence.problem import normalise
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
@@ -86,23 +86,23 @@ def rollout(
         return None
     which = rng.permutation(logs.episodes)[:episodes]
     steps = int(min(steps, logs.store.lengths[which].max()))
-    danger = Danger(world, "learned", None, False) if world.barrier is not None else None
+    barrier = BarrierSource(world, "learned", None, False) if world.barrier is not None else None
     starts = logs.x[logs.starts[which]]
     play = jax.jit(_play, static_argnames="steps")
     played = []
     for member in range(world.dynamics.size):
         member_key = jax.random.fold_in(key, member)
-        played.append(play(policy, observe, world, danger, starts, jnp.asarray(member), member_key, steps=steps))
+        played.append(play(policy, observe, world, barrier, starts, jnp.asarray(member), member_key, steps=steps))
     earned, unsafe, ood = (np.stack([np.asarray(of_member[k]) for of_member in played]) for k in range(3))
-    returns_of_logs, unsafe_of_logs = _of_logs(logs, which, steps, danger)
+    returns_of_logs, unsafe_of_logs = _of_logs(logs, which, steps, barrier)
     return ModelRollout(
         episodes=len(which),
         steps=steps,
         returns=Mean.of_samples(earned.sum(1).mean(-1)),
         returns_of_logs=returns_of_logs,
-        unsafe_steps=None if danger is None else Mean.of_samples(unsafe.sum(1).mean(-1)),
+        unsafe_steps=None if barrier is None else Mean.of_samples(unsafe.sum(1).mean(-1)),
         unsafe_steps_of_logs=unsafe_of_logs,
-        violation_rate=None if danger is None else float(unsafe.any(1).mean()),
+        violation_rate=None if barrier is None else float(unsafe.any(1).mean()),
         ood_rate=float(ood.mean()),
     )
 
@@ -111,7 +111,7 @@ def _play(
     policy: Any,
     observe: Observer,
     world: World,
-    danger: Danger | None,
+    barrier: BarrierSource | None,
     starts: Array,
     member: Array,
     key: Key,
@@ -130,31 +130,31 @@ def _play(
         spread = jnp.broadcast_to(jnp.sqrt((change.var(0)).mean(-1) + 1e-12), after.shape[:-1])
         earned = world.values.of_steps(x, action, after)
         earned = earned if earned.ndim == 1 else earned.mean(-1)
-        unsafe = _unsafe(danger, x[:, None], after[:, None], spread[:, None])[:, 0]
+        unsafe = _unsafe(barrier, x[:, None], after[:, None], spread[:, None])[:, 0]
         return (memory, after), (earned, unsafe, (spread > world.strange).any(-1))
 
     _, kept = jax.lax.scan(step, (policy.start(len(starts)), starts), jax.random.split(key, steps))
     return kept
 
 
-def _of_logs(logs: Logs, which: np.ndarray, steps: int, danger: Danger | None) -> tuple[float, float | None]:
+def _of_logs(logs: Logs, which: np.ndarray, steps: int, barrier: BarrierSource | None) -> tuple[float, float | None]:
     """Return and unsafe steps of the first `steps` steps of logged episodes."""
     first = logs.step_of_start[which]
     at = first[:, None] + np.arange(steps)
     there = at <= logs.last_step[first][:, None]
     at = np.where(there, at, 0)
     earned = float((logs.rewards[at] * there).sum(1).mean())
-    if danger is None:
+    if barrier is None:
         return earned, None
     before = logs.x[logs.row[at]][:, :, None]
     after = logs.x[logs.row[at] + 1][:, :, None]
-    unsafe = jax.jit(_unsafe)(danger, before, after, jnp.zeros((*at.shape, 1, 1)))[..., 0]
+    unsafe = jax.jit(_unsafe)(barrier, before, after, jnp.zeros((*at.shape, 1, 1)))[..., 0]
     return earned, float((np.asarray(unsafe) & there).sum(1).mean())
 
 
-def _unsafe(danger: Danger | None, before: Array, after: Array, spread: Array) -> Array:
+def _unsafe(barrier: BarrierSource | None, before: Array, after: Array, spread: Array) -> Array:
     """(..., 1) bool of single steps from features (..., 1, N, D): somebody's margin is below 0."""
-    if danger is None:
+    if barrier is None:
         return jnp.zeros(before.shape[:-2], bool)
     rows = jnp.concatenate([before, after], -3)
-    return (danger.along(rows, spread) < 0).any((-2, -1))
+    return (barrier.along(rows, spread) < 0).any((-2, -1))

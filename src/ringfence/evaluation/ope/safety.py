@@ -10,7 +10,7 @@ from ringfence.evaluation import statistics
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.responses import Responses
 from ringfence.evaluation.ope.result import Safety
-from ringfence.guards import Danger
+from ringfence.guards import BarrierSource
 from ringfence.types import Array
 from ringfence.world import World
 
@@ -22,11 +22,11 @@ def safety(logs: Logs, steps: np.ndarray, responses: Responses, world: World, ah
     begins = steps == logs.step_of_start[logs.episode[steps]]
     safe = begins | (logs.costs[np.maximum(steps - 1, 0)] == 0)
     later = np.minimum(steps[:, None] + np.arange(ahead), logs.last_step[steps][:, None])
-    danger = Danger(world, "learned", None, False)
+    barrier = BarrierSource(world, "learned", None, False)
     x = logs.x[logs.row[steps]]
     smallest = jax.jit(_smallest_margin)
-    of_policy = np.asarray(smallest(danger, x, jnp.asarray(responses.plan)))[safe]
-    of_logs = np.asarray(smallest(danger, x, jnp.asarray(logs.actions[later])))[safe]
+    of_policy = np.asarray(smallest(barrier, x, jnp.asarray(responses.plan)))[safe]
+    of_logs = np.asarray(smallest(barrier, x, jnp.asarray(logs.actions[later])))[safe]
     episodes = logs.episode[steps][safe]
     asked = len(np.unique(episodes))
     violated = len(np.unique(episodes[of_policy < 1]))
@@ -44,16 +44,16 @@ def safety(logs: Logs, steps: np.ndarray, responses: Responses, world: World, ah
     )
 
 
-def _smallest_margin(danger: Danger, x: Array, plan: Array) -> Array:
+def _smallest_margin(barrier: BarrierSource, x: Array, plan: Array) -> Array:
     """(M,) over the steps, agents and constraints of plans (M, K, N, A) from states (M, N, D)."""
 
     def step(x, action):
-        after, spread = danger.world.dynamics.step(x, action)
+        after, spread = barrier.world.dynamics.step(x, action)
         return after, (after, spread)
 
     rows, spread = jax.lax.scan(step, x, jnp.moveaxis(plan, 1, 0))[1]
     rows = jnp.concatenate([x[:, None], jnp.moveaxis(rows, 0, 1)], 1)
-    return danger.along(rows, jnp.moveaxis(spread, 0, 1)).min((1, 2, 3))
+    return barrier.along(rows, jnp.moveaxis(spread, 0, 1)).min((1, 2, 3))
 
 
 def _quantiles(x: np.ndarray) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""How a guard knows danger: one signed score per agent, from whichever source."""
+"""What a guard knows danger by: one signed score per agent, from whichever source."""
 
 from __future__ import annotations
 
@@ -11,42 +11,42 @@ from ringfence.types import Array
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, Worst
 
-DANGERS = ("formula", "learned", "both")
+BARRIERS = ("learned", "analytic", "both")
 
 
-class Danger(eqx.Module):
-    """Scores in units of a margin that is right for each source: the hazard's own safe margin for a formula, the
-    calibrated one for what is learned. So a margin means the same to both, and the smaller of both can be taken.
+class BarrierSource(eqx.Module):
+    """Scores in units of a margin that is right for each source: the constraint's own safe margin for an analytic
+    one, the calibrated one for what is learned. So a margin means the same to both, and the smaller can be taken.
 
     What is learned is lowered out of distribution, where the ensemble disagrees by more than it did on held-out
     episodes: by one margin for every time that it does.
     """
 
     world: World
-    source: str = eqx.field(static=True)  # one of DANGERS
+    source: str = eqx.field(static=True)  # one of BARRIERS
     hazard: BoundHazard | None = eqx.field(static=True)  # bound to the World's view
     terminal_value: bool = eqx.field(static=True)  # the last row is judged by what will be dangerous, too
 
     def __check_init__(self):
-        if self.source not in DANGERS:
-            raise UserError(f"danger='{self.source}' is unknown; choose formula, learned or both.")
+        if self.source not in BARRIERS:
+            raise UserError(f"barrier='{self.source}' is unknown; choose learned, analytic or both.")
         if self.source != "learned":
-            self._check_formula()
-        if self.source != "formula" and self.world.barrier is None:
+            self._check_analytic()
+        if self.source != "analytic" and self.world.barrier is None:
             raise UserError(
-                f"danger='{self.source}' needs a barrier, but this World was fitted without labels of danger; use "
-                "danger='formula', or fit a World on logs with costs."
+                f"barrier='{self.source}' needs a barrier, but this World was fitted without labels of danger; use "
+                "barrier='analytic', or fit a World on logs with costs."
             )
 
-    def _check_formula(self) -> None:
+    def _check_analytic(self) -> None:
         if self.hazard is None or not self.hazard.has_formula:
             raise UserError(
-                f"danger='{self.source}' needs a formula that the World's view can read, and there is none; use "
-                "danger='learned'."
+                f"barrier='{self.source}' needs a formula that the World's view can read, and there is none; use "
+                "barrier='learned'."
             )
         if not self.hazard.safe_margin > 0:
             raise UserError(
-                f"danger='{self.source}' measures its margin in safe margins, but the hazard's is 0; give it one "
+                f"barrier='{self.source}' measures its margin in safe margins, but the hazard's is 0; give it one "
                 "above 0."
             )
 
@@ -54,35 +54,35 @@ class Danger(eqx.Module):
         """(..., K, N, C) scores of predicted rows (..., K+1, N, D), the present first, by each constraint (1 unless the
         logs name several); spread (..., K, N)."""
         after = rows[..., 1:, :, :]
-        if self.source == "formula":
-            return self._by_formula(after)
+        if self.source == "analytic":
+            return self._analytic(after)
         barrier = self._barrier
         score = barrier.apart(rows[..., :-1, :, :], after)
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
         score = score - jnp.maximum(spread / self.world.strange - 1.0, 0.0)[..., None]
-        return self._with_formula(score, after)
+        return self._with_analytic(score, after)
 
     def now(self, before: Array, present: Array) -> Array:
         """(..., N, C) scores of the step that led from one state (..., N, D) to the present."""
-        if self.source == "formula":
-            return self._by_formula(present)
-        return self._with_formula(self._barrier.apart(before, present), present)
+        if self.source == "analytic":
+            return self._analytic(present)
+        return self._with_analytic(self._barrier.apart(before, present), present)
 
     @property
     def limits(self) -> dict[str, float]:
         """Limit per episode of each constraint that has a barrier of its own; empty where danger is one."""
-        return {} if self.source == "formula" else self.world.limits
+        return {} if self.source == "analytic" else self.world.limits
 
     @property
     def _barrier(self) -> Barrier | Worst:
         assert self.world.barrier is not None, "checked when it was made"
         return self.world.barrier
 
-    def _with_formula(self, score: Array, x: Array) -> Array:
-        return score if self.source == "learned" else jnp.minimum(score, self._by_formula(x))
+    def _with_analytic(self, score: Array, x: Array) -> Array:
+        return score if self.source == "learned" else jnp.minimum(score, self._analytic(x))
 
-    def _by_formula(self, x: Array) -> Array:
+    def _analytic(self, x: Array) -> Array:
         assert self.hazard is not None and self.hazard.clearance is not None, "checked when it was made"
         return (self.hazard.clearance(x) / self.hazard.safe_margin)[..., None]
