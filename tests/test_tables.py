@@ -11,7 +11,8 @@ import ringfence
 from ringfence.cli import app
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError
-from ringfence.logs.io.table import observe
+from ringfence.logs.io.observe import observe
+from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import cut, nearest, resample, teams
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import CostColumn, Separation
@@ -335,6 +336,30 @@ def test_what_is_observed_at_run_time_is_what_the_logs_hold(how):
         observe(store.card, {c: now[c] for c in ("x", "y", "vy")}, {"x": now["gx"], "y": now["gy"]})
     with pytest.raises(UserError, match="give one number per agent"):
         observe(store.card, {"x": now["x"][:2], "y": now["y"]})
+
+
+def test_a_schema_says_what_its_options_say():
+    schema = TableSchema(**NAMES, max_episode_steps=7)
+    assert schema.state == ("x", "y", "vx", "vy") and schema.cost == ("hit",) and schema == dataclasses.replace(schema)
+    assert (schema.position, schema.velocity, schema.axes) == (("x", "y"), ("vx", "vy"), ("x", "y"))
+    store = EpisodeStore.from_table(fleet(), schema, notes=["first"], card={"task": "mine"})
+    assert store.content == EpisodeStore.from_table(fleet(), **NAMES, max_episode_steps=7).content
+    assert store.card["task"] == "mine" and store.card["warnings"][0] == "first"
+    with pytest.raises(UserError, match="schema and dt both say how the table is read"):
+        EpisodeStore.from_table(fleet(), schema, dt=0.2)
+    with pytest.raises(UserError, match="agent of the table is not named"):
+        EpisodeStore.from_table(fleet(), time="t", state=["x"])
+    with pytest.raises(UserError, match="max_speeds"):
+        EpisodeStore.from_table(fleet(), **NAMES, max_speeds=3.0)
+    with pytest.raises(UserError, match="leave state out"):
+        EpisodeStore.from_layout(fleet(), "highd", state=["x"])
+
+
+def test_others_without_places_are_observed():
+    table = fleet()
+    store = EpisodeStore.from_table(table, **(NAMES | {"state": ["vx", "vy"]}))
+    now = {name: table[name][:3] for name in ("vx", "vy")}
+    np.testing.assert_allclose(observe(store.card, now), store.observations[0], atol=1e-6)
 
 
 def test_options_of_before_work_and_warn(tmp_path, capsys):

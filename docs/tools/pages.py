@@ -23,7 +23,9 @@ RESULTS = ROOT / "results"
 REFERENCE = {
     "Logs": ("ringfence.logs.store", "ringfence.datasets.make", "ringfence.datasets.audit"),
     "Importers": (
+        "ringfence.logs.io.table_schema",
         "ringfence.logs.io.table",
+        "ringfence.logs.io.observe",
         "ringfence.logs.io.rosbag",
         "ringfence.datasets.importers.hdf5",
         "ringfence.datasets.importers.omar",

@@ -20,7 +20,7 @@ import functools
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,9 @@ import h5py
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
-from ringfence.logs.io.table import OLD_OPTIONS, Table, read_layout, read_table
+from ringfence.logs.io.columns import Table
+from ringfence.logs.io.table import read_layout, read_table
+from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
 from ringfence.logs.schema import ARRAYS, OPTIONAL, complete_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
@@ -360,11 +362,26 @@ class EpisodeStore:
         )
 
     @classmethod
-    def from_table(cls, table: Table, *, time: str, agent: str, state: Sequence[str], **options: Any) -> EpisodeStore:
+    def from_table(
+        cls,
+        table: Table,
+        schema: TableSchema | None = None,
+        *,
+        notes: Sequence[str] = (),
+        card: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> EpisodeStore:
         """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
-        Parquet file; options as of `ringfence.logs.io.table.read_table`."""
-        options = renamed(options, OLD_OPTIONS, "from_table")
-        return cls.from_steps(**read_table(table, time=time, agent=agent, state=state, **options))
+        Parquet file.
+
+        What its columns are is a `TableSchema`, or the fields of one by name: `time`, `agent`, `state` and options.
+        `card` adds fields to the store's; its warnings begin with the `notes`.
+        """
+        if schema is None:
+            schema = TableSchema.of(renamed(options, OLD_OPTIONS, "from_table"))
+        elif options:
+            raise UserError(f"schema and {next(iter(options))} both say how the table is read; give one of them.")
+        return cls.from_steps(**read_table(table, schema, notes=notes, card=card))
 
     @classmethod
     def from_layout(cls, table: Table, layout: str, **options: Any) -> EpisodeStore:

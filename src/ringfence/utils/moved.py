@@ -31,7 +31,7 @@ MOVED: dict[str, tuple[str, ...]] = {
     "data.recipes.spread_alike": ("datasets.recipes.spread_alike",),
     "data.robots": ("datasets.robots",),
     "data.store": ("logs.store",),
-    "data.tables": ("logs.io.table",),
+    "data.tables": ("logs.io.table", "logs.io.observe"),
     "data.tracks": ("logs.io.tracks",),
     "diffusion": ("proposals.diffusion",),
     "each": ("problem.homogeneous",),

@@ -1,6 +1,6 @@
 """Rows of (time, agent) as episodes: one clock, holes cut, a constant team or an agent among its neighbours.
 
-Everything here is NumPy on flat arrays; `tables.py` reads tables and makes stores of what comes out.
+Everything here is NumPy on flat arrays; `rows.py` says what a table's rows are, `episodes.py` what agents see.
 """
 
 from __future__ import annotations

@@ -1,0 +1,157 @@
+"""Columns of a table: of a data frame, a dictionary of arrays, a CSV or a Parquet file."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ringfence.errors import StoreError, UserError, unknown
+
+Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
+Columns = dict[str, np.ndarray]
+
+
+def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
+    """The named columns, whatever the table is; one that is absent is refused with the nearest name."""
+    wanted = list(dict.fromkeys(wanted))
+    if isinstance(table, str | Path):
+        table = _read_file(Path(table), wanted)
+    if isinstance(table, Mapping):
+        found = {name: np.asarray(table[name]) for name in _known(wanted, list(table))}
+    else:
+        frame = _frame(table)
+        found = {name: frame[name].to_numpy() for name in _known(wanted, frame.columns)}
+    lengths = {len(column) if column.ndim == 1 else -1 for column in found.values()}
+    if len(lengths) != 1 or not lengths - {-1, 0}:
+        shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
+        raise StoreError(f"The columns are not of one length above 0 ({shapes}); give one entry per row.")
+    return found
+
+
+def numbers(columns: Columns, name: str) -> np.ndarray:
+    """A column as float64; the first entry that is no finite number is refused by its row. Dates become seconds since
+    the first of them."""
+    column = columns[name]
+    if column.dtype.kind == "M":
+        return (column - column.min()) / np.timedelta64(1, "s")
+    if column.dtype.kind == "m":
+        return column / np.timedelta64(1, "s")
+    try:
+        found = column.astype(np.float64)
+    except (TypeError, ValueError):
+        row = next((k for k, entry in enumerate(column) if not _is_number(entry)), 0)
+        raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; repair or drop it.") from None
+    wrong = ~np.isfinite(found)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise StoreError(
+            f"row {row}: {name} is {found[row]} ({int(wrong.sum())} such rows); fill it, or drop the rows (a hole of "
+            "more than the gap ends an episode)."
+        )
+    return found
+
+
+def words(columns: Columns, name: str) -> np.ndarray:
+    """A column of names: numbers as they are, text decoded; a missing entry is refused by its row."""
+    column = columns[name]
+    if column.dtype.kind == "f" and not np.isfinite(column).all():
+        row = int(np.flatnonzero(~np.isfinite(column))[0])
+        raise StoreError(f"row {row}: {name} is missing; fill or drop it.")
+    if column.dtype.kind != "O":
+        return column
+    missing = [row for row, entry in enumerate(column) if entry is None or entry != entry]
+    if missing:
+        raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
+    return np.array([_text(name, row, entry) for row, entry in enumerate(column)])
+
+
+def _text(name: str, row: int, entry: Any) -> str:
+    if not isinstance(entry, bytes):
+        return str(entry)
+    try:
+        return entry.decode()
+    except UnicodeDecodeError:
+        raise StoreError(f"row {row}: {name} is {entry[:40]!r}, no text in UTF-8; write it anew in that.") from None
+
+
+def _known(wanted: list[str], names: list[str]) -> list[str]:
+    for name in wanted:
+        if name not in names:
+            raise unknown("column of the table", name, names)
+    return wanted
+
+
+def _frame(table: Any) -> Any:
+    """A data frame of any library as narwhals' own."""
+    narwhals = _needs("narwhals")
+    try:
+        return narwhals.from_native(table, eager_only=True)
+    except TypeError:
+        raise StoreError(
+            f"The table is a {type(table).__name__}; give a data frame (pandas, polars, pyarrow), a dictionary of "
+            "columns, or a .csv or .parquet file."
+        ) from None
+
+
+def _needs(module: str) -> ModuleType:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise UserError(
+            f"Tables are read by {module.partition('.')[0]}; install it with pip install 'ringfence[tables]'."
+        ) from None
+
+
+def _read_file(path: Path, wanted: list[str]) -> Columns:
+    """Columns of a CSV or Parquet file."""
+    if not path.is_file():
+        raise StoreError(f"'{path}' is no file; give a .csv or .parquet file.")
+    kind = path.suffix.lower()
+    if kind not in (".csv", ".parquet", ".pq"):
+        raise StoreError(f"'{path}' ends in '{kind}'; give a .csv or .parquet file.")
+    pyarrow = _needs("pyarrow")
+    try:
+        table = _read_csv(path) if kind == ".csv" else _read_parquet(path, wanted)
+    except (pyarrow.ArrowException, OSError) as error:
+        raise StoreError(f"'{path}' is no table that can be read ({str(error).splitlines()[0]}).") from None
+    names = table.column_names
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
+    return {name: table.column(name).to_numpy() for name in names}
+
+
+def _read_csv(path: Path) -> Any:
+    """An Arrow table, separated by what separates the header."""
+    from pyarrow import csv
+
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(2**20)
+    separator = max(",;\t|", key=head.count)  # the first of those that separate as often
+    return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=separator))
+
+
+def _read_parquet(path: Path, wanted: list[str]) -> Any:
+    """An Arrow table; a file that claims to unpack to far more than it holds is refused unread."""
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(path) as file:
+        groups = range(file.metadata.num_row_groups)
+        size = sum(file.metadata.row_group(k).total_byte_size for k in groups)
+        if size > 100 * path.stat().st_size + 2**28:
+            raise StoreError(f"'{path}' claims {size / 2**20:.0f} MiB and holds far less; write it again.")
+        there = set(file.schema_arrow.names)
+        return file.read(wanted) if set(wanted) <= there else file.read()
+
+
+def _is_number(entry: Any) -> bool:
+    try:
+        float(entry)
+    except (TypeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,209 @@
+"""Episodes of tracks: of a constant team, or of one agent among its neighbours, and what each agent sees."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ringfence.errors import StoreError
+from ringfence.logs.io.table_schema import AXES, TableSchema
+from ringfence.logs.io.tracks import Tracks, cut, nearest, teams
+from ringfence.problem.features import others
+
+RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in AXES)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """R rows of tracks, and what their columns are."""
+
+    schema: TableSchema
+    tracks: Tracks
+    agents: np.ndarray  # their names
+
+    def column(self, name: str) -> np.ndarray:
+        """(R,)"""
+        return self.tracks.state[:, self.schema.state.index(name)]
+
+    @cached_property
+    def place(self) -> np.ndarray:
+        """(R, axes of the position) m."""
+        return np.stack([self.column(axis) for axis in self.schema.position], 1)
+
+    @cached_property
+    def velocity(self) -> np.ndarray:
+        """(R, axes) m/s: logged, or by how much positions change from the row before (from the first to the next)."""
+        if not self.schema.axes:
+            return np.zeros((len(self.tracks.step), 0))
+        logged = self.schema.velocity
+        return np.stack(
+            [self.column(f"v{axis}") if f"v{axis}" in logged else self._slope(axis) for axis in self.schema.axes], 1
+        )
+
+    def _slope(self, axis: str) -> np.ndarray:
+        segment = self.tracks.segment
+        begins = np.ones(len(segment), bool)
+        begins[1:] = segment[1:] != segment[:-1]
+        column = self.column(axis)
+        change = np.diff(column, prepend=column[:1]) / self.tracks.dt
+        later = np.append(change[1:], 0.0)
+        single = begins & np.append(begins[1:], True)
+        return np.where(single, 0.0, np.where(begins, later, change))
+
+    def accelerations(self, rows: np.ndarray) -> np.ndarray:
+        """(W, N, axes) m/s², of windows' rows; what follows the last row of a window is nobody's."""
+        velocity = self.velocity[rows]
+        return np.diff(velocity, axis=0, append=velocity[-1:]) / self.tracks.dt
+
+    @property
+    def to_goal(self) -> np.ndarray:
+        """(R, axes of the position) m."""
+        return self.tracks.state[:, len(self.schema.state) :] - self.place
+
+    def own(self, with_place: bool) -> tuple[list[str], list[np.ndarray]]:
+        """Names and columns (R, ...) of what an agent knows of itself and of its goal."""
+        schema = self.schema
+        hidden = schema.velocity if with_place else (*schema.velocity, *schema.position)
+        rest = [name for name in schema.state if name not in hidden]
+        names = [f"own.v{axis}" for axis in schema.axes] + [f"own.{name}" for name in rest]
+        parts = [self.velocity, *(self.column(name)[:, None] for name in rest)]
+        if schema.goal:
+            names += [f"goal.d{axis}" for axis in schema.position]
+            parts.append(self.to_goal)
+        return names, parts
+
+
+@dataclass(frozen=True, eq=False)
+class Episodes:
+    """W rows of E episodes of N agents, one after another."""
+
+    rows: np.ndarray  # (W, N) of the tracks
+    lengths: np.ndarray  # (E,) rows of each episode
+    observations: np.ndarray  # (W, N, O)
+    names: list[str]  # of the observations' entries
+    cost: np.ndarray  # (W, N, K)
+    notes: tuple[str, ...] = ()
+    sensing_radius: float | None = None  # m, of agents who see their neighbours
+
+    @property
+    def last(self) -> np.ndarray:
+        """(E,) rows in which an episode ends."""
+        return np.cumsum(self.lengths) - 1
+
+    @property
+    def leaves(self) -> np.ndarray:
+        """(W,) whether a step follows a row."""
+        found = np.ones(len(self.rows), bool)
+        found[self.last] = False
+        return found
+
+    @property
+    def arrives(self) -> np.ndarray:
+        """(W,) whether a step leads to a row."""
+        found = np.ones(len(self.rows), bool)
+        found[self.last - self.lengths + 1] = False
+        return found
+
+
+def team_episodes(motion: Motion) -> Episodes:
+    """Episodes of a constant team, of which everybody sees all others."""
+    rows, lengths = _team_windows(motion)
+    names, parts = motion.own(with_place=True)
+    seen = [np.concatenate(parts, 1)[rows]]
+    n = rows.shape[1]
+    whose = others(n)
+    columns = _of_others(motion)
+    for j in range(n - 1):
+        for name, column in columns.items():
+            mine = column[rows]
+            theirs = mine[:, whose[:, j]]
+            seen.append((theirs - mine if name in RELATIVE else theirs)[..., None])
+            names.append(f"other{j}.{name}")
+    cost = motion.tracks.cost[rows]
+    if motion.schema.separation is not None:
+        cost = _too_close(motion.place[rows], motion.schema.separation.radius)
+    notes = _left_out(motion, rows)
+    return Episodes(rows, lengths, np.concatenate(seen, -1), names, cost, notes)
+
+
+def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (W, N) of windows in which a team is there, and how many rows each has."""
+    schema = motion.schema
+    rows, lengths, n = teams(motion.tracks, schema.team)
+    index, lengths = cut(lengths, schema.min_episode_steps, schema.max_episode_steps)
+    if not len(lengths):
+        here = np.unique(motion.tracks.agent).size
+        raise StoreError(
+            f"No {n} agents are together for {schema.min_episode_steps} steps of {motion.tracks.dt:g} s (the table has "
+            f"{here}); give another team, a smaller min_episode_steps, a longer gap, or neighbours."
+        )
+    return rows[index], lengths
+
+
+def _of_others(motion: Motion) -> dict[str, np.ndarray]:
+    """(R,) columns of what is seen of another agent: those of RELATIVE relative to oneself, the rest as they are."""
+    schema = motion.schema
+    columns = {f"d{axis}": motion.column(axis) for axis in schema.position}
+    columns |= {f"dv{axis}": motion.velocity[:, k] for k, axis in enumerate(schema.axes)}
+    known = (*schema.position, *schema.velocity)
+    return columns | {name: motion.column(name) for name in schema.state if name not in known}
+
+
+def _too_close(place: np.ndarray, radius: float) -> np.ndarray:
+    """(W, N, 1) costs of places (W, N, axes): 1 where the nearest other is closer than the radius."""
+    n = place.shape[1]
+    distance = np.linalg.norm(place[:, None] - place[:, :, None], axis=-1) + 1e9 * np.eye(n)
+    return (distance.min(-1) < radius).astype(float)[..., None]
+
+
+def _left_out(motion: Motion, rows: np.ndarray) -> tuple[str, ...]:
+    """What is in no episode, in sentences."""
+    tracks = motion.tracks
+    notes = []
+    share = 1 - len(np.unique(rows)) / len(tracks.step)
+    if share > 0.001:
+        notes.append(
+            f"{100 * share:.1f} % of the rows are left out: other than {rows.shape[1]} agents, or too short a time"
+        )
+    absent = sorted(set(np.unique(tracks.agent)) - set(np.unique(tracks.agent[rows])))
+    if absent:
+        named = ", ".join(str(motion.agents[k]) for k in absent[:5]) + (", ..." if len(absent) > 5 else "")
+        notes.append(f"agents that are in no episode, so that nobody will see them: {named}")
+    return tuple(notes)
+
+
+def neighbour_episodes(motion: Motion) -> Episodes:
+    """Episodes of one agent each, who sees its nearest."""
+    schema = motion.schema
+    tracks = motion.tracks
+    assert schema.neighbours is not None
+    index, lengths = cut(
+        np.bincount(tracks.segment, minlength=tracks.segment.max() + 1),
+        schema.min_episode_steps,
+        schema.max_episode_steps,
+    )
+    if not len(lengths):
+        raise StoreError(
+            f"No agent is there for {schema.min_episode_steps} steps of {tracks.dt:g} s; give a smaller "
+            "min_episode_steps."
+        )
+    near = nearest(tracks, motion.place, schema.neighbours, schema.sensing_radius or np.inf)
+    there = near >= 0
+    offset = np.where(there[..., None], motion.place[near] - motion.place[:, None], 0.0)
+    drift = np.where(there[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
+    radius = schema.sensing_radius or float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
+    offset[~there] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
+    names, parts = motion.own(with_place=False)
+    for j in range(schema.neighbours):
+        parts += [offset[:, j], drift[:, j], there[:, j, None].astype(float)]
+        names += [f"other{j}.d{axis}" for axis in schema.position]
+        names += [f"other{j}.dv{axis}" for axis in schema.axes]
+        names.append(f"other{j}.seen")
+    cost = tracks.cost
+    if schema.separation is not None:
+        close = np.linalg.norm(offset[:, 0], axis=-1) < schema.separation.radius
+        cost = (close & there[:, 0]).astype(float)[:, None]
+    rows = index[:, None]
+    return Episodes(rows, lengths, np.concatenate(parts, 1)[rows], names, cost[rows], sensing_radius=float(radius))

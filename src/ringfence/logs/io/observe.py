@@ -1,0 +1,85 @@
+"""What agents observe at run time, as in the store of a table."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.logs.io.table_schema import AXES
+from ringfence.logs.io.tracks import Tracks, nearest
+from ringfence.problem.features import others
+from ringfence.utils import stored
+
+
+def observe(card: Mapping[str, Any], state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
+    """(N, O) what agents observe now, as in the store of a table with this `card`: for a policy at run time.
+
+    `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
+    `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
+    are homogeneous, any number in any order.
+    """
+    card = stored.card(card)
+    names: list[str] = list(card.get("observation_names") or ())
+    columns = {name: np.asarray(column, np.float64) for name, column in state.items()}
+    goals = {name: np.asarray(column, np.float64) for name, column in (goal or {}).items()}
+    shapes = {column.shape for column in (*columns.values(), *goals.values())}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 1:
+        raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")
+    whom = _seen_by_each(card, columns, _others_in(names))
+    now = _Now(columns, goals, whom, float(card.get("sensing_radius", np.inf)))
+    return np.stack([now.entry(name) for name in names], 1).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Now:
+    """N agents at one time."""
+
+    columns: dict[str, np.ndarray]  # (N,)
+    goals: dict[str, np.ndarray]  # (N,)
+    others: np.ndarray  # (N, M) whom each agent sees, -1 where nobody is near
+    sensing_radius: float  # m
+
+    def entry(self, name: str) -> np.ndarray:
+        """(N,) of an observation's entry."""
+        whose, _, what = name.partition(".")
+        relative = what[:1] == "d" and what[1:] in self.columns
+        column = what[1:] if relative else what
+        if whose == "goal" and column in self.goals:
+            return self.goals[column] - self.columns[column]
+        if whose == "own" and what in self.columns:
+            return self.columns[what]
+        if whose.startswith("other") and (what == "seen" or column in self.columns):
+            who = self.others[:, int(whose.removeprefix("other"))]
+            return (who >= 0).astype(float) if what == "seen" else self._of_other(who, column, relative)
+        raise UserError(f"The logs observe '{name}', which state and goal do not tell; add it.")
+
+    def _of_other(self, who: np.ndarray, column: str, relative: bool) -> np.ndarray:
+        """(N,) the others' column; nobody is as far along the first axis as one senses."""
+        own = self.columns[column]
+        theirs = own[who] - own if relative else own[who]
+        first_axis = next((axis for axis in AXES if axis in self.columns), None)
+        return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
+
+
+def _others_in(names: list[str]) -> int:
+    """How many others the entries are of."""
+    numbers = [re.match(r"other(\d+)\.", name) for name in names]
+    return 1 + max((int(found[1]) for found in numbers if found), default=-1)
+
+
+def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots: int) -> np.ndarray:
+    """(N, slots) whom each agent sees."""
+    n = len(next(iter(columns.values())))
+    if not card.get("homogeneous"):
+        if n != slots + 1:
+            raise UserError(f"state tells of {n} agents, the logs of {slots + 1}; give all of them.")
+        return others(n)
+    zero = np.zeros(n, int)
+    place = np.stack([columns[axis] for axis in AXES if axis in columns], 1)
+    now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, card.get("dt", 1.0))
+    return nearest(now, place, slots, float(card.get("sensing_radius", np.inf)))

@@ -1,0 +1,210 @@
+"""Rows of a table in order, their numbers, and what is doubtful about them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.columns import Columns, numbers, words
+from ringfence.logs.io.table_schema import TableSchema
+
+GAP = 5.0  # steps without a row that end an episode
+LONG = 5.0  # s, a step that hardly any controller has
+FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """M rows sorted by recording, agent and time."""
+
+    order: np.ndarray  # (M,) rows of the table
+    recording: np.ndarray  # (M,)
+    agent: np.ndarray  # (M,)
+    time: np.ndarray  # (M,) s
+    agents: np.ndarray  # names, by number
+
+    @cached_property
+    def follows(self) -> np.ndarray:
+        """(M-1,) whether a row is of the same agent and recording as the one before."""
+        return (np.diff(self.recording) == 0) & (np.diff(self.agent) == 0)
+
+    @cached_property
+    def step(self) -> float:
+        """s between rows of an agent, in the median."""
+        return float(np.median(np.diff(self.time)[self.follows]))
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Numbers of the rows, in their order."""
+
+    columns: Columns  # (M,) each of state, action and goal
+    reward: np.ndarray  # (M,)
+    cost: np.ndarray  # (M, K)
+
+    def stacked(self, names: tuple[str, ...]) -> np.ndarray:
+        """(M, columns)"""
+        return np.stack([self.columns[name] for name in names], 1)
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Steps that rows are put on."""
+
+    dt: float  # s
+    gap: float  # s without a row, after which an agent was away
+
+
+def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
+    """The rows in order; an agent's times must increase."""
+    clock = numbers(columns, schema.time)
+    agents, owner = np.unique(words(columns, schema.agent), return_inverse=True)
+    recording = np.zeros(len(clock), int)
+    if schema.episode is not None:
+        recording = np.unique(words(columns, schema.episode), return_inverse=True)[1]
+    order = np.lexsort((np.arange(len(clock)), owner, recording))  # an agent's rows in the order of the table
+    rows = Rows(order, recording[order], owner[order], clock[order], agents)
+    _refuse_disorder(rows, columns, schema)
+    if not rows.follows.any():
+        raise StoreError(
+            f"No agent has two rows; check that {schema.agent} tells agents and {schema.time} their times."
+        )
+    return rows
+
+
+def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
+    passed = np.diff(rows.time)
+    backwards = rows.follows & (passed < 0)
+    twice = rows.follows & (passed == 0)
+    where = "." if schema.episode is not None else ", or name the column that tells episodes apart."
+    for wrong, what, remedy in (
+        (backwards, "is earlier than", "sort each agent's rows by time"),
+        (twice, "is the time of", "keep one row per agent and time"),
+    ):
+        if not wrong.any():
+            continue
+        k = int(np.flatnonzero(wrong)[np.argmin(rows.order[1:][wrong])])
+        row = int(rows.order[k + 1])
+        raise StoreError(
+            f"row {row}: {schema.time}={rows.time[k + 1]:.10g} {what} row {int(rows.order[k])} of the same agent "
+            f"({schema.agent}={columns[schema.agent][row]}); {remedy}{where}"
+        )
+
+
+def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
+    """The numbers that the schema names; without a reward or cost, 0."""
+    read = {name: numbers(columns, name)[rows.order] for name in (*schema.state, *schema.action, *schema.goal)}
+    zero = np.zeros(len(rows.time))
+    reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
+    costs = [numbers(columns, name)[rows.order] for name in schema.cost]
+    return Values(read, reward, np.stack(costs or [zero], 1))
+
+
+def clock_of(rows: Rows, schema: TableSchema) -> Clock:
+    dt = schema.dt or float(f"{rows.step:.6g}")
+    gap = schema.gap or GAP * max(dt, rows.step)
+    if gap < rows.step:
+        raise UserError(
+            f"gap={gap:g} is less than the {rows.step:g} s between an agent's rows; every row would be cut off."
+        )
+    return Clock(dt, gap)
+
+
+# --- units ---
+def refuse_jumps(rows: Rows, values: Values, schema: TableSchema) -> None:
+    """Refuse rows that nothing can lie apart by."""
+    if not schema.position:
+        return
+    speed = _speeds(rows, values, schema)
+    beyond = speed > schema.max_speed
+    if beyond.any():
+        k = int(np.flatnonzero(beyond)[np.argmin(rows.order[1:][beyond])])
+        raise StoreError(
+            f"row {int(rows.order[k + 1])}: {', '.join(schema.position)} moved at {speed[k]:.4g} m/s since row "
+            f"{int(rows.order[k])} of the same agent, more than max_speed={schema.max_speed:g}; check the units of "
+            "positions (m) and times (s), or drop the row."
+        )
+
+
+def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Iterator[str]:
+    """What is odd about the numbers, in sentences."""
+    if schema.position:
+        yield from _doubtful_velocities(rows, values, schema)
+        yield from _jumps(rows, values, schema)
+    if clock.dt >= LONG:
+        yield f"a step is {clock.dt:g} s: if times are in ms or µs, scale them to seconds"
+    if schema.dt is None:
+        yield from _off_the_clock(rows, clock)
+    if schema.action:
+        yield from _large_actions(values, schema)
+    if len(schema.position) < 2:
+        yield "state holds no x and y, so nobody sees where others are relative to oneself"
+
+
+def _moved(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
+    """(M-1, axes of the position) m/s since the row before; 0 where another agent's rows begin."""
+    passed = np.where(rows.follows, np.diff(rows.time), np.inf)
+    return np.diff(values.stacked(schema.position), axis=0) / passed[:, None]
+
+
+def _speeds(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
+    return np.linalg.norm(_moved(rows, values, schema), axis=1)
+
+
+def _doubtful_velocities(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
+    """Columns of velocities that are not those of the positions."""
+    moved = _moved(rows, values, schema)
+    speed = np.linalg.norm(moved, axis=1)
+    follows = rows.follows
+    usual = follows & (speed <= np.quantile(speed[follows], 0.99))  # a row that jumped says nothing of the others
+    for k, axis in enumerate(schema.position):
+        if f"v{axis}" not in schema.velocity:
+            continue
+        real = moved[usual, k]
+        v = values.columns[f"v{axis}"]
+        # Simulators differ in which of both velocities moves things.
+        ways = (v[:-1][usual], v[1:][usual], (v[:-1] + v[1:])[usual] / 2)
+        logged = max(ways, key=lambda way: abs(float((real * way).sum())) / max(float(np.linalg.norm(way)), 1e-12))
+        ratio = float((real * logged).sum() / max((real**2).sum(), 1e-12))
+        if (real != 0).any() and not 0.67 < ratio < 1.5:
+            yield f"v{axis} is {ratio:.3g} times what {axis} changes by: check its unit, sign, axis and frame"
+
+
+def _jumps(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
+    if not schema.velocity:
+        return
+    speed = _speeds(rows, values, schema)
+    largest = max(float(np.linalg.norm(values.stacked(schema.velocity), axis=1).max()), 1e-9)
+    jumps = np.flatnonzero(speed > 5 * largest)
+    if jumps.size and jumps.size < FEW_MOVED * len(speed):
+        yield (
+            f"row {int(rows.order[jumps[0] + 1])} and {jumps.size - 1} others moved more than five times as fast as "
+            "any velocity says: positions jump there, or no column tells recordings apart"
+        )
+
+
+def _off_the_clock(rows: Rows, clock: Clock) -> Iterator[str]:
+    begins = np.flatnonzero(np.diff(rows.recording, prepend=-1))
+    first = np.minimum.reduceat(rows.time, begins)
+    which = np.unique(rows.recording, return_inverse=True)[1]
+    steps = (rows.time - first[which]) / clock.dt
+    far = float(np.quantile(np.abs(steps - np.round(steps)), 0.99))
+    if far > 0.01:
+        yield (
+            f"rows are up to {far:.2g} of a step of {clock.dt:g} s off the clock: states are interpolated, actions, "
+            "costs and rewards are those nearest to a step"
+        )
+
+
+def _large_actions(values: Values, schema: TableSchema) -> Iterator[str]:
+    sizes = np.abs(values.stacked(schema.action))
+    largest = float(sizes.max())
+    usual = float(np.quantile(sizes, 0.99, axis=0).max())
+    if largest > 10 * usual:
+        yield (
+            f"the largest action is {largest:.4g}, 99 % are below {usual:.4g}: all are learned in units of the largest"
+        )

@@ -1,0 +1,198 @@
+"""What the columns of a table are, and how episodes are made of its rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from ringfence.errors import UserError, unknown, whole_number
+from ringfence.problem.constraints import Hazard, Separation
+
+AXES = "xyz"
+LISTS = ("state", "action", "goal", "cost")
+# Options as 0.1.0 called them.
+OLD_OPTIONS = {
+    "longest": "max_episode_steps",
+    "shortest": "min_episode_steps",
+    "fastest": "max_speed",
+    "sight": "sensing_radius",
+}
+
+
+@dataclass(frozen=True)
+class TableSchema:
+    """Columns of a table with a row per agent and time, in SI units. Checked when made; lists may be given as any
+    iterable of names, and `cost` as one name.
+
+    Columns of `state` named x, y, z are where an agent is, and vx, vy, vz how fast it moves in the same axes.
+    Velocities that are not there are the differences of positions. `action` is an agent's command at that time, which
+    it followed until its next row; without any, actions are its accelerations. `reward` and `cost` are what came since
+    its row before. Without `reward`, it is the progress to the `goal` (columns of its x, y), in m, or 0. Without
+    `cost`, it follows from `danger`, a `Separation`, or is 0. Several columns of costs are constraints of these names.
+
+    Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
+    is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
+    `team` of them is there (by default of the size with most rows). With `neighbours`=k it is the whole track of one
+    agent, who sees the k nearest others within `sensing_radius` m; such agents are homogeneous, and a policy plays any
+    number of them. Episodes have `min_episode_steps` to `max_episode_steps` steps. `max_speed` m/s is more than
+    anything there can do.
+    """
+
+    time: str
+    agent: str
+    state: tuple[str, ...]
+    episode: str | None = None
+    action: tuple[str, ...] = ()
+    reward: str | None = None
+    cost: tuple[str, ...] = ()
+    goal: tuple[str, ...] = ()
+    dt: float | None = None
+    gap: float | None = None
+    team: int | None = None
+    neighbours: int | None = None
+    sensing_radius: float | None = None
+    min_episode_steps: int = 5
+    max_episode_steps: int | None = None
+    max_speed: float = 100.0
+    danger: Hazard | None = None
+
+    def __post_init__(self):
+        if isinstance(self.cost, str):
+            object.__setattr__(self, "cost", (self.cost,))
+        for name in LISTS:
+            object.__setattr__(self, name, _names(name, getattr(self, name)))
+        for rule in RULES:
+            rule(self)
+
+    @classmethod
+    def of(cls, options: Mapping[str, Any]) -> TableSchema:
+        """The schema of options by name."""
+        names = [field.name for field in fields(cls)]
+        for name in options:
+            if name not in names:
+                raise unknown("option of a table", name, names)
+        for name in ("time", "agent", "state"):
+            if name not in options:
+                raise UserError(f"{name} of the table is not named; give {name}=, and time=, agent= and state= always.")
+        return cls(**options)
+
+    @property
+    def position(self) -> tuple[str, ...]:
+        return tuple(axis for axis in AXES if axis in self.state)
+
+    @property
+    def velocity(self) -> tuple[str, ...]:
+        return tuple(f"v{axis}" for axis in AXES if f"v{axis}" in self.state)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Those that agents move along, by position or velocity."""
+        return tuple(axis for axis in AXES if axis in self.position or f"v{axis}" in self.velocity)
+
+    @property
+    def homogeneous(self) -> bool:
+        """Whether an episode is of one agent among its neighbours."""
+        return self.neighbours is not None
+
+    @property
+    def separation(self) -> Separation | None:
+        """What a step costs by, where no column says it."""
+        return self.danger if isinstance(self.danger, Separation) else None
+
+    @property
+    def columns(self) -> list[str]:
+        """All that are read."""
+        optional = [name for name in (self.episode, self.reward) if name]
+        return [self.time, self.agent, *self.state, *self.action, *self.goal, *self.cost, *optional]
+
+
+def _names(field: str, given: Iterable[str] | None) -> tuple[str, ...]:
+    if isinstance(given, str):
+        raise UserError(f"{field}='{given}' is one word; give a list of columns.")
+    names = tuple(given) if given is not None else ()
+    twice = [name for name in names if names.count(name) > 1]
+    if twice:
+        raise UserError(f"{field} names the column '{twice[0]}' twice; name it once.")
+    return names
+
+
+# --- rules, in the order in which they are asked ---
+def _one_kind_of_episode(schema: TableSchema) -> None:
+    if schema.team is not None and schema.neighbours is not None:
+        raise UserError("team and neighbours both say who an episode is of; give one of them.")
+
+
+def _whole_numbers(schema: TableSchema) -> None:
+    for name in ("team", "neighbours", "max_episode_steps"):
+        value = getattr(schema, name)
+        if value is not None:
+            whole_number(name, value, 1, 10**6)
+    whole_number("min_episode_steps", schema.min_episode_steps, 1)
+
+
+def _episode_steps(schema: TableSchema) -> None:
+    most = schema.max_episode_steps
+    fewest = schema.min_episode_steps
+    if most is not None and most < fewest:
+        raise UserError(
+            f"max_episode_steps={most} is less than min_episode_steps={fewest}; give a smaller min_episode_steps, too."
+        )
+
+
+def _numbers_above_zero(schema: TableSchema) -> None:
+    for name in ("dt", "gap", "sensing_radius", "max_speed"):
+        value = getattr(schema, name)
+        if value is not None and not (isinstance(value, int | float) and 0 < value < np.inf):
+            raise UserError(f"{name}={value!r} must be a number above 0.")
+
+
+def _state(schema: TableSchema) -> None:
+    if not schema.state:
+        raise UserError("state names no column; name those that say where an agent is and how it moves.")
+
+
+def _goal(schema: TableSchema) -> None:
+    if schema.goal and len(schema.goal) != len(schema.position):
+        raise UserError(
+            f"goal names {len(schema.goal)} columns, the position has {len(schema.position)}; state must hold as many "
+            "of x, y, z, under these names."
+        )
+
+
+def _position(schema: TableSchema) -> None:
+    if (schema.homogeneous or schema.danger is not None) and len(schema.position) < 2:
+        raise UserError("state holds no x and y, which neighbours and distances follow from; rename these columns.")
+
+
+def _danger(schema: TableSchema) -> None:
+    if schema.danger is None:
+        return
+    if not isinstance(schema.danger, Separation):
+        raise UserError(
+            f"danger={type(schema.danger).__name__} is not read from a table; give a Separation or a cost column."
+        )
+    if schema.cost:
+        raise UserError("cost and danger both say what a step costs; give one of them.")
+
+
+def _action(schema: TableSchema) -> None:
+    if not schema.action and not schema.axes:
+        raise UserError(
+            "action names no column, and state holds no x or vx to tell accelerations by; name the actions."
+        )
+
+
+RULES: tuple[Callable[[TableSchema], None], ...] = (
+    _one_kind_of_episode,
+    _whole_numbers,
+    _episode_steps,
+    _numbers_above_zero,
+    _state,
+    _goal,
+    _position,
+    _danger,
+    _action,
+)
