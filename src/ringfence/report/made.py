@@ -11,9 +11,9 @@ from typing import Any
 from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown, whole_number
 from ringfence.evaluation.protocol import of_last_step
-from ringfence.guards import GuardOptions, options_of
+from ringfence.guards import GUARDS, GuardOptions, options_of
 from ringfence.logs.provenance import regenerated
 from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.report.pooling import Result
@@ -29,11 +29,17 @@ LONGEST = 400  # letters of a fact; the file itself lies in the run folder
 
 
 def commands(section: Section[Row], out: Path) -> list[str]:
-    """Shell lines that make this section's numbers again."""
+    """Shell lines that make this section's numbers again. What they are made of was written by whoever wrote the run
+    folders, so every word is quoted, and choices that this version does not know are refused (`check_choices`)."""
     make, data = _making(section)
-    roots = dict.fromkeys(shell(run.path.parent.parent) for run in section.runs)
-    report = f"ringfence report {' '.join(roots)} --out {shell(out)}"
+    roots = dict.fromkeys(str(run.path.parent.parent) for run in section.runs)
+    report = _line(["report", *roots, "--out", str(out)])
     return [*make, *_training(section, data), *_playing(section), report]
+
+
+def _line(words: Iterable[Any]) -> str:
+    """A command of `ringfence` with every word quoted."""
+    return " ".join(["ringfence", *(shell(word) for word in words)])
 
 
 def _making(section: Section[Row]) -> tuple[list[str], str]:
@@ -41,16 +47,21 @@ def _making(section: Section[Row]) -> tuple[list[str], str]:
     card = section.card
     if not regenerated(card):
         return [], "DATA.h5"
-    task = shell(section.task)
-    seed = card.get("seed", 0)
-    size = card.get("size", card.get("transitions"))
-    full = registry.TASKS[section.task].transitions if section.task in registry.TASKS else None
+    task = section.task
+    seed = _whole(card, "seed") or 0
+    size = _whole(card, "size" if card.get("size") is not None else "transitions")
+    full = registry.TASKS[task].transitions if task in registry.TASKS else None
     if seed == 0 and size in (None, full):
-        unknown = "" if size else "  # its size was not recorded"
-        return [f"ringfence data make {task}{unknown}"], task
-    data = shell(f"{section.task}.h5")
-    wanted = f" --size {size}" if size else ""
-    return [f"ringfence data make {task}{wanted} --seed {seed} --out {data}"], data
+        unknown_size = "" if size else "  # its size was not recorded"
+        return [_line(["data", "make", task]) + unknown_size], task
+    data = f"{task}.h5"
+    wanted = ["--size", size] if size else []
+    return [_line(["data", "make", task, *wanted, "--seed", seed, "--out", data])], data
+
+
+def _whole(card: Mapping[str, Any], name: str) -> int | None:
+    """A count on a card, None where it has none."""
+    return None if card.get(name) is None else whole_number(f"The data card's {name}", card[name], 0, 2**63)
 
 
 def _training(section: Section[Row], data: str) -> list[str]:
@@ -63,18 +74,16 @@ def _training(section: Section[Row], data: str) -> list[str]:
         jobs.setdefault((config["algorithm"], config["preset"], changed, root), []).append(config["seed"])
     lines = []
     for (algorithm, preset, changed, root), seeds in jobs.items():
-        words = ["ringfence", "train", shell(algorithm), data]
+        words: list[Any] = ["train", algorithm, data]
         if preset != _usual_preset(algorithm, section.task):
-            words += ["--preset", shell(preset)]
+            words += ["--preset", preset]
         for first, count in _stretches(sorted(seeds)):
-            tail = [f"--seeds {count}"]
+            tail = ["--seeds", count]
             if first:
-                tail.append(f"--first-seed {first}")
+                tail += ["--first-seed", first]
             if root != "runs":
-                tail.append(f"--out {shell(root)}")
-            if settings := json.loads(changed):
-                tail.append(_set(settings))
-            lines.append(" ".join(words + tail))
+                tail += ["--out", root]
+            lines.append(_line([*words, *tail, *_set(json.loads(changed))]))
     return lines
 
 
@@ -100,42 +109,62 @@ def _stretches(seeds: list[int]) -> list[tuple[int, int]]:
 
 def _playing(section: Section[Row]) -> list[str]:
     """A line for all runs that were played the same way."""
-    evaluations: dict[tuple[str, str, str], list[str]] = {}
+    evaluations: dict[tuple[str | None, tuple[str, ...]], list[str]] = {}
     for row in section.rows:
         for run, result in row.members:
-            simulator = result.get("simulator")
-            command = "play" if simulator else "eval"
-            env = f"--env {shell(simulator)}" if simulator else ""
-            evaluations.setdefault((command, env, _how(result, run)), []).append(shell(run.path))
-    return [
-        " ".join(["ringfence", command, *dict.fromkeys(paths), *([env] if env else []), how])
-        for (command, env, how), paths in evaluations.items()
-    ]
+            check_choices(f"'{run.path}'", result)
+            how = tuple(map(str, _how(result, run)))
+            evaluations.setdefault((result.get("simulator"), how), []).append(str(run.path))
+    lines = []
+    for (simulator, how), paths in evaluations.items():
+        command, env = ("play", ["--env", simulator]) if simulator else ("eval", [])
+        lines.append(_line([command, *dict.fromkeys(paths), *env, *how]))
+    return lines
 
 
-def _how(result: Result, run: Run) -> str:
+def _how(result: Result, run: Run) -> list[Any]:
     """The options of `ringfence eval` that gave a result."""
-    words = [f"--episodes {result['episodes']}"]
+    words: list[Any] = ["--episodes", result["episodes"]]
     if result["split"] == "validation":
-        words.append("--split validation")
+        words += ["--split", "validation"]
     if not of_last_step(result, run.config["config"]):
-        words.append(f"--checkpoint {result['step']}")
+        words += ["--checkpoint", result["step"]]
     planner = result.get("planner", "default")
     if planner != "default":
-        words.append(f"--planner {planner}")
+        words += ["--planner", planner]
     task = registry.TASKS.get(run.config["task"])
     team = run.config.get("team") if task is None or task.env is None else task.env.n_agents
     if result.get("agents") not in (None, team):
-        words.append(f"--agents {result['agents']}")
+        words += ["--agents", result["agents"]]
     settings = _given(result.get("options") or {}, _planner_options(planner))
     if result.get("guard_options"):
-        words.append(f"--guard {result['guard']} --barrier {result['barrier']}")
+        words += ["--guard", result["guard"], "--barrier", result["barrier"]]
         if result["execution"] != "centralized":
-            words.append(f"--execution {result['execution']}")
+            words += ["--execution", result["execution"]]
         settings |= _given(result["guard_options"], _guard_options(result, task))
-    if settings:
-        words.append(_set(settings))
-    return " ".join(words)
+    return [*words, *_set(settings)]
+
+
+def check_choices(name: str, result: Result) -> None:
+    """Refuse a result that says of how it was played what this version does not know: nobody could play it again."""
+    planners = [stored.PLANNERS.get(planner, planner) for planner in PLANNERS]
+    choices = {
+        "planner": [*planners, *stored.PLANNERS_BEFORE_GUARDS],
+        "guard": GUARDS,
+        "barrier": ["none", "learned", "analytic", "both"],
+        "execution": ["centralized", "decentralized"],
+    }
+    for kind, known in choices.items():
+        if result.get(kind) is not None and result[kind] not in known:
+            raise UserError(f"{name}: {unknown(kind, result[kind], known)}")
+    options = {
+        "options": [*stored.planner_options(dataclasses.asdict(PlanOptions())), *stored.OPTIONS_BEFORE_GUARDS],
+        "guard_options": [*stored.guard_options(dataclasses.asdict(GuardOptions()))],
+    }
+    for kind, known in options.items():
+        for option in result.get(kind) or {}:
+            if option not in known:
+                raise UserError(f"{name}: {unknown(f'entry of {kind}', option, known)}")
 
 
 def _planner_options(planner: str) -> dict[str, Any]:
@@ -154,8 +183,9 @@ def _given(options: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, An
     return {name: value for name, value in options.items() if value != usual.get(name)}
 
 
-def _set(settings: Mapping[str, Any]) -> str:
-    return "--set " + " ".join(shell(f"{name}={value}") for name, value in settings.items())
+def _set(settings: Mapping[str, Any]) -> list[str]:
+    """--set and its words; nothing where nothing is set."""
+    return ["--set", *(f"{name}={value}" for name, value in settings.items())] if settings else []
 
 
 # --- settings and machines ---

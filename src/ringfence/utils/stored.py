@@ -76,6 +76,20 @@ HEADS = {
 
 # What planners that checked their own actions by the formula did, before guards were apart from them.
 _BEFORE_GUARDS = {"guarded": "shield", "shielded": "shield", "adaptive": "adapt"}
+# Names that only their results have.
+PLANNERS_BEFORE_GUARDS = tuple(_BEFORE_GUARDS)
+OPTIONS_BEFORE_GUARDS = (
+    "plans",
+    "repair",
+    "select",
+    "margin",
+    "prefix",
+    "foresight",
+    "share",
+    "shield",
+    "adapt",
+    "rate",
+)
 
 
 def result(stored: Mapping[str, Any]) -> dict[str, Any]:
