@@ -1,17 +1,21 @@
 """Nothing that is read can hurt: it is refused in a sentence, or it is what it was; nothing outside is touched."""
 
+import io
 import json
+import lzma
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
+import tarfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ringfence.bench import pack, rows
+from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
@@ -329,3 +333,97 @@ def test_who_may_read_a_file_follows_the_umask(umask, tmp_path):
     finally:
         os.umask(before)
     assert (tmp_path / "w.safetensors").stat().st_mode & 0o777 == 0o666 & ~umask
+
+
+def archived(folder: Path, members: list, name: str = "runs.tar.xz") -> Path:
+    """A results folder with an archive of (member, contents)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tarfile.open(folder / name, "w:xz") as tar:
+        for member, content in members:
+            member.size = len(content)
+            tar.addfile(member, io.BytesIO(content))
+    return folder
+
+
+def test_a_sparse_member_of_an_archive_is_refused(tmp_path):
+    """248 bytes that claim 4 GiB of zeros."""
+    raw = bytearray(tarfile.TarInfo("cells/a/results.json").tobuf(tarfile.GNU_FORMAT))
+    raw[124:136] = b"%011o\0" % 0
+    raw[156:157] = tarfile.GNUTYPE_SPARSE
+    raw[386:482] = bytes(96)
+    raw[386:410] = b"%011o\0" % (4 * 2**30 - 1) + b"%011o\0" % 0  # nothing, far out
+    raw[483:495] = b"%011o\0" % (4 * 2**30 - 1)  # the real size
+    raw[148:156] = b" " * 8
+    raw[148:156] = b"%06o\0 " % sum(raw)
+    folder = tmp_path / "results"
+    folder.mkdir()
+    (folder / "runs.tar.xz").write_bytes(lzma.compress(bytes(raw) + bytes(1024)))
+    with pytest.raises(UserError, match="holds 'cells/a/results.json', which is no file of a cell"):
+        unpack(folder)
+    assert not (folder / "cells").exists()
+
+
+@pytest.mark.parametrize("link", ["cells", "cells/a", "cells/a/results.json"])
+def test_an_archive_is_not_unpacked_through_a_link(link, tmp_path):
+    """Nothing outside of the results folder is written."""
+    folder = archived(tmp_path / "results", [(tarfile.TarInfo("cells/a/results.json"), b"{}")])
+    (tmp_path / "outside").mkdir()
+    (folder / link).parent.mkdir(parents=True, exist_ok=True)
+    (folder / link).symlink_to(tmp_path / "outside" / ("new.json" if link.endswith("json") else ""))
+    with pytest.raises(UserError, match="is a link out of .*; remove that link"):
+        unpack(folder)
+    assert not list((tmp_path / "outside").iterdir())
+
+
+@pytest.mark.parametrize("content", [b"[]", b"3", b'{"x": 3}'])
+def test_archived_results_of_another_kind_are_refused(content, tmp_path):
+    """They are joined with those that are there."""
+    folder = archived(tmp_path / "results", [(tarfile.TarInfo("cells/a/results.json"), content)])
+    (folder / "cells" / "a").mkdir(parents=True)
+    (folder / "cells" / "a" / "results.json").write_text("{}")
+    with pytest.raises(UserError, match="is truncated or damaged"):
+        unpack(folder)
+
+
+@pytest.fixture
+def in_time():
+    """What hangs is interrupted."""
+
+    def late(*_):
+        raise AssertionError("it hangs")
+
+    before = signal.signal(signal.SIGALRM, late)
+    signal.alarm(20)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("name", ["ckpt/step-00000003.safetensors", "metrics.jsonl", "rollout-default.npz", "World"])
+def test_a_pipe_in_a_run_folder_is_not_waited_for(name, trained_run, tmp_path, in_time):
+    from ringfence import world
+
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    (run.path / name).unlink(missing_ok=True)
+    os.mkfifo(run.path / name)
+    attempts = {
+        "ckpt/step-00000003.safetensors": lambda: run.load_checkpoint({}, 3),
+        "metrics.jsonl": lambda: run.metrics,
+        "rollout-default.npz": lambda: recordings.read(run.path, "default"),
+        "World": lambda: world.load(run.path / name),
+    }
+    with pytest.raises(UserError, match="no regular file"):
+        attempts[name]()
+
+
+def test_a_pipe_among_logs_is_not_waited_for(tmp_path, in_time):
+    from ringfence.datasets.importers.omar import import_omar
+    from ringfence.logs.io.rosbag import read_bag
+
+    for kind in ("obs", "acs", "rews", "dones"):
+        os.mkfifo(tmp_path / f"{kind}_0.npy")
+    with pytest.raises(UserError, match="no regular file"):
+        import_omar(tmp_path)
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="no regular file"):
+        read_bag(tmp_path / "a.mcap", "/robot_{i}")

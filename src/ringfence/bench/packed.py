@@ -19,7 +19,7 @@ from pathlib import Path, PurePosixPath
 from ringfence.errors import UserError
 from ringfence.training.runs import write_json
 from ringfence.utils import schemas
-from ringfence.utils.files import whole
+from ringfence.utils.files import regular, whole, within
 
 PLACES = ("cells", "reference")
 ARCHIVES = {
@@ -39,6 +39,11 @@ def unpack(out: str | Path) -> None:
     archives = [out / name for name in ARCHIVES if (out / name).exists()]
     if not archives:
         return
+    for archive in archives:
+        try:
+            regular(archive)
+        except ValueError as error:
+            raise UserError(f"'{archive}' cannot be read ({error}); restore that file.") from None
     digests = {a.name: hashlib.sha256(a.read_bytes()).hexdigest() for a in archives}
     if (out / MARK).exists():
         done = schemas.read(out / MARK, dict[str, str], "holds a damaged mark; delete that file")
@@ -67,9 +72,13 @@ def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFi
     """One file of an archive, where there is none yet; results join those that are there."""
     parts = PurePosixPath(member.name).parts
     known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
-    if not (known and member.isfile()):
+    if not (known and member.isreg()) or member.issparse():  # a sparse one claims any size in a few bytes
         raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
     file = out.joinpath(*parts)
+    try:
+        within(out, file)
+    except ValueError as error:
+        raise UserError(f"'{file}' cannot be written ({error}); remove that link.") from None
     packed = tar.extractfile(member)
     assert packed is not None  # it is a file
     content = packed.read()
@@ -77,7 +86,7 @@ def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFi
         if parts[-1] != "results.json":
             return
         results = schemas.read(file, schemas.Results, "holds a damaged results.json; delete that file")
-        content = json.dumps({**json.loads(content), **results}, indent=1).encode()
+        content = json.dumps({**schemas.decode(content, schemas.Results), **results}, indent=1).encode()
     with whole(file) as temporary:
         temporary.write_bytes(content)
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.utils import stored
-from ringfence.utils.files import read_npz, whole
+from ringfence.utils.files import read_npz, whole, within
 
 Recording = dict[str, np.ndarray]
 
@@ -35,7 +35,7 @@ def read(folder: Path, variant: str) -> Recording | None:
     if file is None:
         return None
     try:
-        arrays = read_npz(file)
+        arrays = read_npz(within(folder, file))
         _check(arrays)
     except ValueError as error:
         raise UserError(f"'{file}' is damaged ({error}); evaluate the run again or delete the file.") from error

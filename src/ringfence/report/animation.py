@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ringfence.datasets import registry
+from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.report.pooling import Result
 from ringfence.report.table import Row, Section
 from ringfence.training.runs import Run
+from ringfence.utils.files import regular, within
 
 EPISODES = 4  # per variant
 VARIANTS = 2  # per task
+LARGEST = 2**26  # bytes of a film
 NUMBERS = 20_000  # of an episode's plans; more plans than fit are left out, never the chosen one
 
 
@@ -81,10 +85,24 @@ def films(section: Section[Row]) -> list[dict[str, Any]]:
         for run, result in sorted(row.members, key=_seed):
             file = recordings.kept(run.path, result["variant"], "gif")
             if row.split == "test" and file is not None:
-                gif = base64.b64encode(file.read_bytes()).decode()
+                gif = base64.b64encode(_film(run, file)).decode()
                 found.append({"label": row.label, "seed": run.config["seed"], "gif": gif})
                 break
     return found[-VARIANTS:]
+
+
+def _film(run: Run, file: Path) -> bytes:
+    """A GIF that lies in the run's folder: a page that is passed on must hold no other file of its maker's."""
+    try:
+        size = regular(within(run.path, file)).stat().st_size
+        if size > LARGEST:
+            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
+        content = file.read_bytes()
+        if not content.startswith((b"GIF87a", b"GIF89a")):
+            raise ValueError("it is no GIF")
+    except (OSError, ValueError) as error:
+        raise UserError(f"'{file}' is no film of this run ({error}); delete that file.") from None
+    return content
 
 
 def player(section: Section[Row], recorded: Recorded) -> dict[str, Any] | None:

@@ -24,7 +24,7 @@ from safetensors.numpy import save_file
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
 from ringfence.utils import schemas, stored
-from ringfence.utils.files import alone, whole
+from ringfence.utils.files import alone, regular, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 
 _log = logging.getLogger(__name__)
@@ -67,8 +67,15 @@ class Run:
     @property
     def metrics(self) -> list[dict]:
         """Logged training metrics, oldest first; a line that an interruption cut short is dropped."""
-        file, rows = self.path / "metrics.jsonl", []
-        for line in file.read_text(errors="replace").splitlines() if file.exists() else []:
+        file = self.path / "metrics.jsonl"
+        rows: list[dict] = []
+        if not file.exists():
+            return rows
+        try:
+            lines = regular(file).read_text(errors="replace").splitlines()
+        except (OSError, ValueError) as error:
+            raise UserError(f"'{file}' cannot be read ({error}); delete it.") from None
+        for line in lines:
             with suppress(ValueError):
                 rows.append(schemas.decode(line, schemas.Row))
         return rows
@@ -145,6 +152,7 @@ def runs_below(folder: Path) -> list[Run]:
 def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:
     """What a checkpoint of that step holds; ValueError says what is wrong with it. Those older than digests are
     believed."""
+    regular(file)
     try:
         with safe_open(file, framework="np") as opened:
             metadata = opened.metadata() or {}

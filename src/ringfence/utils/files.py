@@ -70,6 +70,25 @@ def writable(path: str | os.PathLike) -> Path:
     return path
 
 
+def regular(path: str | os.PathLike) -> Path:
+    """The path, if a file lies there that can be read to its end; `ValueError` names what it is else. A pipe would be
+    waited for, a device read for ever."""
+    path = Path(path)
+    if not path.exists():
+        raise ValueError("it is not there")
+    if not path.is_file():
+        raise ValueError("it is a folder" if path.is_dir() else "it is no regular file")
+    return path
+
+
+def within(folder: str | os.PathLike, path: str | os.PathLike) -> Path:
+    """The path, if it lies in the folder, links followed; `ValueError` otherwise: what others wrote must not show, or
+    overwrite, what lies elsewhere."""
+    if not Path(path).resolve().is_relative_to(Path(folder).resolve()):
+        raise ValueError(f"it is a link out of '{folder}'")
+    return Path(path)
+
+
 def _sweep(path: Path) -> None:
     """Remove parts of this file whose writers are gone."""
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
@@ -150,6 +169,7 @@ def owned(folder: Path, taken: str) -> Iterator[int]:
 def read_npz(path: Path) -> dict[str, np.ndarray]:
     """Arrays of numbers, or ValueError: nothing is unpickled, and no more is unpacked than a file of that size may
     claim."""
+    regular(path)
     try:
         with zipfile.ZipFile(path) as packed:
             claimed = sum(member.file_size for member in packed.infolist())

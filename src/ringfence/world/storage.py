@@ -16,7 +16,7 @@ from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas, stored
-from ringfence.utils.files import whole
+from ringfence.utils.files import regular, whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
@@ -66,6 +66,10 @@ def save(
 def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> World:
     """The World in a file."""
     path = Path(path)
+    try:
+        regular(path)
+    except ValueError as error:
+        raise UserError(f"'{path}' is no World that can be read ({error}); fit one with `ringfence fit`.") from None
     try:
         return _read(path, map_of)
     except UserError:

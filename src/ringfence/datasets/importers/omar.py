@@ -28,6 +28,7 @@ from ringfence.errors import StoreError
 from ringfence.logs.schema import complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.utils.files import regular
 
 REQUIRED = ("obs", "acs", "rews", "dones")  # next_obs may be absent
 TIER = re.compile(r"(?:simple_spread[-_])?(medium[-_]replay|medium|expert|random)")
@@ -212,7 +213,7 @@ def _agents(directory: Path, kind: str, n: int, rows: int | None, width: int | N
     for i in range(n):
         file = directory / f"{kind}_{i}.npy"
         try:
-            array = np.load(file, mmap_mode="r", allow_pickle=False)
+            array = np.load(regular(file), mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
             raise StoreError(f"'{file}' is truncated or no .npy file of numbers ({error}); copy it again.") from error
         if array.dtype.kind not in "fbiu":

@@ -369,6 +369,9 @@ def _opened(path: Path) -> Iterator[_File]:
         raise StoreError(f"'{path}' holds no metadata.yaml, so it is no ROS 2 bag; {hint}.")
     if not path.is_dir() and path.suffix not in (".bag", ".mcap", ".db3"):
         raise StoreError(f"'{path}' is no bag by its name; pass a .bag, .mcap or .db3 file or a ROS 2 bag's folder.")
+    for file in path.iterdir() if path.is_dir() else (path,):
+        if file.exists() and not file.is_file() and not file.is_dir():
+            raise StoreError(f"'{file}' is no regular file; pass a bag that was copied whole.")
     try:
         reader = Reader1(path) if first else Reader2(path)
         reader.open()
