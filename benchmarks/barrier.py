@@ -28,8 +28,8 @@ OUT = HERE.parent / "results" / "tuning" / "barrier.csv"
 WAYS: dict[str, dict] = {
     "default": {},
     "no distances": {"distances": False},
-    "logged steps alone": {"foreseen": 0.0},
-    "foreseen steps alone": {"foreseen": 1.0},
+    "logged steps alone": {"predicted_share": 0.0},
+    "foreseen steps alone": {"predicted_share": 1.0},
     "hinges": {"loss": "hinges"},
     "hinges, gradient penalty 0.01": {"loss": "gradient-penalty", "penalty": 0.01},
     "hinges, gradient penalty 0.1": {"loss": "gradient-penalty", "penalty": 0.1},
@@ -46,7 +46,7 @@ GUARDS: dict[str, dict] = {
 SHORT = {"3 rows": {"horizon": 3}, "future, 3 rows": {"terminal_value": True, "horizon": 3}}  # where 7 are usual
 
 FIELDS = ("task", "way", "guard", "seed", "fit_seconds", "unsafe_share", "recall", "auroc", "margin")
-FIELDS += ("foreseen_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible_rate")
+FIELDS += ("predicted_false_safe", "episodes", "return", "cost", "cost_low", "cost_high", "infeasible_rate")
 
 
 class Simulated:
@@ -126,7 +126,7 @@ def measured(name: str, subject, way: str, guard: str, seed: int) -> dict:
         "seed": seed,
         "fit_seconds": world.card.seconds.get("label", took),
     }
-    row |= {k: getattr(scores, k) for k in ("unsafe_share", "recall", "auroc", "margin", "foreseen_false_safe")}
+    row |= {k: getattr(scores, k) for k in ("unsafe_share", "recall", "auroc", "margin", "predicted_false_safe")}
     row |= {"episodes": subject.episodes, "return": played["return_mean"], "cost": played["cost_mean"]}
     row |= {"cost_low": low, "cost_high": high, "infeasible_rate": played.get("infeasible_rate", "")}
     row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}

@@ -195,7 +195,7 @@ def test_a_controller_acts_like_the_policy(trained, small_store):
     assert pilot.policy.proposal.options.value_guidance == 100.0 and pilot.policy.guard.options.num_samples == 2
     seen, state = small_store.observations[0], small_store.state[0]
     first = pilot.act(seen, state)
-    assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["strange"].dtype == bool
+    assert first.shape == (3, 2) and (np.abs(first) <= 1).all() and pilot.info["ood"].dtype == bool
     again = Controller(trained["icbf"], **how)
     np.testing.assert_array_equal(again.act(seen, state), first)
     again.reset()

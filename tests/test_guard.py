@@ -63,7 +63,7 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
     margin = jnp.full((64, 1), 3.0)
 
     def missing(plan):
-        rows, spread = guard.foreseen(present, plan[:, None])
+        rows, spread = guard.predict(present, plan[:, None])
         return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin).sum((1, 2))
 
     assert (missing(eqx.filter_jit(guard.shielded)(present, plan, margin)) >= missing(plan) - 1e-5).all()
@@ -85,9 +85,9 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
 def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, optimizer_steps=10, num_restarts=4, safety_weight=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
-    worth = lambda a: small_world.values.of_plan(guard.foreseen(present, a)[0], a)  # noqa: E731
+    value = lambda a: small_world.values.of_plan(guard.predict(present, a)[0], a)  # noqa: E731
     better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros((64, 1)))
-    assert (worth(better) > worth(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
+    assert (value(better) > value(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
     last = jnp.full((64, 3, 3, 2), 0.5)
     starts = guard.started(plan, last, jax.random.key(0))[0]
     assert starts.shape[1] == 4
@@ -201,7 +201,7 @@ def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, pre
     barrier = BarrierSource(small_world, "learned", None, False)
     rows = jnp.stack([present, present], 1)[:, None]
     near = barrier.along(rows, jnp.zeros((64, 1, 1, 3)))
-    far = barrier.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.strange))
+    far = barrier.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold))
     np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
 
 
@@ -236,7 +236,7 @@ def test_any_callable_is_guarded(small_world, small_store):
     """A controller of NumPy arrays; what it may not return is said in a sentence."""
     seen, state = small_store.observations[0], small_store.state[0]
     pilot = ringfence.guard(lambda observations, state: np.zeros((3, 2)), small_world)
-    assert pilot.act(seen, state).shape == (3, 2) and {"infeasible", "strange"} <= set(pilot.info)
+    assert pilot.act(seen, state).shape == (3, 2) and {"infeasible", "ood"} <= set(pilot.info)
     pilot.reset()
     pilot.act(seen, state, cost=1.0)
     for wrong, said in (

@@ -35,7 +35,7 @@ def test_they_are_few_and_small():
 
 def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
     run = loop.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path / "runs")[0]
-    other = dataclasses.replace(small_world, strange=2 * small_world.strange)
+    other = dataclasses.replace(small_world, ood_threshold=2 * small_world.ood_threshold)
     assert len(zoo.put(run, "mine/bc", small_world, small_world, tmp_path)) == 2
     made = zoo.put(run, "mine/bc", other, small_world, tmp_path)
     assert [f.name for f in made] == ["bc.safetensors", "world.safetensors", "bc-world.safetensors"]
@@ -45,7 +45,7 @@ def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
     seen, state = small_store.observations[0], small_store.state[0]
     was, now = (Controller(r, guard="shield", horizon=1, correction_steps=1, world=small_world) for r in (run, back))
     np.testing.assert_allclose(now.act(seen, state), was.act(seen, state), atol=0.02)
-    assert run_worlds.of_run(back).strange == 2 * run_worlds.for_guard(back).strange
+    assert run_worlds.of_run(back).ood_threshold == 2 * run_worlds.for_guard(back).ood_threshold
     assert back.checkpoints()[0][0] == 4 and back.config == run.config
 
 

@@ -21,7 +21,7 @@ from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy
 
-RATES = {"infeasible": "infeasible_rate", "strange": "ood_rate"}  # columns of what is counted in steps
+RATES = {"infeasible": "infeasible_rate", "ood": "ood_rate"}  # columns of what is counted in steps
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 
 

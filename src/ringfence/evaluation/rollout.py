@@ -16,7 +16,7 @@ from ringfence.utils.progress import Progress
 
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
 CHUNK = 50  # episodes per compiled batch
-COUNTED = ("infeasible", "strange")  # of every step: a guard's condition could not be met; its World knew nothing there
+COUNTED = ("infeasible", "ood")  # of every step: a guard's condition could not be met; its World knew nothing there
 CUT = ("reward", "cost", "state", "violated", *COUNTED)  # of as many episodes as were asked for
 
 Played = dict[str, np.ndarray]

@@ -9,7 +9,7 @@ from ringfence.errors import UserError
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
 from ringfence.world import World
-from ringfence.world.barrier import Barrier, Worst
+from ringfence.world.barrier import Barrier, MinBarrier
 
 BARRIERS = ("learned", "analytic", "both")
 
@@ -61,7 +61,7 @@ class BarrierSource(eqx.Module):
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
-        score = score - jnp.maximum(spread / self.world.strange - 1.0, 0.0)[..., None]
+        score = score - jnp.maximum(spread / self.world.ood_threshold - 1.0, 0.0)[..., None]
         return self._with_analytic(score, after)
 
     def now(self, before: Array, present: Array) -> Array:
@@ -76,7 +76,7 @@ class BarrierSource(eqx.Module):
         return {} if self.source == "analytic" else self.world.limits
 
     @property
-    def _barrier(self) -> Barrier | Worst:
+    def _barrier(self) -> Barrier | MinBarrier:
         assert self.world.barrier is not None, "checked when it was made"
         return self.world.barrier
 

@@ -40,7 +40,7 @@ class Decision(NamedTuple):
     rows: Array  # (B, P, K+1, N, D) where the proposals lead
     safety: Array  # (B, N) least score along the plan, of any constraint
     short: Array  # (B, N) bool: the condition is not met along it
-    strange: Array  # (B, N) bool: the first action leads out of distribution
+    ood: Array  # (B, N) bool: the first action leads out of distribution
 
 
 class Correction(NamedTuple):
@@ -70,13 +70,13 @@ class Guard(eqx.Module):
         proposals = self.world.spec.own(proposals)
         if self.options.optimizer_steps:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
-        rows, spread = self.foreseen(present, proposals)
+        rows, spread = self.predict(present, proposals)
         chosen = self.selected(rows, proposals, self.clear(rows, spread, margin))
         index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
         plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
         if self.options.correction_steps:
             plan = self.shielded(present, plan, margin)
-        ahead, spread = self.foreseen(present, plan[:, None])
+        ahead, spread = self.predict(present, plan[:, None])
         missing = self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin)
         return Decision(
             plan=plan,
@@ -84,10 +84,10 @@ class Guard(eqx.Module):
             rows=rows,
             safety=self.barrier.along(ahead, spread)[:, 0].min((1, 3)),
             short=(missing < -TOLERANCE).any(1),
-            strange=spread[:, 0, 0] > self.world.strange,
+            ood=spread[:, 0, 0] > self.world.ood_threshold,
         )
 
-    def foreseen(self, present: Array, actions: Array, dynamics: Dynamics | None = None) -> tuple[Array, Array]:
+    def predict(self, present: Array, actions: Array, dynamics: Dynamics | None = None) -> tuple[Array, Array]:
         """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A)."""
         model = dynamics or self.world.dynamics
         x = jnp.broadcast_to(present[:, None], (*actions.shape[:2], *present.shape[1:]))
@@ -101,13 +101,13 @@ class Guard(eqx.Module):
         return rows, jnp.moveaxis(spread, 0, 2)
 
     def imagined(self, present: Array, actions: Array) -> tuple[Array, Array]:
-        """`foreseen`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work.
+        """`predict`, each start by one member of the ensemble, in turn (TS∞, Chua et al. 2018): a third of the work.
         All of them judge what comes of it."""
         dynamics = self.world.dynamics
         nets = dynamics.members(jnp.arange(actions.shape[1])[:, None] % dynamics.size)
 
         def of_start(nets: tuple[MLP, MLP | None], actions: Array) -> tuple[Array, Array]:
-            rows, spread = self.foreseen(present, actions[:, None], dynamics.by_members(nets))
+            rows, spread = self.predict(present, actions[:, None], dynamics.by_members(nets))
             return rows[:, 0], spread[:, 0]
 
         return jax.vmap(of_start, (0, 1), 1)(nets, actions)
@@ -203,7 +203,7 @@ class Guard(eqx.Module):
 
     def _shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
-        rows, spread = self.foreseen(present, plan[:, None])
+        rows, spread = self.predict(present, plan[:, None])
         short = self.missing(present, self.clear(rows, spread, margin)[:, 0], margin)
         return short.sum(1) if self.world.alone else short.sum((1, 2))[:, None]
 

@@ -94,7 +94,7 @@ class Guarded(eqx.Module):
             "chosen": found.chosen,
             "clearance": found.safety.min(-1),
             "infeasible": found.short.any(-1),
-            "strange": found.strange.any(-1),
+            "ood": found.ood.any(-1),
         }
         spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)

@@ -21,7 +21,7 @@ class Controller:
     controller.reset()                             # at the start of every episode
     action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
 
-    `info` says of the last action what the policy knows of it, e.g. `strange`: the World knows nothing there. Not for
+    `info` says of the last action what the policy knows of it, e.g. `ood`: the World knows nothing there. Not for
     several threads at once.
     """
 

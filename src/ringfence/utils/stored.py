@@ -10,7 +10,9 @@ import csv
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
 
 COLUMNS = {
     "avoidable_cost": "cost_safe_start",
@@ -45,7 +47,16 @@ WORLD_SETTINGS = {
     "members": "num_ensemble",
     "both_ends": "use_transition",
     "missed": "miscoverage",
+    "foreseen": "predicted_share",
 }
+# Parts of a World's card, what is said of its barriers, and the arrays of its file.
+WORLD_CARD = {"foresight": "prediction_error", "strange": "ood"}
+BARRIER_SCORES = {
+    "foreseen_false_safe": "predicted_false_safe",
+    "unsafe_foreseen_above": "unsafe_predicted_above",
+    "missed": "miscoverage",
+}
+WORLD_ARRAYS = {"strange": "ood_threshold"}
 SPEC = {"alike": "homogeneous"}
 CARD = {"alike": "homogeneous", "sight": "sensing_radius"}
 BARRIERS = {"formula": "analytic"}
@@ -72,6 +83,7 @@ HEADS = {
     "apart": "action_rmse",
     "not_surely_safe": "margin_violation_rate",
     "foreseen_unsafe": "predicted_violation_rate",
+    "foreseen_false_safe": "predicted_false_safe",
 }
 
 # What planners that checked their own actions by the formula did, before guards were apart from them.
@@ -146,6 +158,29 @@ def guard_options(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def world_settings(stored: Mapping[str, Any]) -> dict[str, Any]:
     return named(stored, WORLD_SETTINGS)
+
+
+def world_card(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """What a World's file says of it, but for the settings."""
+    found = named(stored, WORLD_CARD)
+    if found.get("barrier"):
+        found["barrier"] = _scores(found["barrier"])
+    if found.get("constraints"):
+        found["constraints"] = {name: _scores(scores) for name, scores in found["constraints"].items()}
+    return found
+
+
+def _scores(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """How well a barrier does."""
+    found = named(stored, BARRIER_SCORES)
+    if "calibration" in found:
+        found["calibration"] = [named(row, BARRIER_SCORES) for row in found["calibration"]]
+    return found
+
+
+def world_arrays(stored: Mapping[str, T]) -> dict[str, T]:
+    """Arrays of a World's file by their paths, e.g. `values/critic/layers/0`."""
+    return {"/".join(WORLD_ARRAYS.get(part, part) for part in name.split("/")): x for name, x in stored.items()}
 
 
 def config(stored: Mapping[str, Any]) -> dict[str, Any]:

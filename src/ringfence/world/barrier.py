@@ -88,7 +88,7 @@ class Barrier(eqx.Module):
         return jnp.concatenate([x, (after - before - self.step_mean) / self.step_scale], -1)
 
 
-class Worst(eqx.Module):
+class MinBarrier(eqx.Module):
     """Barriers of several constraints, read as one, in units of their margins: the worst counts."""
 
     each: tuple[Barrier, ...]

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgspec
 
+from ringfence.utils import stored as named
 from ringfence.utils.config import build_config
 from ringfence.utils.renamed import deprecated
 from ringfence.world.settings import Settings, settings_named
@@ -37,7 +38,7 @@ class HeldOut(Part, frozen=True):
     steps: int
 
 
-class Foresight(Part, frozen=True):
+class PredictionError(Part, frozen=True):
     """Errors of the forward models, rolled out along logged actions."""
 
     steps_ahead: tuple[int, ...]
@@ -64,7 +65,7 @@ class MarginScores(Part, frozen=True):
 
     margin: float
     unsafe_in_1000: float  # of the steps that have it, both classes as frequent as in the logs
-    unsafe_foreseen_above: float  # share of entries into danger that were predicted to have it
+    unsafe_predicted_above: float  # share of entries into danger that were predicted to have it
     safe_kept: float  # share of the safe steps that have it
 
 
@@ -86,9 +87,9 @@ class BarrierScores(Part, frozen=True):
     false_alarms: float = UNKNOWN
     false_safe: float = UNKNOWN  # share of the unsafe steps with a score of 0 or more
     false_unsafe: float = UNKNOWN
-    foreseen_false_safe: float = UNKNOWN  # the same of entries into danger, by predicted scores
+    predicted_false_safe: float = UNKNOWN  # the same of entries into danger, by predicted scores
     margin: float = UNKNOWN  # the default one, calibrated
-    missed: float = UNKNOWN  # share of entries that are predicted to have it
+    miscoverage: float = UNKNOWN  # share of entries that are predicted to have it
     calibration: tuple[MarginScores, ...] = ()
     ahead_kept: float = UNKNOWN  # share of the safe steps that keep the margin by V
     avoidable: Avoidable | None = None
@@ -109,9 +110,9 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     shape: str = ""  # of the barrier, in words
     seconds: dict[str, float] = {}  # that fitting each part took
     held_out: HeldOut | None = None
-    foresight: Foresight | None = None
+    prediction_error: PredictionError | None = None
     values: ValueScores | None = None
-    strange: Threshold | None = None
+    ood: Threshold | None = None
     barrier: BarrierScores | None = None
     constraints: dict[str, BarrierScores] | None = None  # by name, where the logs name several
     unread: dict[str, Any] = {}  # what else a file says of it
@@ -125,10 +126,11 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Card:
         """The card of a file. What it does not name stays in `unread`; msgspec.ValidationError where a part is none."""
-        settings = build_config(Settings, settings_named(stored["settings"], warn=False), "the World")
-        parts = {name: value for name, value in stored.items() if name != "settings"}
+        known = named.world_card(stored) | {"settings": settings_named(stored["settings"], warn=False)}
+        settings = build_config(Settings, known["settings"], "the World")
+        parts = {name: value for name, value in known.items() if name != "settings"}
         card = msgspec.structs.replace(msgspec.convert(parts, cls), settings=settings)
-        return msgspec.structs.replace(card, unread=_beyond(stored, card.to_json()))
+        return msgspec.structs.replace(card, unread=_beyond(known, card.to_json()))
 
     def to_json(self) -> dict[str, Any]:
         """The card as files hold it."""
@@ -138,8 +140,8 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
         return _joined(known, more)
 
     def __getitem__(self, name: str) -> Any:
-        deprecated(f"card['{name}']", f"card.{name}")
-        return self.to_json()[name]
+        deprecated(f"card['{name}']", f"card.{named.WORLD_CARD.get(name, name)}")
+        return self.to_json()[named.WORLD_CARD.get(name, name)]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.to_json())
@@ -184,20 +186,20 @@ def _of_data(card: Card) -> Iterator[str]:
 
 
 def _of_prediction(card: Card) -> Iterator[str]:
-    if card.foresight is not None:
-        errors = card.foresight.error_of_change
+    if card.prediction_error is not None:
+        errors = card.prediction_error.error_of_change
         shown = sorted({0, min(2, len(errors) - 1), len(errors) - 1})
         far = ", ".join(f"{100 * errors[k]:.2g} % at {k + 1}" for k in shown)
-        yield f"Foresight errs by this share of what changes, steps ahead: {far}."
+        yield f"Predictions err by this share of what changes, steps ahead: {far}."
     if card.values is not None:
         yield (
             f"Rewards of steps are explained to {100 * card.values.reward_r2:.3g} %, returns-to-go to "
             f"{100 * card.values.value_r2:.3g} % of their variance."
         )
-    if card.strange is not None:
+    if card.ood is not None:
         yield (
-            f"It calls a place strange where its forward models are more than {card.strange.threshold:.2g} usual "
-            f"steps apart: {100 * card.strange.level:g} % of held-out episodes never are."
+            f"Out of distribution is where its forward models are more than {card.ood.threshold:.2g} usual steps "
+            f"apart: {100 * card.ood.level:g} % of held-out episodes never are."
         )
 
 
@@ -224,8 +226,8 @@ def _of_barrier(card: Card) -> Iterator[str]:
         yield _of_horizon(scores.avoidable, scores.ahead_kept)
     if card.constraints is None:
         yield (
-            f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, foreseen from up to {JUDGED} "
-            f"steps before, {1000 * scores.missed:.2g} looked as safe as that."
+            f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, predicted from up to {JUDGED} "
+            f"steps before, {1000 * scores.miscoverage:.2g} looked as safe as that."
         )
         return
     for name, found in card.constraints.items():
@@ -236,7 +238,7 @@ def _of_horizon(avoidable: Avoidable, kept: float) -> str:
     shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
     line = (
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
-        f"{avoidable.rows} ahead (horizon={avoidable.rows}), where foresight reaches that far"
+        f"{avoidable.rows} ahead (horizon={avoidable.rows}), where predictions reach that far"
     )
     if math.isnan(kept):
         return line + "."

@@ -46,9 +46,9 @@ class Dynamics(eqx.Module):
     map: FeatureMap = eqx.field(static=True)
 
     @property
-    def foreseen(self) -> np.ndarray:
+    def predicted(self) -> np.ndarray:
         """(F,) the entries that the network predicts."""
-        return _foreseen(self.map)
+        return _predicted(self.map)
 
     def step(self, before: Array, action: Array) -> tuple[Array, Array]:
         """Features (..., N, D) after actions (..., N, A) in [−1, 1], the mean over members, and how far these are
@@ -98,7 +98,7 @@ class Dynamics(eqx.Module):
         moved = change * self.step_scale + self.step_mean
         if self.map.joint:
             return (before[..., 0, :] + moved[..., 0, :])[..., _of_first(self.map)]
-        after = before.at[..., self.foreseen].add(moved)
+        after = before.at[..., self.predicted].add(moved)
         if self.map.reconcile is None:
             return after
         return self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
@@ -130,7 +130,7 @@ def fit_dynamics(
 
     def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array) -> Array:
         net, guesses = nets
-        moved = (after - before)[:, shown, model.foreseen]
+        moved = (after - before)[:, shown, model.predicted]
         moved = (moved - model.step_mean) / model.step_scale
         read = model.read(before, action)
         wrong = 0.0
@@ -154,10 +154,10 @@ def fit_dynamics(
 
 def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:
     """The model with mean and deviation of states (M, D) and of their changes."""
-    moved = (after - before)[:, model.foreseen]
+    moved = (after - before)[:, model.predicted]
     mean = before.mean(0)
     scale = varying(before.std(0), mean)
-    step_scale = varying(moved.std(0), (np.abs(mean) + scale)[model.foreseen])
+    step_scale = varying(moved.std(0), (np.abs(mean) + scale)[model.predicted])
     statistics = [jnp.asarray(x, jnp.float32) for x in (mean, scale, moved.mean(0), step_scale)]
     return eqx.tree_at(lambda d: (d.mean, d.scale, d.step_mean, d.step_scale), model, statistics)
 
@@ -166,11 +166,11 @@ def blank_dynamics(map: FeatureMap, action: int, members: int, width: int) -> Dy
     """An ensemble of the right shapes that says nothing."""
     net, guesses = _networks(jax.random.key(0), map, action, members, width)
     one = jnp.ones(len(map.names))
-    some = jnp.ones(len(_foreseen(map)))
+    some = jnp.ones(len(_predicted(map)))
     return Dynamics(net, guesses, mean=one, scale=one, step_mean=some, step_scale=some, map=map)
 
 
-def _foreseen(map: FeatureMap) -> np.ndarray:
+def _predicted(map: FeatureMap) -> np.ndarray:
     everything = map.joint or map.own is None
     return np.arange(len(map.names)) if everything else np.array(map.own)
 
@@ -188,7 +188,7 @@ def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) 
     entries = len(map.names)
     read = n * (entries + action) if map.models_others else entries + (n if map.joint else 1) * action
     groups = 1 if map.joint or map.follows else n
-    sizes = (read, width, width, len(_foreseen(map)))
+    sizes = (read, width, width, len(_predicted(map)))
     keys = jax.random.split(key, members)
     nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(keys)
     if not map.models_others:

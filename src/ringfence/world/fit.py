@@ -43,7 +43,16 @@ STATES = 20_000  # steps that a barrier's features are standardised by
 PARTS = {
     "dynamics": ("members", "dynamics_updates", "dynamics_width"),
     "values": ("discount", "value_updates"),
-    "label": ("labels", "loss", "penalty", "foreseen", "distances", "both_ends", "barrier_width", "barrier_updates"),
+    "label": (
+        "labels",
+        "loss",
+        "penalty",
+        "predicted_share",
+        "distances",
+        "both_ends",
+        "barrier_width",
+        "barrier_updates",
+    ),
     "future": ("future_updates", "future_discount", "expectile"),
 }
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}
@@ -102,12 +111,12 @@ def _fitted(
 
     world = blank_world(map, spec, settings)
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
-    worth = _values(logged, moved, world.values, parts, quiet)
+    value = _values(logged, moved, world.values, parts, quiet)
     each = [_barrier(logged.by(name), moved, acts, parts, quiet) for name in labels]
-    danger = None
+    barrier = None
     if each:
-        danger = cbf.Worst(tuple(each), tuple(labels)) if logged.several else each[0]
-    world = World(acts, worth, danger, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
+        barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
+    world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
     found = validate.validate(world, logged, settings.miscoverage, settings.loss)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
@@ -116,17 +125,17 @@ def _fitted(
         data=_data(store, logged.several),
         settings=settings,
         seed=parts.seed,
-        shape=_shape_in_words(danger),
+        shape=_shape_in_words(barrier),
         seconds={name: round(took, 1) for name, took in seconds.items()},
         held_out=found.held_out,
-        foresight=found.foresight,
+        prediction_error=found.prediction_error,
         values=found.values,
-        strange=found.strange,
+        ood=found.ood,
         barrier=found.scores,
         constraints=found.constraints,
     )
-    strange = jnp.asarray(found.strange.threshold, jnp.float32)
-    return dataclasses.replace(world, barrier=found.barrier, strange=strange, card=card)
+    threshold = jnp.asarray(found.ood.threshold, jnp.float32)
+    return dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
 
 
 def _data(store: EpisodeStore, several: bool) -> Data:
@@ -231,7 +240,7 @@ def _label(logged: Logged, acts: dynamics.Dynamics, settings: Settings, key: Key
         key_fit,
         loss=settings.loss,
         penalty=settings.penalty,
-        share=settings.foreseen,
+        share=settings.predicted_share,
         updates=settings.barrier_updates,
         width=settings.barrier_width,
         quiet=quiet,
@@ -252,7 +261,7 @@ def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier
     return eqx.tree_at(lambda b: (b.mean, b.scale, b.step_mean, b.step_scale), barrier, statistics)
 
 
-def _shape_in_words(barrier: cbf.Barrier | cbf.Worst | None) -> str:
+def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
     if barrier is None:
         return "no barrier"
     shape = barrier.shape

@@ -6,7 +6,7 @@ import equinox as eqx
 
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Spec
-from ringfence.world.barrier import Barrier, Worst
+from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import Card
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.values import Values
@@ -18,8 +18,8 @@ class World(eqx.Module):
 
     dynamics: Dynamics
     values: Values
-    barrier: Barrier | Worst | None  # None: the logs have no labels of danger
-    strange: Array  # () ensemble disagreement above which a state is out of distribution: a conformal quantile
+    barrier: Barrier | MinBarrier | None  # None: the logs have no labels of danger
+    ood_threshold: Array  # () ensemble disagreement above which a state is out of distribution: a conformal quantile
     map: FeatureMap = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
     alone: bool = eqx.field(static=True)  # of each agent's own view, for decentralized execution

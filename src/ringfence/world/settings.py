@@ -30,7 +30,7 @@ class Settings:
     barrier: bool = True
     loss: cbf.Loss = "cross-entropy"  # of labels
     penalty: NonNegative = 1.0  # weight of the gradient's, where the loss has one
-    foreseen: Share = 0.5  # share of labelled steps that end where they were predicted to end
+    predicted_share: Share = 0.5  # share of labelled steps that end where they were predicted to end
     distances: bool = True  # pairs read how far apart they are and how fast they close
     both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
     barrier_width: Width = 64  # units of each of 3 hidden layers

@@ -10,14 +10,14 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from safetensors import safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas, stored
 from ringfence.utils.files import regular, whole
-from ringfence.utils.pytrees import load_named, named_arrays
+from ringfence.utils.pytrees import as_tree, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
 from ringfence.world.card import Card
@@ -37,12 +37,12 @@ def blank_world(
 
     def shapes() -> World:
         acts = dynamics.blank_dynamics(map, spec.action_dim, settings.members, settings.dynamics_width)
-        worth = values.blank_values(map, spec.action_dim, settings.discount, alone)
-        danger = blank_barrier(map, settings) if settings.barrier else None
+        value = values.blank_values(map, spec.action_dim, settings.discount, alone)
+        barrier = blank_barrier(map, settings) if settings.barrier else None
         names = tuple(constraints)
-        if danger is not None and names:
-            danger = cbf.Worst((danger,) * len(names), names)
-        return World(acts, worth, danger, jnp.ones(()), map, spec, alone, card or Card())
+        if barrier is not None and names:
+            barrier = cbf.MinBarrier((barrier,) * len(names), names)
+        return World(acts, value, barrier, jnp.ones(()), map, spec, alone, card or Card())
 
     return eqx.filter_eval_shape(shapes)
 
@@ -92,4 +92,5 @@ def _read(path: Path, map_of: MapOf) -> World:
     if map.names != spec.feature_names:
         raise UserError(f"'{path}' is a World of another view; fit it again.")
     names = (card.data.constraints or ()) if settings.labels == "costs" else ()
-    return load_named(path, blank_world(map, spec, settings, names, card))
+    arrays = stored.world_arrays(load_file(path))
+    return as_tree(arrays, blank_world(map, spec, settings, names, card), path)

@@ -12,14 +12,14 @@ import numpy as np
 
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
-from ringfence.world.barrier import Barrier, Worst
+from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (
     JUDGED,
     Avoidable,
     BarrierScores,
-    Foresight,
     HeldOut,
     MarginScores,
+    PredictionError,
     Threshold,
     ValueScores,
 )
@@ -53,37 +53,37 @@ class Validation:
     """What held-out episodes say of a World."""
 
     held_out: HeldOut
-    foresight: Foresight
+    prediction_error: PredictionError
     values: ValueScores
-    strange: Threshold
-    barrier: Barrier | Worst | None  # with the margin that calibration asks for
+    ood: Threshold
+    barrier: Barrier | MinBarrier | None  # with the margin that calibration asks for
     scores: BarrierScores | None
     constraints: dict[str, BarrierScores] | None
 
 
-def validate(world: World, logged: Logged, missed: float, loss: str = "cross-entropy") -> Validation:
-    """`missed` is the share of unsafe steps that may be predicted at the default margin or above."""
+def validate(world: World, logged: Logged, miscoverage: float, loss: str = "cross-entropy") -> Validation:
+    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above."""
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
-    foresight = _foresight(world.dynamics, logged, rng)
+    prediction_error = _prediction_error(world.dynamics, logged, rng)
     explained = _value_scores(world.values, logged, world.alone, rng)
-    strange = _threshold(world.dynamics, logged)
+    ood = _threshold(world.dynamics, logged)
     barrier = world.barrier
     scores = None
     constraints = None
-    if isinstance(barrier, Worst):
+    if isinstance(barrier, MinBarrier):
         each = {}
         constraints = {}
         for name, one in zip(barrier.names, barrier.each):
-            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, missed, LEAST[loss])
+            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss])
             constraints[name] = found
             each[name] = _in_units(one, unit)
-        barrier = Worst(tuple(each.values()), barrier.names)
-        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, missed, 1.0, 1.0)
+        barrier = MinBarrier(tuple(each.values()), barrier.names)
+        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, 1.0)
     elif barrier is not None:
-        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, missed, LEAST[loss])
+        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss])
         barrier = _in_units(barrier, unit)
-    return Validation(held_out, foresight, explained, strange, barrier, scores, constraints)
+    return Validation(held_out, prediction_error, explained, ood, barrier, scores, constraints)
 
 
 def _in_units(barrier: Barrier, unit: float) -> Barrier:
@@ -93,7 +93,7 @@ def _in_units(barrier: Barrier, unit: float) -> Barrier:
 # --- predictions ---
 
 
-def _foresight(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> Foresight:
+def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> PredictionError:
     """Root mean square errors of held-out windows, rolled out along the logged actions."""
     held = logged.held_steps
     left = np.asarray(logged.arrays["last_row"] - logged.arrays["row"])[held]
@@ -106,10 +106,10 @@ def _foresight(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> 
     error = _rms(np.asarray(predicted) - came[:, 1:])
     change = _rms(came[:, 1:] - came[:, :1])
     scale = np.maximum(np.asarray(dynamics.scale), 1e-9)
-    entries = dynamics.foreseen
+    entries = dynamics.predicted
     share = _over_entries(error / scale, entries) / np.maximum(_over_entries(change / scale, entries), 1e-9)
     shown = sorted({0, min(2, ahead - 1), ahead - 1})
-    return Foresight(
+    return PredictionError(
         steps_ahead=tuple(range(1, ahead + 1)),
         error_of_change=tuple(round(float(v), 4) for v in share),
         by_entry={name: tuple(float(f"{error[k, d]:.3g}") for k in shown) for d, name in enumerate(logged.map.names)},
@@ -196,10 +196,10 @@ def _r2(truth: np.ndarray, found: np.ndarray) -> float:
 
 def _barrier_scores(
     dynamics: Dynamics,
-    barrier: Barrier | Worst,
+    barrier: Barrier | MinBarrier,
     logged: Logged,
     rng: np.random.Generator,
-    missed: float,
+    miscoverage: float,
     least: float,
     unit: float | None = None,
 ) -> tuple[BarrierScores, float]:
@@ -217,10 +217,10 @@ def _barrier_scores(
     truth = unsafe[steps]
     ends = _entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
-    foreseen = _foreseen(dynamics, barrier, logged, ends)
-    missed = max(missed, OUTLIERS / len(foreseen))
+    predicted = _predicted_scores(dynamics, barrier, logged, ends)
+    miscoverage = max(miscoverage, OUTLIERS / len(predicted))
     if unit is None:
-        unit = max(least, conformal(foreseen, 1 - missed))
+        unit = max(least, conformal(predicted, 1 - miscoverage))
     share = float(unsafe[held].mean())
     alarm = np.quantile(now[~truth], FALSE_ALARMS)
     scores = BarrierScores(
@@ -230,17 +230,17 @@ def _barrier_scores(
         false_alarms=FALSE_ALARMS,
         false_safe=float((now[truth] >= 0).mean()),
         false_unsafe=float((now[~truth] < 0).mean()),
-        foreseen_false_safe=float((foreseen >= 0).mean()),
+        predicted_false_safe=float((predicted >= 0).mean()),
         margin=float(unit),
-        missed=missed,
-        calibration=tuple(_of_margin(m, now, truth, foreseen, share) for m in sorted(MARGINS | {round(unit, 2)})),
+        miscoverage=miscoverage,
+        calibration=tuple(_of_margin(m, now, truth, predicted, share) for m in sorted(MARGINS | {round(unit, 2)})),
         ahead_kept=float((ahead[~truth] >= unit).mean()),
         avoidable=_avoidable(dynamics, barrier, logged.arrays, ends[:ENTERED]),
     )
     return scores, unit
 
 
-def _scored(barrier: Barrier | Worst, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """ℓ of steps and V of where they lead, each (W,), of the agent in most danger."""
     x = logged.arrays["features"]
     now = []
@@ -254,12 +254,12 @@ def _scored(barrier: Barrier | Worst, logged: Logged, steps: np.ndarray) -> tupl
 
 
 @jax.jit
-def _score(barrier: Barrier | Worst, before: Array, after: Array) -> Array:
+def _score(barrier: Barrier | MinBarrier, before: Array, after: Array) -> Array:
     return lowest(barrier.of_steps(before, after))
 
 
 @jax.jit
-def _score_ahead(barrier: Barrier | Worst, after: Array) -> Array:
+def _score_ahead(barrier: Barrier | MinBarrier, after: Array) -> Array:
     return lowest(barrier.ahead(after))
 
 
@@ -271,7 +271,9 @@ def _entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
     return entered if len(entered) >= ENTRIES else bad
 
 
-def _foreseen(dynamics: Dynamics, barrier: Barrier | Worst, logged: Logged, ends: np.ndarray) -> np.ndarray:
+def _predicted_scores(
+    dynamics: Dynamics, barrier: Barrier | MinBarrier, logged: Logged, ends: np.ndarray
+) -> np.ndarray:
     """Scores of steps that entered danger, as they are predicted from up to `JUDGED` steps before."""
     row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
     found = []
@@ -286,7 +288,7 @@ def _foreseen(dynamics: Dynamics, barrier: Barrier | Worst, logged: Logged, ends
     return np.concatenate(found)
 
 
-def _of_margin(margin: float, now: np.ndarray, unsafe: np.ndarray, foreseen: np.ndarray, share: float) -> MarginScores:
+def _of_margin(margin: float, now: np.ndarray, unsafe: np.ndarray, predicted: np.ndarray, share: float) -> MarginScores:
     """Of held-out steps with that margin: how many of 1000 are unsafe, weighed by how frequent the classes are."""
     passed = float((now[~unsafe] >= margin).mean())
     missed = float((now[unsafe] >= margin).mean())
@@ -294,7 +296,7 @@ def _of_margin(margin: float, now: np.ndarray, unsafe: np.ndarray, foreseen: np.
     return MarginScores(
         margin=float(margin),
         unsafe_in_1000=float(1000 * share * missed / both) if both else 0.0,
-        unsafe_foreseen_above=float((foreseen >= margin).mean()),
+        unsafe_predicted_above=float((predicted >= margin).mean()),
         safe_kept=passed,
     )
 
@@ -311,7 +313,7 @@ def _auroc(score: np.ndarray, unsafe: np.ndarray) -> float:
 
 
 def _avoidable(
-    dynamics: Dynamics, barrier: Barrier | Worst, arrays: dict[str, Array], entered: np.ndarray
+    dynamics: Dynamics, barrier: Barrier | MinBarrier, arrays: dict[str, Array], entered: np.ndarray
 ) -> Avoidable:
     """How many of the steps that entered danger other actions could have avoided from so many steps before, and any
     danger within the longest such time, as the World predicts it."""
@@ -329,7 +331,7 @@ def _avoidable(
 
 
 @jax.jit
-def _avoided(dynamics: Dynamics, barrier: Barrier | Worst, x: Array, actions: Array) -> Array:
+def _avoided(dynamics: Dynamics, barrier: Barrier | MinBarrier, x: Array, actions: Array) -> Array:
     """(W,) bool: whether some actions near the logged ones (K, W, N, A) keep all scores at 0 or more, from states
     (W, N, D)."""
 

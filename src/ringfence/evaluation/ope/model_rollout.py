@@ -131,7 +131,7 @@ def _play(
         earned = world.values.of_steps(x, action, after)
         earned = earned if earned.ndim == 1 else earned.mean(-1)
         unsafe = _unsafe(barrier, x[:, None], after[:, None], spread[:, None])[:, 0]
-        return (memory, after), (earned, unsafe, (spread > world.strange).any(-1))
+        return (memory, after), (earned, unsafe, (spread > world.ood_threshold).any(-1))
 
     _, kept = jax.lax.scan(step, (policy.start(len(starts)), starts), jax.random.split(key, steps))
     return kept

@@ -29,7 +29,7 @@ class Responses:
     plan: np.ndarray  # (M, K, N, A) that it means to take along what the World predicts
     changed: np.ndarray | None = None  # (M,) bool: the guard changed the action
     infeasible: np.ndarray | None = None  # (M,) bool
-    strange: np.ndarray | None = None  # (M,) bool: the guard's World knows nothing there
+    ood: np.ndarray | None = None  # (M,) bool: the guard's World knows nothing there
 
 
 class Respondent:
@@ -65,7 +65,7 @@ def _respond(policy: Any, world: World, seen: Array, state: Array | None, key: K
     act_key, plan_key = jax.random.split(key)
     memory, step = policy.act(policy.start(len(seen)), seen, state, act_key)
     action = normalise.to_unit(step.action, spec.action_low, spec.action_high)
-    found = {"action": action} | {k: step.info[k] for k in ("infeasible", "strange") if k in step.info}
+    found = {"action": action} | {k: step.info[k] for k in ("infeasible", "ood") if k in step.info}
     if isinstance(policy, Guarded):
         _, wanted, _ = policy.proposed(policy.start(len(seen))["inner"], seen, state, act_key)
         difference = jnp.abs(wanted - action[:, None, None])[:, :, 0].max((-2, -1))
@@ -96,8 +96,8 @@ def behaviour(logs: Logs, steps: np.ndarray, responses: Responses, world: World)
     return Behaviour(
         intervention_rate=_share(responses.changed),
         infeasible_rate=_share(responses.infeasible),
-        guard_ood_rate=_share(responses.strange),
-        ood_rate=float((apart > float(world.strange)).mean()),
+        guard_ood_rate=_share(responses.ood),
+        ood_rate=float((apart > float(world.ood_threshold)).mean()),
         action_rmse=float(rmse / max(float(logged.std()), 1e-6)),
     )
 

@@ -36,7 +36,7 @@ def safety(logs: Logs, steps: np.ndarray, responses: Responses, world: World, ah
         predicted_violation_rate_of_logs=float((of_logs < 0).mean()),
         margin_violation_rate=float((of_policy < 1).mean()),
         margin_violation_rate_of_logs=float((of_logs < 1).mean()),
-        miscoverage=None if scores is None or scores.warning else scores.missed,
+        miscoverage=None if scores is None or scores.warning else scores.miscoverage,
         margin_violation_episodes=violated / asked,
         margin_violation_episodes_upper=statistics.upper_bound(violated, asked),
         margins=_quantiles(of_policy),
