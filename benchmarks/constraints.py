@@ -48,9 +48,9 @@ def stores() -> tuple[EpisodeStore, EpisodeStore]:
     by_step = lambda x: x.reshape(e, yard.STEPS, *x.shape[1:])  # noqa: E731
     made = [rows, *(by_step(x) for x in (store.actions, store.rewards))]
     costs = {"contact": by_step(store.costs), "fast": fast(rows[:, 1:])}
-    card = {**store.card, "constraints": LIMITS}
+    card = store.card.updated(constraints=LIMITS)
     named = EpisodeStore.from_episodes(*made, costs, card=card)
-    one = {**store.card, "cost_limit": LIMITS["fast"]}
+    one = store.card.updated(cost_limit=LIMITS["fast"])
     return dataclasses.replace(named, constraints=None, card=one), named
 
 

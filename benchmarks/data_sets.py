@@ -35,8 +35,8 @@ def row(name: str) -> dict:
         "unsafe": round(float((costs > 0).mean()), 4),  # share of episodes with any cost
         "terminated": round(float(store.episode_terminated.mean()), 4),
         "disagreement": round(disagreement(store, task), 4),  # share of steps whose cost is not what the hazard says
-        "speed_limit": store.card.get("speed_limit", ""),
-        "return_ceiling": round(store.card["return_ceiling"], 1) if "return_ceiling" in store.card else "",
+        "speed_limit": store.card.extra.get("speed_limit", ""),
+        "return_ceiling": round(store.card.extra["return_ceiling"], 1) if "return_ceiling" in store.card.extra else "",
     }
 
 

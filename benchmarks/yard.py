@@ -63,7 +63,7 @@ def main() -> None:
     store = yard.record()
     # The formula is what a guard may be asked for beside; what is learned is learned of the costs.
     hazard = Separation(2 * yard.RADIUS)
-    logs_of_both = dataclasses.replace(store, card={**store.card, "hazard": to_dict(hazard)})
+    logs_of_both = dataclasses.replace(store, card=store.card.updated(hazard=to_dict(hazard)))
     world = ringfence.fit(logs_of_both, quiet=False)
     run = ringfence.train("bc", logs_of_both, out=ROOT / "runs")[0]
     there = {tuple(r.values())[:4]: list(r.values()) for r in stored.table(OUT)} if OUT.exists() else {}

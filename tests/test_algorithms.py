@@ -330,7 +330,7 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
         loop.train("icbf", more, out=run.path.parents[2], **job_of("icbf"))
     with pytest.raises(UserError, match="width=100 must be a multiple of 16"):
         loop.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100})
-    blank = {"card": {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}}}
+    blank = {"card": small_store.card.updated(task="mine", hazard={"kind": "CostColumn"})}
     blank = dataclasses.replace(small_store, costs=0 * small_store.costs, **blank)
     for name in ("icbf", "fisor", "bc-safe", "ma-td3bc-lag"):
         with pytest.raises(UserError, match=f"{name} is told no danger"):
@@ -565,7 +565,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
     from ringfence.cli import app
 
     monkeypatch.setattr(app, "out", Console(width=300))
-    own = dataclasses.replace(small_store, card={**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}})
+    own = dataclasses.replace(small_store, card=small_store.card.updated(task="mine", hazard={"kind": "CostColumn"}))
     dark = loop.train("bc", own, out=tmp_path, changes={**TINY["bc"], "steps": 2}, quiet=True)[0]
     with pytest.raises(SystemExit) as stop:
         app.main(["eval", str(dark.path), str(trained["bc"].path), "--episodes", "2"])
@@ -629,8 +629,7 @@ def test_who_labels_no_states_trains_where_its_view_lacks_the_formula(played, ab
 def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     """What an agent has not is the middle of the bounds, whoever learned it."""
     store = absolute(played["costs"])
-    store.card["action_sizes"] = [2, 1, 2]
-    store = dataclasses.replace(store)
+    store = dataclasses.replace(store, card=store.card.updated(action_sizes=[2, 1, 2]))
     told = {k: v for k, v in TINY[name].items() if k != "steps"} | {"view": "centralized"}
     job = make_job(name, registry.from_store(store), None, told, store)
     assert (
@@ -642,15 +641,15 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     seen, whole = store.observations[:4], store.state[:4]
     action = np.asarray(policy.act(policy.start(4), seen, whole, jax.random.key(0))[1].action)
     assert (action[:, 1, 1] == 0).all() and (np.abs(action[:, [0, 2]]) > 0).all() and (action[:, 1, 0] != 0).all()
-    store.card["action_sizes"] = [2, 3, 2]
+    wide = store.card.updated(action_sizes=[2, 3, 2])
     with pytest.raises(UserError, match=r"action_sizes=\[2, 3, 2\]; it must say for each of the 3 agents .* 1 to 2"):
-        dataclasses.replace(store)
+        dataclasses.replace(store, card=wide)
 
 
 def test_the_cards_cost_limit_is_what_learners_keep(absolute, played):
     """Of own data; a setting overrides it, and those who keep no limit are as they were."""
     store = absolute(played["costs"])
-    told = dataclasses.replace(store, card={**store.card, "cost_limit": 7.0})
+    told = dataclasses.replace(store, card=store.card.updated(cost_limit=7.0))
     for name, field, usual in (("bc-safe", "cost_limit", 0.0), ("ma-td3bc-lag", "limit", 1.0)):
         kept = [
             getattr(make_job(name, registry.from_store(s), None, changes, s).config, field)
@@ -658,7 +657,7 @@ def test_the_cards_cost_limit_is_what_learners_keep(absolute, played):
         ]
         assert kept == [usual, 7.0, 3.0]
     assert make_job("bc", registry.from_store(told), None, {}, told).config.cost_limit is None
-    none = dataclasses.replace(store, card={**store.card, "cost_limit": 0.0})
+    none = dataclasses.replace(store, card=store.card.updated(cost_limit=0.0))
     with pytest.raises(UserError, match=r"limit=0.0 must be positive; .* the data's card \(cost_limit\) unless"):
         make_job("ma-td3bc-lag", registry.from_store(none), None, {}, none)
 

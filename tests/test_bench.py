@@ -481,7 +481,7 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     configs = [Run(c.folder(g.out)).config for c in g.cells]
     assert [t["task"] for t in configs] == names and configs[0]["hazard"]["limit"] > configs[1]["hazard"]["limit"]
     shutil.rmtree(other.folder(g.out))
-    card = grid.data_of(other.task, 1000).card
+    card = grid.data_of(other.task, 1000).card.to_dict()
     assert grid.adopt(other, g.out, card | {"simulator": "another"}) is None  # what other steps taught
     config = native.folder(g.out) / "config.json"
     now = config.read_text()

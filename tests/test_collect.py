@@ -72,7 +72,7 @@ def test_what_is_shown_is_what_is_kept():
             np.testing.assert_array_equal(store.costs[steps][t], [infos[a]["cost"] for a in "ab"])
         assert store.episode_terminated[k] == over["a"] and not env.agents
     assert set(store.lengths) <= {3, 4, 5, 6} and len(set(store.lengths)) > 1 and store.costs.ndim == 2
-    assert (store.card["action_low"], store.card["action_high"]) == (-2, 2) and store.card["agents"] == ["a", "b"]
+    assert (store.card.action_low, store.card.action_high) == (-2, 2) and store.card.agents == ["a", "b"]
     team = ringfence.collect(Drift, lean, episodes=3, cost=lambda infos: 0.5)
     assert team.costs.ndim == 1 and (team.costs == 0.5).all()
 

@@ -80,7 +80,7 @@ def fitted(logs):
 
 def test_costs_by_name_are_kept_through_everything(logs, tmp_path):
     assert logs.constraints.shape == (250 * STEPS, 2, 2) and logs.limits == LIMITS
-    assert (logs.costs == logs.constraints.max(-1)).all() and logs.card["cost_limit"] == 10
+    assert (logs.costs == logs.constraints.max(-1)).all() and logs.card.cost_limit == 10
     x, v = np.moveaxis(logs.observations.reshape(250, STEPS + 1, 2, 2)[:, 1:], -1, 0)
     np.testing.assert_array_equal(logs.of_constraint("wall").reshape(x.shape), np.abs(x) > 1)
     np.testing.assert_array_equal(logs.of_constraint("fast").reshape(x.shape), np.abs(v) > np.float32(0.6))
@@ -121,7 +121,7 @@ def test_costs_by_name_that_do_not_fit_are_refused(logs):
     with pytest.raises(StoreError, match="costs is not the largest of the constraints"):
         dataclasses.replace(logs, costs=0 * logs.costs)
     with pytest.raises(StoreError, match="name other constraints"):
-        logs.followed_by(dataclasses.replace(logs, constraints=None, card={**logs.card, "constraints": None}))
+        logs.followed_by(dataclasses.replace(logs, constraints=None, card=logs.card.updated(constraints=None)))
     quiet = np.array(logs.constraints)
     quiet[..., 1] = 0
     blank = dataclasses.replace(logs, constraints=quiet, costs=quiet.max(-1))
@@ -177,7 +177,7 @@ def test_margins_follow_the_constraint_that_was_paid(fitted, logs):
 def test_learners_keep_every_limit(logs):
     from ringfence.algos import bc
 
-    kept = bc.within(logs, bc.Config(cost_limit=logs.card["cost_limit"]))
+    kept = bc.within(logs, bc.Config(cost_limit=logs.card.cost_limit))
     assert 0 < kept.episodes < (logs.episode_costs <= 10).sum()
     assert (kept.episode_costs_of("wall") == 0).all() and (kept.episode_costs_of("fast") <= 10).all()
 

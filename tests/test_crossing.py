@@ -156,7 +156,7 @@ def test_a_unicycle_is_steered_as_a_disc_is_pushed():
 
 def test_unicycles_drive_to_their_goals_in_logs_of_their_own():
     store = make(registry.get("crossing_unicycle-hasty"), 2000)[0]
-    assert store.card["observation_names"][2:4] == ["own.cos", "own.sin"] and store.returns.min() > 0.5
+    assert store.card.observation_names[2:4] == ["own.cos", "own.sin"] and store.returns.min() > 0.5
     with pytest.raises(UserError, match="obstacles or walls"):
         task = registry.get("crossing_unicycle-hasty")
         make(dataclasses.replace(task, env=Crossing(walls=True)), 2000)
@@ -168,7 +168,7 @@ def logs():
 
 
 def test_logs_tell_whom_they_cost(logs):
-    assert logs.costs.shape == (2000, 8) and logs.card["observation_names"][0] == "own.vx"
+    assert logs.costs.shape == (2000, 8) and logs.card.observation_names[0] == "own.vx"
     same = make(registry.get("crossing-hasty"), 2000, fresh=True)[0]
     assert same.content == logs.content
     starts = unsafe_starts(registry.get("crossing-hasty"), logs.state[::101])
@@ -251,7 +251,8 @@ def test_rooms_that_cannot_be_are_refused(room, said):
 
 def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     """The card says so, and what was learned of eight plays five."""
-    card = {k: logs.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "homogeneous": True}
+    names = logs.card.observation_names
+    card = {"observation_names": names, "hazard": logs.card.hazard, "task": "fleet", "homogeneous": True}
     mine = dataclasses.replace(logs, state=None, card=card)
     run = loop.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(mine, **QUICK_WORLD)

@@ -176,14 +176,15 @@ def test_a_followed_plan_is_remembered(planner, small_store, tmp_path):
 
 def test_agents_who_are_alike(own_store, tmp_path):
     """Learned of three of them, without states; a file is of as many as are asked for."""
-    card = {k: own_store.card[k] for k in ("observation_names", "hazard")} | {"task": "fleet", "homogeneous": True}
+    names = own_store.card.observation_names
+    card = {"observation_names": names, "hazard": own_store.card.hazard, "task": "fleet", "homogeneous": True}
     costs = np.repeat(own_store.costs[:, None], 3, 1)
     store = dataclasses.replace(own_store, costs=costs, card=card)
     run = loop.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
     call, told = of_stablehlo(exporting.export(run, tmp_path / "5", "stablehlo", agents=5))
     assert told["inputs"] == [{"name": "observations", "shape": [5, 14], "dtype": "float32"}] and told["n_agents"] == 5
     assert (
-        told["names"] == {"observations": list(own_store.card["observation_names"])}
+        told["names"] == {"observations": list(own_store.card.observation_names)}
         and told["execution"] == "decentralized"
     )
     seen = own_store.observations[:5, 0]
@@ -296,7 +297,7 @@ def test_metadata_is_json_where_nothing_was_told_yet(played, small_store, tmp_pa
         pytest.fail(f"JSON has no {word}")
 
     costs = {"near": played["costs"], "far": 1.0 - played["costs"]}
-    card = {**small_store.card, "constraints": {"near": 1.0, "far": 20.0}}
+    card = small_store.card.updated(constraints={"near": 1.0, "far": 20.0})
     state = {"state": played["state"]}
     named = [played[name] for name in ("observations", "actions", "rewards")]
     store = EpisodeStore.from_episodes(*named, costs, card=card, **state)

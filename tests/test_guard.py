@@ -257,7 +257,7 @@ def test_any_callable_is_guarded(small_world, small_store):
 def test_a_world_of_other_data_is_refused(small_store, tmp_path):
     tiny = dict(changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)
     run = loop.train("bc", small_store, **tiny)[0]
-    card = {**small_store.card, "task": "other"}
+    card = small_store.card.updated(task="other")
     other = worlds.fit(dataclasses.replace(small_store, card=card), **QUICK_WORLD)
     with pytest.raises(UserError, match="The World is of 'other', the run .* of other data"):
         load(run, guard="shield", world=other)

@@ -73,9 +73,9 @@ def test_dsrl_equals_what_was_written(tmp_path, dtype):
     np.testing.assert_array_equal(store.costs, data["costs"].astype(np.float32))
     np.testing.assert_array_equal(store.terminated, data["terminals"])
     np.testing.assert_array_equal(store.truncated, data["timeouts"])
-    assert store.card["task"] == "OfflinePoint-v0-20-4" and store.card["cost_limit"] == 25
-    assert store.card["warnings"] == [] and "DSRL" in store.card["provenance"]
-    assert (store.card["action_low"], store.card["action_high"]) == (-1, 1)
+    assert store.card.task == "OfflinePoint-v0-20-4" and store.card.cost_limit == 25
+    assert store.card.warnings == [] and "DSRL" in store.card.provenance
+    assert (store.card.action_low, store.card.action_high) == (-1, 1)
     assert {x.dtype for x in (store.observations, store.actions, store.rewards, store.costs)} == {np.dtype("f4")}
 
 
@@ -95,7 +95,7 @@ def test_an_unfinished_end_is_dropped_and_terminals_win(tmp_path):
     data["observations"][-1] = np.nan  # of no account
     store = import_hdf5(write(tmp_path / "d.hdf5", data | {"terminals": data["terminals"].astype(np.float32)}))
     assert store.lengths.tolist() == [5, 3, 7] and store.terminated.nonzero()[0].tolist() == [4, 14]
-    assert store.card["warnings"] == [
+    assert store.card.warnings == [
         "the last 2 rows are an unfinished episode and were dropped",
         "1 steps are marked as terminals and as timeouts, too, and count as terminals",
     ]
@@ -110,8 +110,8 @@ def test_d4rl_with_next_observations_has_no_costs(tmp_path):
     store = import_hdf5(tmp_path / "walker2d_medium-v2.hdf5")
     np.testing.assert_array_equal(store.observations[:, 0], as_rows(data))
     np.testing.assert_array_equal(store.terminated, data["terminals"])
-    assert not store.costs.any() and store.card["task"] == "walker2d_medium-v2"
-    notes = store.card["warnings"]
+    assert not store.costs.any() and store.card.task == "walker2d_medium-v2"
+    notes = store.card.warnings
     assert notes[0] == "not read: init_qpos" and "infos/cost is not read" in notes[1] and "no costs are" in notes[2]
 
 
@@ -124,7 +124,7 @@ def test_d4rl_without_them_gives_up_the_last_steps(tmp_path):
     np.testing.assert_array_equal(store.actions[:, 0], data["actions"][inside])
     np.testing.assert_array_equal(store.rewards[:, 0], data["rewards"][inside])
     assert not store.terminated.any() and store.truncated.sum() == 3
-    assert store.card["warnings"][0] == (
+    assert store.card.warnings[0] == (
         "next_observations is missing, so the last step of every episode was given up, its observation being the end; "
         "where 2 terminations led is not known, so those episodes count as truncated; 1 episodes of one step are gone"
     )
@@ -134,7 +134,7 @@ def test_steps_that_do_not_lead_to_the_next_row_are_noted_or_refused(tmp_path):
     data = recorded(lengths=(40, 40))
     data["next_observations"][7, 1] += 0.5
     store = import_hdf5(write(tmp_path / "d.hdf5", data))
-    assert "1 steps inside episodes, row 7 first" in store.card["warnings"][0]
+    assert "1 steps inside episodes, row 7 first" in store.card.warnings[0]
     np.testing.assert_array_equal(store.observations[8, 0], data["observations"][8])
     order = np.random.default_rng(0).permutation(80)
     shuffled = {name: x[order] for name, x in data.items()}
@@ -159,9 +159,9 @@ def test_a_map_shares_the_columns_out(tmp_path, how):
     np.testing.assert_array_equal(store.actions[:, 1], np.concatenate([data["actions"][:, [1]], zero[:17]], 1))
     np.testing.assert_array_equal(store.rewards, np.repeat(data["rewards"][:, None], 2, 1))
     assert store.costs.shape == (17,)
-    assert store.card["agents"] == ["a", "b"] and store.card["columns"] == PAIR
-    assert store.card["action_sizes"] == [2, 1]
-    assert store.card["warnings"] == [
+    assert store.card.agents == ["a", "b"] and store.card.extra["columns"] == PAIR
+    assert store.card.action_sizes == [2, 1]
+    assert store.card.warnings == [
         "agents of different sizes are filled up at the end: 'b' has 2 of 3 observation entries, 'b' has 1 of 2 "
         "action entries"
     ]
@@ -171,7 +171,7 @@ def test_what_is_filled_up_lies_within_the_bounds(tmp_path):
     data = recorded()
     data["actions"] = data["actions"] + 2.5
     store = import_hdf5(write(tmp_path / "d.hdf5", data), agents=PAIR, action_low=1.5, action_high=3.5)
-    assert (store.actions[:, 1, 1] == 2.5).all() and (store.card["action_low"], store.card["action_high"]) == (1.5, 3.5)
+    assert (store.actions[:, 1, 1] == 2.5).all() and (store.card.action_low, store.card.action_high) == (1.5, 3.5)
 
 
 def one(**changes):
@@ -329,10 +329,10 @@ def test_a_file_that_claims_a_thousand_times_its_size_is_not_unpacked(tmp_path):
 
 
 def test_a_name_of_ours_does_not_tie_foreign_data_to_a_simulator(tmp_path):
-    assert import_hdf5(write(tmp_path / "simple_spread-expert.hdf5", recorded())).card["task"] == (
+    assert import_hdf5(write(tmp_path / "simple_spread-expert.hdf5", recorded())).card.task == (
         "simple_spread-expert-imported"
     )
-    assert import_hdf5(write(tmp_path / "-x.hdf5", recorded())).card["task"] == "imported"
+    assert import_hdf5(write(tmp_path / "-x.hdf5", recorded())).card.task == "imported"
 
 
 # --- Minari ---
@@ -403,21 +403,21 @@ def test_minari_equals_what_its_library_reads(collected):
     assert 0 < store.costs.mean() < 1 and 0 < store.terminated.sum() < 6
     beyond = np.abs(store.observations[:, 0]).max(1) > 1  # the cost is of the state that the step led to
     np.testing.assert_array_equal(store.costs, np.delete(beyond, np.cumsum([0, *(store.lengths + 1)[:-1]])))
-    assert store.card["task"] == "drift-walk-v0" and store.card["warnings"] == []
-    assert (store.card["action_low"], store.card["action_high"]) == (-2, 2)
-    assert store.card["observation_names"] is None and "Minari" in store.card["provenance"]
+    assert store.card.task == "drift-walk-v0" and store.card.warnings == []
+    assert (store.card.action_low, store.card.action_high) == (-2, 2)
+    assert store.card.observation_names is None and "Minari" in store.card.provenance
 
 
 def test_minari_observations_in_groups_are_joined_by_name(collected):
     folder, episodes = collected(several=True, record_infos=False)
     store = import_hdf5(folder, agents={"only": {"observation": [2, 0, 1], "action": [1, 0]}})
-    assert store.card["observation_names"] == ["place.1", "goal", "place.0"]
+    assert store.card.observation_names == ["place.1", "goal", "place.0"]
     seen = np.concatenate([np.column_stack([e.observations["place"], e.observations["goal"]]) for e in episodes])
     np.testing.assert_array_equal(store.observations[:, 0], seen[:, [1, 2, 0]].astype(np.float32))
     np.testing.assert_array_equal(store.actions[:, 0], np.concatenate([e.actions for e in episodes])[:, ::-1])
-    assert not store.costs.any() and "no costs are recorded" in store.card["warnings"][0]
+    assert not store.costs.any() and "no costs are recorded" in store.card.warnings[0]
     two = {"x": {"observation": [1], "action": [0]}, "y": {"observation": [2], "action": [1]}}
-    assert import_hdf5(folder, agents=two).card["observation_names"] is None
+    assert import_hdf5(folder, agents=two).card.observation_names is None
 
 
 def test_minari_buffers_of_eleven_parts_and_other_spaces(tmp_path, monkeypatch):
@@ -443,10 +443,10 @@ def test_minari_buffers_of_eleven_parts_and_other_spaces(tmp_path, monkeypatch):
     np.testing.assert_array_equal(store.observations[:, 0, :11], np.concatenate(parts[:11], 1))
     np.testing.assert_array_equal(store.observations[:, 0, 11:], parts[11].reshape(5, 6).astype(np.float32))
     assert store.costs.tolist() == [0, 1, 0, 2]  # one of every step, none of the reset
-    assert store.card["observation_names"][9:13] == ["_index_9", "_index_10", "_index_11.0", "_index_11.1"]
-    assert (store.card["action_low"], store.card["action_high"]) == (-1, 3)
+    assert store.card.observation_names[9:13] == ["_index_9", "_index_10", "_index_11.0", "_index_11.1"]
+    assert (store.card.action_low, store.card.action_high) == (-1, 3)
     assert store.truncated.tolist() == [False, False, False, True]
-    assert [note.split(" and ")[0] for note in store.card["warnings"]] == [
+    assert [note.split(" and ")[0] for note in store.card.warnings] == [
         "entries of the action space have bounds of their own; the card holds the widest for all of them",
         "1 episodes end without a mark",
     ]
@@ -511,11 +511,11 @@ def test_minari_without_metadata_or_with_bounds_of_the_callers(collected):
     folder, _ = collected()
     file = folder / "data" / "main_data.hdf5"
     space(folder / "data", {"action_space": '{"type": "Box"}'})
-    assert import_hdf5(file, action_low=-3, action_high=4).card["action_high"] == 4
+    assert import_hdf5(file, action_low=-3, action_high=4).card.action_high == 4
     (folder / "data" / "metadata.json").unlink()
     with pytest.raises(StoreError, match=r"outside \[-1, 1\]; pass action_low and action_high"):
         import_hdf5(file)
-    assert import_hdf5(file, action_low=-2, action_high=2).card["task"] == "main_data"
+    assert import_hdf5(file, action_low=-2, action_high=2).card.task == "main_data"
 
 
 def test_minari_data_that_is_not_here_is_named(tmp_path, monkeypatch):
@@ -538,7 +538,7 @@ def test_an_imported_store_is_described_and_trained(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "3, 2 per agent" in said and "DSRL" in said and "note agents of different sizes" in said
     store = EpisodeStore.load(out)
-    assert store.card["cost_limit"] == 5 and store.card["columns"] == PAIR
+    assert store.card.cost_limit == 5 and store.card.extra["columns"] == PAIR
     run = loop.train("bc", store, out=tmp_path / "runs", changes={"steps": 4, "width": 16}, quiet=True)[0]
     assert run.metrics[-1]["step"] == 4 and np.isfinite(list(run.metrics[-1].values())).all()
 

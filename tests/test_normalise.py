@@ -28,7 +28,7 @@ def test_bounds_of_actions_change_no_lesson(small_store):
     plain = WindowData(small_store, view).arrays["actions"]
     np.testing.assert_array_equal(plain, small_store.actions)
     np.testing.assert_array_equal(normalise.from_unit(plain, -1.0, 1.0), plain)
-    card = small_store.card | {"action_low": 2.0, "action_high": 8.0}
+    card = small_store.card.updated(action_low=2.0, action_high=8.0)
     told = normalise.from_unit(small_store.actions, 2.0, 8.0)
     assert 2.0 <= told.min() < 2.1 and 7.9 < told.max() <= 8.0
     other = WindowData(replace(small_store, actions=told, card=card), view).arrays["actions"]

@@ -135,15 +135,15 @@ def test_a_vault_becomes_the_simulators_own_data(tmp_path, task):
     assert log["costs"].sum() >= 3 and (store.costs == log["costs"]).mean() > 0.95
     assert store.terminated[store.episode_ends - 1].tolist() == log["fallen"].tolist()
     assert store.terminated.sum() == log["fallen"].sum() == env.ant
-    assert store.card["task"] == f"{task}-good"
-    told = " ".join(store.card["warnings"])
+    assert store.card.task == f"{task}-good"
+    told = " ".join(store.card.warnings)
     assert ("actions are as recorded" if env.ant else "actions are reversed") in told
     assert ("1 of 3 episodes end with a fall" in told) == env.ant
     again = EpisodeStore.load(store.save(tmp_path / "store.h5"))
     assert again.hazard.limit == env.limit
     facts, _, notes = audit(again)
-    assert "(native); at most 25 steps" in facts["speed limit"] and notes == store.card["warnings"]
-    assert facts["return ceiling"].startswith(f"{store.card['return_ceiling']:.0f} within the limit")
+    assert "(native); at most 25 steps" in facts["speed limit"] and notes == store.card.warnings
+    assert facts["return ceiling"].startswith(f"{store.card.extra['return_ceiling']:.0f} within the limit")
 
 
 def test_a_recording_can_be_read_under_another_limit(tmp_path):
@@ -151,15 +151,17 @@ def test_a_recording_can_be_read_under_another_limit(tmp_path):
     vault = write_vault(tmp_path, log)
     store = import_vault(vault, "halfcheetah_2x3", "quantile")
     assert registry.from_store(store) == registry.get("halfcheetah_2x3-good-quantile") and store.hazard.limit == 7.903
-    assert store.card["protocol"] == "quantile" and not store.costs.any()
+    assert store.card.extra["protocol"] == "quantile" and not store.costs.any()
     slow = import_vault(vault, "halfcheetah_2x3", 0.5)
     np.testing.assert_array_equal(slow.costs, log["speed"] > 0.5)
     task = registry.from_store(slow)
-    assert task.name == "halfcheetah_2x3-good-below-0.5" and task.env.limit == 0.5 and slow.card["protocol"] == "own"
+    assert (
+        task.name == "halfcheetah_2x3-good-below-0.5" and task.env.limit == 0.5 and slow.card.extra["protocol"] == "own"
+    )
     with pytest.raises(UserError, match="no quantile limit for 'halfcheetah_2x3-imported'; name the tier with --tier"):
         import_vault(vault.rename(tmp_path / "mine"), "halfcheetah_2x3", "quantile")
     again = import_vault(tmp_path / "mine", "halfcheetah_2x3", "quantile", tier="Good")
-    assert again.card["task"] == store.card["task"]
+    assert again.card.task == store.card.task
 
 
 def test_falls_that_were_not_paid_keep_their_speed(tmp_path):
@@ -171,14 +173,14 @@ def test_falls_that_were_not_paid_keep_their_speed(tmp_path):
     first = import_vault(write_vault(tmp_path / "a", log), "ant_4x2", 0.5)
     store = import_vault(write_vault(tmp_path / "b", v5), "ant_4x2", 0.5)
     np.testing.assert_array_equal(store.costs, first.costs)
-    assert "1 falls were not paid the 1 for standing" in " ".join(store.card["warnings"])
-    assert "not paid" not in " ".join(first.card["warnings"])
-    assert "multiagent_mujoco" in first.card["simulator"] and "gymnasium-robotics" in store.card["simulator"]
+    assert "1 falls were not paid the 1 for standing" in " ".join(store.card.warnings)
+    assert "not paid" not in " ".join(first.card.warnings)
+    assert "multiagent_mujoco" in first.card.simulator and "gymnasium-robotics" in store.card.simulator
 
 
 def test_data_that_is_not_what_its_name_says_is_refused(tmp_path):
     store = import_vault(write_vault(tmp_path, recorded("2x3")), "halfcheetah_2x3")
-    named = lambda **card: replace(store, card={**store.card, **card})  # noqa: E731
+    named = lambda **card: replace(store, card=store.card.updated(**card))  # noqa: E731
     with pytest.raises(UserError, match="called 'halfcheetah_2x3-good', whose danger is .*3.227.* but defines .*1.0"):
         registry.from_store(named(hazard={"kind": "SpeedLimit", "limit": 1.0, "features": ["torso.vx"]}))
     wide = constraints.to_dict(replace(store.hazard, safe_margin=1.0))  # the same danger
@@ -187,8 +189,8 @@ def test_data_that_is_not_what_its_name_says_is_refused(tmp_path):
     assert bare == registry.get("halfcheetah_2x3-good")
     shifted = np.concatenate([np.zeros((len(store.state), 1), np.float32), store.state], 1)
     with pytest.raises(StoreError, match="has 18 state entries, its simulator 17; bring it into that layout"):
-        registry.from_store(replace(store, state=shifted, card={**store.card, "state_names": None}))
-    names = list(store.card["state_names"])
+        registry.from_store(replace(store, state=shifted, card=store.card.updated(state_names=None)))
+    names = list(store.card.state_names)
     names[:2] = names[1::-1]
     with pytest.raises(StoreError, match="its state entry 0 is 'torso.pitch', of its simulator 'torso.z'"):
         registry.from_store(named(state_names=names))
@@ -206,7 +208,7 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     vault.rename(tmp_path / "replay")
     store = import_vault(tmp_path / "replay", "halfcheetah_2x3")
     task = registry.from_store(store)
-    assert import_vault(tmp_path / "replay", "halfcheetah_2x3", tier="mine").card["task"] == "halfcheetah_2x3-mine"
+    assert import_vault(tmp_path / "replay", "halfcheetah_2x3", tier="mine").card.task == "halfcheetah_2x3-mine"
     assert task.name == "halfcheetah_2x3-replay" and task.env == SafeMuJoCo("2x3", 3.227)
     assert (task.cost_limit, task.return_max, task.presets) == (25.0, 9132.25, ("mujoco",))
     small = {"steps": 2, "batch": 4, "width": 8}
@@ -216,16 +218,16 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     played, _ = protocol.evaluate_policy(policy, replace(job.task, env=SafeMuJoCo("2x3", 3.227, 5)), 1, "test", 0)
     assert played["task"] == "halfcheetah_2x3-replay" and np.isfinite(played["return_norm"])
     # a store of that name without the robot's states is anybody's own data
-    own = replace(store, state=None, card={**store.card, "state_names": []})
+    own = replace(store, state=None, card=store.card.updated(state_names=[]))
     assert registry.from_store(own).env is None
 
 
 def test_a_tier_is_named_by_its_own_folder_alone(tmp_path, monkeypatch):
     vault = write_vault(tmp_path / "poor", recorded("2x3"))
     monkeypatch.chdir(vault)
-    assert import_vault(".", "halfcheetah_2x3").card["task"] == "halfcheetah_2x3-good"
+    assert import_vault(".", "halfcheetah_2x3").card.task == "halfcheetah_2x3-good"
     vault.rename(tmp_path / "poor" / "Mixed")
-    assert import_vault(tmp_path / "poor" / "Mixed", "halfcheetah_2x3").card["task"] == "halfcheetah_2x3-imported"
+    assert import_vault(tmp_path / "poor" / "Mixed", "halfcheetah_2x3").card.task == "halfcheetah_2x3-imported"
 
 
 def test_contact_forces_are_found_where_they_were_charged(tmp_path):
@@ -238,8 +240,8 @@ def test_contact_forces_are_found_where_they_were_charged(tmp_path):
         import_vault(write_vault(tmp_path / "a", log, states=states), "ant_4x2")
     log["rewards"] += (5e-4 * np.clip(after, -1, 1) ** 2).sum(1, keepdims=True).astype(np.float32) * 9
     store = import_vault(write_vault(tmp_path / "b", log, states=states), "ant_4x2")
-    assert "contact forces charged" in " ".join(store.card["warnings"])
-    assert store.card["simulator"].startswith("gymnasium-robotics"), "whose states hold 78 forces"
+    assert "contact forces charged" in " ".join(store.card.warnings)
+    assert store.card.simulator.startswith("gymnasium-robotics"), "whose states hold 78 forces"
 
 
 def test_rewards_that_were_scaled_and_rows_out_of_order_are_refused(tmp_path):
@@ -270,7 +272,7 @@ def test_madiffs_cheetah_has_its_state_back(tmp_path):
     store = import_madiff(write_madiff(tmp_path / "good", log, "2x3"), "halfcheetah_2x3")
     np.testing.assert_allclose(store.state[:20], log["state"][:20], atol=1e-6)
     np.testing.assert_allclose(store.actions, log["actions"], atol=1e-6)
-    assert store.card["task"] == "halfcheetah_2x3-good"
+    assert store.card.task == "halfcheetah_2x3-good"
 
 
 def test_lengths_of_madiffs_paths_are_whole_numbers(tmp_path):
@@ -304,14 +306,14 @@ def test_madiffs_ant_says_what_it_lacks(tmp_path):
     log = recorded("4x2")
     store = import_madiff(write_madiff(tmp_path / "medium", log, "4x2", reverse=False), "ant_4x2")
     assert store.state is None and store.observations.shape[1:] == (4, 33)
-    told = " ".join(store.card["warnings"])
+    told = " ".join(store.card.warnings)
     assert "cannot be recovered" in told and "order of actions are taken as recorded" in told
     assert store.lengths.tolist() == [19, 19, 19] and "falls are not marked" in told
     vx = log["rewards"].mean(1) - 1.0 + 0.5 * (log["actions"] ** 2).sum((1, 2))
     np.testing.assert_array_equal(store.costs, (abs(vx) > 2.418)[~log["last"]])
     task = registry.from_store(store)
     assert task.env is None and (task.cost_limit, task.presets) == (25.0, ("mujoco",))
-    assert store.hazard.features == ("torso.vx",) and store.card["task"] == "ant_4x2-medium-observations"
+    assert store.hazard.features == ("torso.vx",) and store.card.task == "ant_4x2-medium-observations"
 
 
 def test_other_robots_and_damaged_files_are_refused(tmp_path):

@@ -58,8 +58,8 @@ def test_import_equals_the_episodes(tmp_path, few, dtype):
         np.testing.assert_array_equal(getattr(store, name), getattr(direct, name), err_msg=name)
     np.testing.assert_allclose(store.state, direct.state, atol=1e-6)
     assert store.costs.any() and not store.terminated.any()
-    assert store.card["task"] == "simple_spread-medium-replay"
-    assert store.card["provenance"].startswith("imported from OMAR arrays") and store.card["warnings"] == []
+    assert store.card.task == "simple_spread-medium-replay"
+    assert store.card.provenance.startswith("imported from OMAR arrays") and store.card.warnings == []
     assert store.hazard == constraints.Separation()
     assert registry.from_store(store).name == "simple_spread-medium-replay"
 
@@ -79,8 +79,8 @@ def test_five_agents_and_an_unfinished_episode(tmp_path):
     assert (store.n_agents, store.episodes, store.steps) == (5, 4, 100)
     np.testing.assert_array_equal(store.costs, played["costs"].ravel())
     np.testing.assert_allclose(store.state, np.asarray(env.global_state(states)).reshape(104, 30), atol=1e-6)
-    assert store.card["warnings"] == ["the last 7 rows are an unfinished episode and were dropped"]
-    assert store.card["task"] == "simple_spread-imported"  # the shipped tasks have three agents
+    assert store.card.warnings == ["the last 7 rows are an unfinished episode and were dropped"]
+    assert store.card.task == "simple_spread-imported"  # the shipped tasks have three agents
     with pytest.raises(StoreError, match="5 agents, the task 'simple_spread-expert' has 3"):
         import_omar(tmp_path / "expert", task="simple_spread-expert")
     task = registry.from_store(store)
@@ -91,10 +91,10 @@ def test_five_agents_and_an_unfinished_episode(tmp_path):
 
 def test_without_next_obs_the_last_steps_are_dropped(tmp_path, few):
     store = import_omar(write(tmp_path / "d", few, following=False), task="mine")
-    assert store.lengths.tolist() == [24] * 8 and store.card["task"] == "mine"
+    assert store.lengths.tolist() == [24] * 8 and store.card.task == "mine"
     np.testing.assert_array_equal(store.observations, few["observations"][:, :-1].reshape(-1, 3, 18))
     np.testing.assert_array_equal(store.costs, few["costs"][:, :-1].ravel())
-    assert "next_obs is missing" in store.card["warnings"][0]
+    assert "next_obs is missing" in store.card.warnings[0]
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_without_next_obs_the_last_steps_are_dropped(tmp_path, few):
     ],
 )
 def test_the_path_names_the_tier(tmp_path, few, path, task):
-    assert import_omar(write(tmp_path / "x" / "y" / path, few)).card["task"] == task
+    assert import_omar(write(tmp_path / "x" / "y" / path, few)).card.task == task
 
 
 def test_another_danger_from_the_command_line_needs_a_name(tmp_path, few, capsys):
@@ -120,7 +120,7 @@ def test_another_danger_from_the_command_line_needs_a_name(tmp_path, few, capsys
     assert "give the data a name with --task" in capsys.readouterr().err and not out.exists()
     main([*arguments, "--task", "mine"])
     wide = EpisodeStore.load(out)
-    assert wide.card["task"] == "mine" and wide.hazard == constraints.Separation(0.5, 0.125)
+    assert wide.card.task == "mine" and wide.hazard == constraints.Separation(0.5, 0.125)
     assert wide.costs.sum() > import_omar(folder).costs.sum()
 
 
@@ -134,7 +134,7 @@ def test_dones_that_are_set_cut_episodes(tmp_path, few):
     store = import_omar(folder)
     assert store.lengths.tolist() == [25, 10, *[25] * 6]
     assert store.terminated.nonzero()[0].tolist() == [34]
-    assert "dones are set" in store.card["warnings"][0]
+    assert "dones are set" in store.card.warnings[0]
 
 
 @pytest.mark.parametrize("length, message", [(20, "row 19 ends.*comes after 25"), (50, "row 24.*obs of row 25")])

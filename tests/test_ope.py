@@ -92,7 +92,7 @@ def test_the_name_of_before_gives_what_it_gave(run, logs, world):
 
 
 def test_others_logs_and_worlds_are_refused(run, logs, world):
-    other = dataclasses.replace(logs, card={**logs.card, "task": "circle"})
+    other = dataclasses.replace(logs, card=logs.card.updated(task="circle"))
     with pytest.raises(UserError, match="The run is of 'line', the logs are of 'circle'"):
         ringfence.ope(run, other)
     with pytest.raises(UserError, match="evaluation_world is of other logs"):

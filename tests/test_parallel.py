@@ -24,7 +24,7 @@ TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
 @pytest.fixture(scope="module")
 def run(small_store, tmp_path_factory):
     """Cloning of data that nobody here simulates: another name, costs instead of a formula."""
-    card = {**small_store.card, "task": "mine", "hazard": {"kind": "CostColumn"}, "cost_limit": 3}
+    card = small_store.card.updated(task="mine", hazard={"kind": "CostColumn"}, cost_limit=3)
     own = dataclasses.replace(small_store, card=card)
     return loop.train("bc", own, out=tmp_path_factory.mktemp("own"), changes=TINY, quiet=True)[0]
 

@@ -236,7 +236,7 @@ def test_a_data_set_is_made_labelled_and_described(tmp_path, monkeypatch):
     again, _ = make(task, 300, fresh=True)
     np.testing.assert_array_equal(store.actions, again.actions)
     assert store.steps >= 300 and path.parent == tmp_path / "data" and store.lengths.max() <= 60
-    card = store.card
+    card = store.card.to_dict()
     assert (
         card["speed_limit"] == task.env.limit
         and card["protocol"] == "quantile"

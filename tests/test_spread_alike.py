@@ -75,7 +75,7 @@ def test_the_same_play_told_otherwise(logs):
     np.testing.assert_array_equal(logs.state, plain.state)
     np.testing.assert_array_equal(logs.actions, plain.actions)
     np.testing.assert_array_equal(logs.costs.max(1), plain.costs)
-    assert logs.costs.any() and logs.card["agents"] == ["agent0", "agent1", "agent2"]
+    assert logs.costs.any() and logs.card.agents == ["agent0", "agent1", "agent2"]
     each = logs.split_agents()
     hazard = constraints.bind(TASK.hazard, TASK.feature_map("pruned").names, 1)
     ends = np.arange(1, 26) + 26 * np.arange(each.episodes)[:, None]  # rows that steps lead to

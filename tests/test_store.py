@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 
 import h5py
@@ -13,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.schema import ARRAYS
+from ringfence.logs.schema import ARRAYS, StoreCard, complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import NOT_ARRIVED, WindowData, at, returns_to_go
 from ringfence.problem.constraints import CostColumn
@@ -123,7 +124,7 @@ def test_a_card_that_says_nothing_is_completed(tmp_path):
         f.attrs["card"] = "{}"
         del f.attrs["card_digest"]
     loaded = EpisodeStore.load(path)
-    assert loaded.card["task"] == "custom" and loaded.hazard == CostColumn()
+    assert loaded.card.task == "custom" and loaded.hazard == CostColumn()
 
 
 @pytest.mark.parametrize("task", ["", " ", ".", "..", "a/b", "../x", "/x", "a\\b", None, 3])
@@ -222,7 +223,7 @@ RULES = {
     ),
     "flag inside": (ends_inside, "inside an episode is flagged"),
     "names": (
-        lambda s: {"card": {**s.card, "observation_names": ["a"]}},
+        lambda s: {"card": s.card.updated(observation_names=["a"])},
         "names 1 observation entries, the data has 5",
     ),
     "kind of ends": (lambda s: {"episode_ends": s.episode_ends.astype(float)}, "type float64; it must hold whole"),
@@ -233,7 +234,7 @@ RULES = {
         lambda s: {k: getattr(s, k)[:, :0] for k in ("observations", "actions", "rewards")},
         "at least one agent and one action entry",
     ),
-    "state names": (lambda s: {"card": {**s.card, "state_names": ["a"]}}, "names 1 state entries, not 6"),
+    "state names": (lambda s: {"card": s.card.updated(state_names=["a"])}, "names 1 state entries, not 6"),
 }
 
 
@@ -249,7 +250,7 @@ def test_broken_rule_is_named(rule):
 
 def test_bounds_of_actions_come_from_the_card():
     store = logs()
-    wide = dataclasses.replace(store, card={**store.card, "action_low": -3.0, "action_high": 3.0})
+    wide = dataclasses.replace(store, card=store.card.updated(action_low=-3.0, action_high=3.0))
     dataclasses.replace(wide, actions=wide.actions * 3)
     with pytest.raises(StoreError, match=r"outside \[-3, 3\]"):
         dataclasses.replace(wide, actions=wide.actions * 30)
@@ -323,7 +324,7 @@ def test_makers_refuse_incomplete_logs(played):
         with pytest.raises(StoreError, match=said):
             EpisodeStore.from_steps(**{**whole, name: value})
     named = EpisodeStore.from_steps(**whole, card={"observation_names": np.array(["a", "b"])})
-    assert named.card["observation_names"] == ["a", "b"]
+    assert named.card.observation_names == ["a", "b"]
 
 
 def test_one_reward_for_the_team_is_everybodys():
@@ -483,3 +484,54 @@ def test_content_tells_steps_apart(small_store):
     same = dataclasses.replace(small_store, costs=small_store.costs.copy())
     other = dataclasses.replace(small_store, costs=small_store.costs + 1)
     assert small_store.content == same.content != other.content
+
+
+def test_a_card_is_written_as_it_was_read(small_store, tmp_path):
+    """Order, fields that nobody knows, and those that are said to be nothing stay; what is not said stays away."""
+    given = {"vehicle": {"wheels": 4}, "task": "fleet", "agents": None, "dt": 0.1, "hazard": {"kind": "CostColumn"}}
+    store = dataclasses.replace(small_store, card=given)
+    assert (store.card.task, store.card.dt, store.card.agents, store.card.warnings) == ("fleet", 0.1, None, [])
+    assert store.card.extra == {"vehicle": {"wheels": 4}} and not store.card.homogeneous
+    defaults = {"task": "custom", "simulator": None, "provenance": "user data", "action_low": -1.0, "action_high": 1.0}
+    defaults |= {"observation_names": None, "state_names": None, "hazard": {"kind": "CostColumn"}}
+    text = json.dumps({**defaults, **given})
+    assert json.dumps(store.card.to_dict()) == text
+    for _ in range(2):
+        with h5py.File(store.save(tmp_path / "s.h5")) as file:
+            assert file.attrs["card"] == text
+        store = EpisodeStore.load(tmp_path / "s.h5")
+    assert dataclasses.replace(store, card=dict(reversed(given.items()))).card == store.card
+    assert store.card.updated(task="other", wheels=3).to_dict() == {**defaults, **given, "task": "other", "wheels": 3}
+    assert EpisodeStore.load(tmp_path / "s.h5").card != store.card.updated(dt=0.2)
+    with pytest.raises(StoreError, match="dt=0; it must be the seconds of a step"):
+        store.card.updated(dt=0)
+    store.card.to_dict()["hazard"]["kind"] = "another"
+    assert store.card.hazard == {"kind": "CostColumn"}
+
+
+def test_a_card_can_be_made_by_its_fields(small_store):
+    card = StoreCard(task="fleet", dt=0.1, extra={"wheels": 4})
+    store = dataclasses.replace(small_store, card=card)
+    assert store.card == complete_card({"task": "fleet", "dt": 0.1, "wheels": 4}) and store.card.extra == {"wheels": 4}
+    with pytest.raises(StoreError, match="task='a/b'; it must be a name"):
+        dataclasses.replace(small_store, card=StoreCard(task="a/b"))
+
+
+def test_a_card_reads_as_the_dictionary_that_it_was(small_store):
+    card = dataclasses.replace(small_store, card={"task": "fleet", "wheels": 4}).card
+    for read, wanted in (
+        (lambda: card["task"], "fleet"),
+        (lambda: card["wheels"], 4),
+        (lambda: card.get("dt", 0.5), 0.5),
+        (lambda: "wheels" in card, True),
+        (lambda: "dt" in card, False),
+        (lambda: {**card, "task": "other"}, card.to_dict() | {"task": "other"}),
+        (lambda: card | {"task": "other"}, card.to_dict() | {"task": "other"}),
+        (lambda: {"a": 1} | card, {"a": 1} | card.to_dict()),
+        (lambda: list(card), list(card.to_dict())),
+        (lambda: dict(card.items()), card.to_dict()),
+    ):
+        with pytest.warns(FutureWarning, match="of a store"):
+            assert read() == wanted
+    with pytest.warns(FutureWarning, match=r"card\['wheels'\] of a store is called card.extra\['wheels'\] now"):
+        card["wheels"]

@@ -117,4 +117,4 @@ def test_every_new_name_is_checked_where_results_are_read():
 def test_homogeneous_agents_of_older_files_are_known():
     spec = {"alike": True, "n_agents": 1}
     assert stored.config({"task": "x", "spec": spec})["spec"] == {"homogeneous": True, "n_agents": 1}
-    assert complete_card({"task": "fleet", "alike": True})["homogeneous"] is True
+    assert complete_card({"task": "fleet", "alike": True}).homogeneous

@@ -36,13 +36,13 @@ def fleet(episodes: int = 6, steps: int = 12, agents: int = 3, dt: float = 0.1, 
 
 def entry(store: EpisodeStore, name: str) -> np.ndarray:
     """(T + E, N) of an observation's entry."""
-    return store.observations[..., store.card["observation_names"].index(name)]
+    return store.observations[..., store.card.observation_names.index(name)]
 
 
 def test_rows_on_one_clock_come_out_as_they_are():
     table = fleet()
     store = EpisodeStore.from_table(table, **NAMES, reward="paid", goal=["gx", "gy"])
-    assert (store.episodes, store.steps, store.n_agents) == (6, 66, 3) and store.card["dt"] == 0.1
+    assert (store.episodes, store.steps, store.n_agents) == (6, 66, 3) and store.card.dt == 0.1
     grid = {name: x.reshape(6, 12, 3) for name, x in table.items()}
     for name in ("x", "y", "vx", "vy"):
         np.testing.assert_allclose(entry(store, f"own.{name}").reshape(6, 12, 3), grid[name], atol=2e-6)
@@ -166,7 +166,7 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
     store = EpisodeStore.from_table(
         table, **options, danger=Separation(0.8, 0.2), neighbours=2, sensing_radius=2.5, max_episode_steps=10
     )
-    assert store.n_agents == 1 and store.card["homogeneous"] and store.costs.any() and (store.lengths <= 10).all()
+    assert store.n_agents == 1 and store.card.homogeneous and store.costs.any() and (store.lengths <= 10).all()
     far = np.hypot(entry(store, "other0.dx"), entry(store, "other0.dy"))
     seen = entry(store, "other0.seen") > 0
     assert (far[~seen] == 2.5).all() and (far[seen] <= 2.5).all() and 0 < seen.mean() < 1
@@ -191,7 +191,7 @@ def test_velocities_and_accelerations_that_nobody_logged():
     v = np.diff(x, axis=1) / 0.1
     np.testing.assert_allclose(entry(store, "own.vx").reshape(6, 12, 3)[:, 1:], v, atol=1e-4)
     np.testing.assert_allclose(store.actions[..., 0].reshape(6, 11, 3)[:, 1:], np.diff(v, axis=1) / 0.1, atol=2e-3)
-    assert any("accelerations" in note for note in store.card["warnings"])
+    assert any("accelerations" in note for note in store.card.warnings)
 
 
 def test_costs_of_distances_and_of_the_team():
@@ -199,7 +199,7 @@ def test_costs_of_distances_and_of_the_team():
     apart = np.hypot(*(np.diff(table[c].reshape(6, 12, 2))[..., 0] for c in "xy"))
     store = EpisodeStore.from_table(table, **NAMES | dict(cost=None), danger=Separation(2.0))
     np.testing.assert_array_equal(store.costs.reshape(6, 11) > 0, apart[:, 1:] < 2.0)
-    assert any("taken for the team's" in note for note in store.card["warnings"])
+    assert any("taken for the team's" in note for note in store.card.warnings)
 
 
 def test_published_layouts_read_as_they_are(tmp_path):
@@ -209,7 +209,7 @@ def test_published_layouts_read_as_they_are(tmp_path):
     lines += [f"{f},2,{90 - f * 1.0:.3f},8.0,6.0,2.0,-25.0,0.0,0.0,0.2,0,5" for f in range(11, 60)]
     (tmp_path / "01_tracks.csv").write_text("\n".join([head, *lines]) + "\n")
     store = EpisodeStore.from_layout(tmp_path / "01_tracks.csv", "highd", neighbours=1, danger=Separation(5.0))
-    assert store.episodes == 2 and store.card["dt"] == 0.04 and store.actions.shape[2] == 2
+    assert store.episodes == 2 and store.card.dt == 0.04 and store.actions.shape[2] == 2
     both = entry(store, "other0.seen")[:, 0] > 0
     assert both[10:39].all() and not both[:10].any()
     np.testing.assert_allclose(entry(store, "other0.dx")[10, 0], (90 - 11 + 3) - (10 + 11 * 1.2 + 2), atol=1e-4)
@@ -219,7 +219,7 @@ def test_published_layouts_read_as_they_are(tmp_path):
     lines = [f"{i},{f},{f * 100},car,{f * 0.5 + i},{i},5.0,0.0,0.0,4.1,1.8" for i in (1, 2) for f in range(1, 20)]
     (tmp_path / "vehicle_tracks_000.csv").write_text("\n".join([head, *lines]) + "\n")
     store = EpisodeStore.from_layout(tmp_path / "vehicle_tracks_000.csv", "interaction")
-    assert (store.episodes, store.steps, store.n_agents) == (1, 18, 2) and store.card["dt"] == 0.1
+    assert (store.episodes, store.steps, store.n_agents) == (1, 18, 2) and store.card.dt == 0.1
     np.testing.assert_allclose(entry(store, "own.x")[:, 0], np.arange(1, 20) * 0.5 + 1, atol=1e-5)
     with pytest.raises(UserError, match="No layout.*'hiway'|layout 'hiway'"):
         EpisodeStore.from_layout(tmp_path / "01_tracks.csv", "hiway")
@@ -284,13 +284,13 @@ def test_files_that_are_no_tables_are_refused(tmp_path):
 
 def test_units_that_disagree_are_noted():
     table = fleet()
-    assert not any("times what" in note for note in EpisodeStore.from_table(table, **NAMES).card["warnings"])
+    assert not any("times what" in note for note in EpisodeStore.from_table(table, **NAMES).card.warnings)
     table |= {"vx": table["vx"] * 3.6, "vy": table["vy"] * 3.6}
     assert any(
-        "vx is 3.6 times what x changes by" in note for note in EpisodeStore.from_table(table, **NAMES).card["warnings"]
+        "vx is 3.6 times what x changes by" in note for note in EpisodeStore.from_table(table, **NAMES).card.warnings
     )
     swapped = fleet() | {"vx": fleet()["vy"], "vy": -fleet()["vx"]}
-    notes = EpisodeStore.from_table(swapped, **NAMES).card["warnings"]
+    notes = EpisodeStore.from_table(swapped, **NAMES).card.warnings
     assert sum("times what" in note for note in notes) == 2
 
 
@@ -316,7 +316,7 @@ def test_clocks_that_jitter_change_no_action_and_no_cost():
     assert (
         held == 6
         and cost > 0
-        and any("off the clock" in n for n in EpisodeStore.from_table(late, **NAMES).card["warnings"])
+        and any("off the clock" in n for n in EpisodeStore.from_table(late, **NAMES).card.warnings)
     )
 
 
@@ -344,7 +344,7 @@ def test_a_schema_says_what_its_options_say():
     assert (schema.position, schema.velocity, schema.axes) == (("x", "y"), ("vx", "vy"), ("x", "y"))
     store = EpisodeStore.from_table(fleet(), schema, notes=["first"], card={"task": "mine"})
     assert store.content == EpisodeStore.from_table(fleet(), **NAMES, max_episode_steps=7).content
-    assert store.card["task"] == "mine" and store.card["warnings"][0] == "first"
+    assert store.card.task == "mine" and store.card.warnings[0] == "first"
     with pytest.raises(UserError, match="schema and dt both say how the table is read"):
         EpisodeStore.from_table(fleet(), schema, dt=0.2)
     with pytest.raises(UserError, match="agent of the table is not named"):
@@ -379,8 +379,8 @@ def test_options_of_before_work_and_warn(tmp_path, capsys):
 
 def test_the_radius_in_cards_of_before_is_read():
     store = EpisodeStore.from_table(fleet(), **NAMES, neighbours=2, sensing_radius=2.5)
-    assert store.card["sensing_radius"] == 2.5
-    before = {name: value for name, value in store.card.items() if name != "sensing_radius"} | {"sight": 2.5}
+    assert store.card.sensing_radius == 2.5
+    before = {name: value for name, value in store.card.to_dict().items() if name != "sensing_radius"} | {"sight": 2.5}
     assert dataclasses.replace(store, card=before).card == store.card
     state = {name: np.array([0.0, 9.0]) for name in ("x", "y", "vx", "vy")}
     np.testing.assert_array_equal(observe(before, state), observe(store.card, state))

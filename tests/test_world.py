@@ -24,7 +24,7 @@ from tests.quick import QUICK_WORLD
 
 
 def with_costs(store, costs, task="mine"):
-    card = {**store.card, "task": task, "hazard": {"kind": "CostColumn"}}
+    card = store.card.updated(task=task, hazard={"kind": "CostColumn"})
     return dataclasses.replace(store, costs=np.asarray(costs, np.float32), card=card)
 
 
@@ -223,7 +223,7 @@ def test_own_entries_tell_the_rest_where_the_logs_agree(played):
 
 
 def test_a_hazard_keeps_what_it_reads(small_store):
-    card = {**small_store.card, "task": "mine", "observation_names": None, "hazard": constraints.Separation(0.3)}
+    card = small_store.card.updated(task="mine", observation_names=None, hazard=constraints.Separation(0.3))
     card = {**card, "hazard": constraints.to_dict(card["hazard"])}
     own = dataclasses.replace(small_store, card=card)
     task = registry.from_store(own)

@@ -87,7 +87,7 @@ def within(store: EpisodeStore, config: Config) -> EpisodeStore:
     if config.cost_limit is None:
         return store
     over = store.episode_costs - config.cost_limit
-    if store.limits and config.cost_limit == store.card["cost_limit"]:
+    if store.limits and config.cost_limit == store.card.cost_limit:
         over = np.max([store.episode_costs_of(name) - limit for name, limit in store.limits.items()], 0)
     return store.select(over <= max(0.0, np.quantile(over, 0.01, method="higher")))
 

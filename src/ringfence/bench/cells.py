@@ -363,7 +363,7 @@ class _Group:
         first = self.left[0]
         store = data_of(first.task, first.transitions)
         for cell in self.left:
-            if paired := adopt(cell, self.out, store.card):
+            if paired := adopt(cell, self.out, store.card.to_dict()):
                 self.adopted[cell] = str(paired.folder(self.out).relative_to(self.out))
         loop.train(
             first.algorithm,

@@ -298,10 +298,10 @@ def _limit(speed_limit: float | None, quantile: bool):
 
 def imported(store, file: Path) -> None:
     """Keep what was imported, and say what was noted."""
-    each = f" of {store.card['dt']:g} s" if "dt" in store.card else ""
+    each = f" of {store.card.dt:g} s" if store.card.dt is not None else ""
     summary = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
     out.print(summary, soft_wrap=True, markup=False)
-    for note in store.card["warnings"]:
+    for note in store.card.warnings:
         out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
 
 

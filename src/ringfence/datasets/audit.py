@@ -38,20 +38,20 @@ def audit(store: EpisodeStore) -> Audit:
         danger, warnings = _danger(store, task)
         facts |= danger
     warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *_odd_ends(store)]
-    return Audit(facts, warnings, list(store.card.get("warnings", [])))
+    return Audit(facts, warnings, list(store.card.warnings))
 
 
 def _sizes(store: EpisodeStore) -> dict[str, str]:
     card = store.card
     lengths = store.lengths
     return {
-        "task": str(card["task"]),
-        "provenance": str(card["provenance"]),
-        "collected": str(card.get("collected", "not said")),
+        "task": card.task,
+        "provenance": str(card.provenance),
+        "collected": str(card.extra.get("collected", "not said")),
         "episodes": f"{store.episodes:,}",
         "steps": f"{store.steps:,}",
         "episode length": f"{lengths.min()} to {lengths.max()}" if np.ptp(lengths) else str(lengths[0]),
-        **({"step": f"{card['dt']:g} s"} if "dt" in card else {}),
+        **({} if card.dt is None else {"step": f"{card.dt:g} s"}),
         "agents": str(store.n_agents),
         "observation, action": f"{store.observations.shape[2]}, {store.actions.shape[2]} per agent",
         "global state": "none" if store.state is None else f"{store.state.shape[1]} entries",
@@ -70,23 +70,23 @@ def _outcomes(store: EpisodeStore) -> dict[str, str]:
         **{f"constraint {name}": _of_constraint(store, name) for name in store.limits},
         "steps with cost": f"{100 * _cost_rate(store):.2f} %",
         "episodes with cost": f"{100 * (costs > 0).mean():.2f} %",
-        "actions": f"from {store.actions.min():.3f} to {store.actions.max():.3f}, bounds {card['action_low']:g} to "
-        f"{card['action_high']:g}",
+        "actions": f"from {store.actions.min():.3f} to {store.actions.max():.3f}, bounds {card.action_low:g} to "
+        f"{card.action_high:g}",
         "ended by": f"{int(store.terminated.sum()):,} terminations, {int(store.truncated.sum()):,} truncations",
     }
 
 
 def _speeds(store: EpisodeStore) -> dict[str, str]:
     """What a robot's card says of its speed limit."""
-    card = store.card
-    if "speed_quantiles" not in card:
+    robot = store.card.extra
+    if "speed_quantiles" not in robot:
         return {}
-    spread = ", ".join(f"{100 * float(q):g} %: {v:.2f}" for q, v in card["speed_quantiles"].items())
-    limit = f"{card['speed_limit']:g} m/s" + (f" ({card['protocol']})" if "protocol" in card else "")
+    spread = ", ".join(f"{100 * float(q):g} %: {v:.2f}" for q, v in robot["speed_quantiles"].items())
+    limit = f"{robot['speed_limit']:g} m/s" + (f" ({robot['protocol']})" if "protocol" in robot else "")
     return {
-        "speed limit": f"{limit}; at most {card['cost_limit']:g} steps of an episode may be above it",
+        "speed limit": f"{limit}; at most {store.card.cost_limit:g} steps of an episode may be above it",
         "speed, quantiles": f"{spread} m/s",
-        "return ceiling": f"{card['return_ceiling']:.0f} within the limit, unless faster than all this data",
+        "return ceiling": f"{robot['return_ceiling']:.0f} within the limit, unless faster than all this data",
     }
 
 

@@ -41,7 +41,7 @@ def make(
     path = writable(out) if out else cached
     card = _card(task, recipe, seed)
     kept = None if fresh else _usable(cached, card, f"{task.name} is made again.")
-    if kept is not None and kept.card["hazard"] == card["hazard"]:  # or the name has come to mean something else
+    if kept is not None and kept.card.hazard == card["hazard"]:  # or the name has come to mean something else
         return kept, kept.save(path) if out else path
     store = None if fresh else _relabelled(task, recipe, kept, size, seed, card)
     if store is None:
@@ -90,7 +90,7 @@ def _relabelled(
         found = None if store is None else recipe.relabelled(task, store)
         if store is not None and found is not None:
             costs, entries = found
-            return replace(store, costs=costs, card=store.card | card | entries)
+            return replace(store, costs=costs, card=store.card.updated(**{**card, **entries}))
     return None
 
 
@@ -103,6 +103,6 @@ def _usable(path: Path, card: Card, damaged: str) -> EpisodeStore | None:
     except StoreError as error:
         warnings.warn(f"{error} {damaged}", stacklevel=4)
         return None
-    simulator = {"episode_length": card["episode_length"]} | kept.card
+    simulator = {"episode_length": card["episode_length"]} | kept.card.to_dict()
     same = all(simulator.get(k) == card[k] for k in SIMULATED_BY if k in card)
     return kept if same else None

@@ -212,7 +212,7 @@ def _danger(hazard: constraints.Hazard) -> constraints.Hazard:
 def from_store(store: EpisodeStore) -> Task:
     """The task that a store belongs to, or a task made of the store alone for anybody's own data."""
     card = store.card
-    name = card["task"]
+    name = card.task
     task = simulated(name, store.hazard)
     if task is not None:
         wrong = _misfit(store, task.simulator)
@@ -220,7 +220,7 @@ def from_store(store: EpisodeStore) -> Task:
             raise StoreError(
                 f"The data is called '{name}', but {wrong}; bring it into that layout, or give it a name of its own."
             )
-        if name in TASKS or (not wrong and card["state_names"]):
+        if name in TASKS or (not wrong and card.state_names):
             return task
     low = float(store.returns.min())
     high = float(store.returns.max())
@@ -231,12 +231,12 @@ def from_store(store: EpisodeStore) -> Task:
         store.hazard,
         return_min=low,
         return_max=high if high > low else low + 1.0,
-        cost_limit=float(card.get("cost_limit", 1.0)),
+        cost_limit=1.0 if card.cost_limit is None else float(card.cost_limit),
         transitions=store.steps,
         presets=("mujoco",) if robot else (),
-        action_low=float(card["action_low"]),
-        action_high=float(card["action_high"]),
-        homogeneous=card.get("homogeneous") is True,
+        action_low=float(card.action_low),
+        action_high=float(card.action_high),
+        homogeneous=card.homogeneous,
     )
 
 
@@ -251,11 +251,11 @@ def _misfit(store: EpisodeStore, env: Env | NativeEnv) -> str:
     for what, here, there in sizes:
         if here != there:
             return f"has {here} {what}, its simulator {there}"
-    low = store.card["action_low"]
-    high = store.card["action_high"]
+    low = store.card.action_low
+    high = store.card.action_high
     if (low, high) != (-1.0, 1.0):
         return f"has actions from {low:g} to {high:g}, its simulator from -1 to 1"
-    names = store.card["state_names"]
+    names = store.card.state_names
     if names and list(names) != list(env.state_names):
         k = next(k for k, (a, b) in enumerate(zip(names, env.state_names)) if a != b)
         return f"its state entry {k} is '{names[k]}', of its simulator '{env.state_names[k]}'"

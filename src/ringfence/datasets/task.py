@@ -106,8 +106,8 @@ class Task:
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
         width = 0 if store.state is None else store.state.shape[1]
-        names = store.card["observation_names"] or [f"obs{d}" for d in range(store.observations.shape[2])]
-        state_names = store.card["state_names"] or [f"state{d}" for d in range(width)]
+        names = store.card.observation_names or [f"obs{d}" for d in range(store.observations.shape[2])]
+        state_names = store.card.state_names or [f"state{d}" for d in range(width)]
         return features.from_data(
             view,
             store.observations,
@@ -117,7 +117,7 @@ class Task:
             first_rows=first_rows(store),
             keep=constraints.reads(self.hazard, store.n_agents, tuple(names)),
             homogeneous=self.homogeneous,
-            dt=store.card.get("dt"),
+            dt=store.card.dt,
         )
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:
@@ -131,7 +131,7 @@ class Task:
             agents = store.n_agents
             action_dim = store.actions.shape[2]
             episode_length = int(store.lengths.max())
-            action_sizes = store.card.get("action_sizes")
+            action_sizes = store.card.action_sizes
         else:
             raise UserError(f"Task '{self.name}' has no simulator; pass the store to learn its sizes.")
         return Spec(

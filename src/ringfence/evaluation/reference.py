@@ -91,9 +91,9 @@ def make(
     if file.exists():
         known = read(file)
         same = (SAFE in known) == safe.any() and _are_complete(known, task, episodes)
-        if same and known["behaviour data"]["data"] == store.card:
+        if same and stored.card(known["behaviour data"]["data"]) == store.card.to_dict():
             return known
-    rows = {"behaviour data": of_data(store, task) | {"data": store.card}}
+    rows = {"behaviour data": of_data(store, task) | {"data": store.card.to_dict()}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)
     for name, policy in _policies(task).items():

@@ -253,7 +253,7 @@ def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> Ep
     if file is None or not file.exists():
         return None
     store = EpisodeStore.load(file)
-    kept = store.card.get("recorded")
+    kept = store.card.extra.get("recorded")
     if kept != source:
         raise StoreError(f"'{file}' holds another recording ({kept}, not {source}); delete it or name another file.")
     return store if store.episodes <= episodes else store.select(np.arange(store.episodes) < episodes)

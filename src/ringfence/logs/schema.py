@@ -2,29 +2,115 @@
 
 from __future__ import annotations
 
+import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
 from ringfence.utils import schemas, stored
+from ringfence.utils.renamed import deprecated
 
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 OPTIONAL = ("state", "speed", "constraints")
 LISTS_OF_NAMES = ("observation_names", "state_names")
-DEFAULTS: dict[str, Any] = {
-    "task": "custom",
-    "simulator": None,
-    "provenance": "user data",
-    "action_low": -1.0,
-    "action_high": 1.0,
-    "observation_names": None,
-    "state_names": None,
-    "hazard": {"kind": "CostColumn"},
-}
+ALWAYS = (
+    "task",
+    "simulator",
+    "provenance",
+    "action_low",
+    "action_high",
+    "observation_names",
+    "state_names",
+    "hazard",
+)  # fields of a card that its JSON always has
+
+
+class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
+    """What a store says of itself: fields that are read by name, and in `extra` whatever else its JSON holds.
+
+    `complete_card` checks a card; a store does so when it is made. `to_dict` gives its JSON, with the fields that were
+    given and in their order, so that a card that is read and written again stays the same.
+    """
+
+    task: str = "custom"
+    simulator: str | None = None  # what the data was recorded in, with its version
+    provenance: str = "user data"
+    action_low: float = -1.0
+    action_high: float = 1.0
+    observation_names: list[str] | None = None
+    state_names: list[str] | None = None
+    hazard: dict[str, Any] = msgspec.field(default_factory=lambda: {"kind": "CostColumn"})
+    dt: float | None = None  # s, of a step
+    cost_limit: float | None = None  # of the team, per episode
+    constraints: dict[str, float] | None = None  # limit per episode, by name
+    homogeneous: bool = False
+    agents: list[str] | None = None  # their names
+    action_sizes: list[int] | None = None  # entries of each agent's action
+    team: int | None = None  # agents of the team whose logs were split into those of single ones
+    content: str | None = None  # digest of the arrays that these were made of
+    sensing_radius: float | None = None  # m
+    warnings: list[str] = []
+    extra: dict[str, Any] = {}
+    written: tuple[str, ...] = ()  # names in the JSON, in order
+
+    def to_dict(self) -> dict[str, Any]:
+        """Its JSON: what was given, and what differs from the defaults."""
+        plain = StoreCard()
+        own = {name: getattr(self, name) for name in FIELDS}
+        differ = [name for name in FIELDS if name in ALWAYS or own[name] != getattr(plain, name)]
+        values = {**self.extra, **own}
+        names = dict.fromkeys([*self.written, *differ, *self.extra])
+        return {name: copy.deepcopy(values[name]) for name in names}
+
+    def updated(self, **fields: Any) -> StoreCard:
+        """The card with other fields, of any name."""
+        return complete_card({**self.to_dict(), **fields})
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, StoreCard):
+            return self.to_dict() == other.to_dict()
+        return NotImplemented
+
+    # --- a dictionary, as cards of 0.1.0 were ---
+    def __getitem__(self, name: str) -> Any:
+        deprecated(f"card['{name}'] of a store", f"card.{name}" if name in FIELDS else f"card.extra['{name}']")
+        return self.to_dict()[name]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        deprecated(f"card.get('{name}') of a store", f"card.{name}" if name in FIELDS else f"card.extra.get('{name}')")
+        return self.to_dict().get(name, default)
+
+    def __contains__(self, name: object) -> bool:
+        deprecated("`in` the card of a store", "card.to_dict()")
+        return name in self.to_dict()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
+
+    def keys(self) -> list[str]:
+        deprecated("keys() of the card of a store", "card.to_dict()")
+        return list(self.to_dict())
+
+    def items(self) -> list[tuple[str, Any]]:
+        deprecated("items() of the card of a store", "card.to_dict()")
+        return list(self.to_dict().items())
+
+    def __or__(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        deprecated("`|` with the card of a store", "card.updated()")
+        return {**self.to_dict(), **fields}
+
+    def __ror__(self, fields: Mapping[str, Any]) -> dict[str, Any]:
+        deprecated("`|` with the card of a store", "card.to_dict()")
+        return {**fields, **self.to_dict()}
+
+
+FIELDS = tuple(name for name in StoreCard.__struct_fields__ if name not in ("extra", "written"))
+GivenCard = StoreCard | Mapping[str, Any]
 
 
 class Arrays(Protocol):
@@ -51,22 +137,29 @@ class Arrays(Protocol):
     @property
     def constraints(self) -> np.ndarray | None: ...
     @property
-    def card(self) -> dict[str, Any]: ...
+    def card(self) -> StoreCard: ...
     @property
     def limits(self) -> dict[str, float]: ...
 
 
-def complete_card(card: dict) -> dict:
-    """A card with every field present; unknown fields are kept, for provenance of any kind."""
-    if not isinstance(card, dict):
-        raise StoreError(f"The card is a {type(card).__name__}; it must be a dictionary of fields.")
-    card = {**DEFAULTS, **stored.card(card)}
+def complete_card(given: GivenCard) -> StoreCard:
+    """The card of these fields, checked; unknown fields are kept, for provenance of any kind."""
+    fields = given.to_dict() if isinstance(given, StoreCard) else given
+    if not isinstance(fields, dict):
+        raise StoreError(f"The card is a {type(fields).__name__}; it must be a dictionary of fields.")
+    defaults = StoreCard()
+    card: dict[str, Any] = {**{name: getattr(defaults, name) for name in ALWAYS}, **stored.card(fields)}
     for rule in CARD_RULES:
         rule(card)
     try:
-        return json.loads(json.dumps(card, default=lambda x: x.tolist()))  # NumPy's arrays and numbers become plain
+        # NumPy's arrays and numbers become plain
+        values: dict[str, Any] = json.loads(json.dumps(card, default=lambda x: x.tolist()))
     except (AttributeError, TypeError, ValueError) as error:
         raise StoreError(f"The card cannot be kept as JSON ({error}); use words, numbers, lists and dicts.") from None
+    known = {name: value for name, value in values.items() if name in FIELDS}
+    known["warnings"] = known.get("warnings") or []
+    extra = {name: value for name, value in values.items() if name not in FIELDS}
+    return StoreCard(**known, extra=extra, written=tuple(values))
 
 
 def validate(store: Arrays) -> None:
@@ -333,8 +426,8 @@ def _constraints(store: Arrays) -> None:
 
 
 def _actions_within_bounds(store: Arrays) -> None:
-    low = store.card["action_low"]
-    high = store.card["action_high"]
+    low = store.card.action_low
+    high = store.card.action_high
     slack = 1e-4 * (high - low)
     outside = (store.actions < low - slack) | (store.actions > high + slack)
     if outside.any():
@@ -361,7 +454,7 @@ def _episodes_end_in_one_way(store: Arrays) -> None:
 
 
 def _action_sizes(store: Arrays) -> None:
-    sizes = store.card.get("action_sizes")
+    sizes = store.card.action_sizes
     if sizes is None:
         return
     n_agents, widest = store.actions.shape[1:]
@@ -374,11 +467,11 @@ def _action_sizes(store: Arrays) -> None:
 
 
 def _names_of_entries(store: Arrays) -> None:
-    names = store.card.get("observation_names")
+    names = store.card.observation_names
     size = store.observations.shape[2]
     if names:
         _demand(len(names) == size, f"The card names {len(names)} observation entries, the data has {size}.")
-    names = store.card.get("state_names")
+    names = store.card.state_names
     if names and store.state is not None:
         size = store.state.shape[1]
         _demand(len(names) == size, f"The card names {len(names)} state entries, not {size}.")

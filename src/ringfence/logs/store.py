@@ -32,7 +32,7 @@ from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Table
 from ringfence.logs.io.table import read_layout, read_table
 from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
-from ringfence.logs.schema import ARRAYS, OPTIONAL, complete_card, validate
+from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
@@ -55,7 +55,7 @@ class EpisodeStore:
     truncated: np.ndarray
     episode_ends: np.ndarray
     state: np.ndarray | None = None
-    card: dict = field(default_factory=dict)
+    card: StoreCard = field(default_factory=StoreCard)  # a dictionary of its fields may be given
     speed: np.ndarray | None = None
     constraints: np.ndarray | None = None
 
@@ -66,7 +66,7 @@ class EpisodeStore:
     def __repr__(self) -> str:
         named = f" ({', '.join(self.limits)})" if self.limits else ""
         return (
-            f"EpisodeStore('{self.card['task']}': {self.episodes:,} episodes, {self.steps:,} steps of {self.n_agents} "
+            f"EpisodeStore('{self.card.task}': {self.episodes:,} episodes, {self.steps:,} steps of {self.n_agents} "
             f"agents, observations {self.observations.shape[2]}, actions {self.actions.shape[2]}, state "
             f"{0 if self.state is None else self.state.shape[1]}, {100 * (self.costs > 0).mean():.3g} % of "
             f"entries with cost{named})"
@@ -118,7 +118,7 @@ class EpisodeStore:
     @property
     def limits(self) -> dict[str, float]:
         """Limit per episode of each named constraint, in the order of `constraints`; empty where there are none."""
-        return self.card.get("constraints") or {}
+        return self.card.constraints or {}
 
     def of_constraint(self, name: str) -> np.ndarray:
         """(T,) or (T, N) cost of one constraint."""
@@ -136,7 +136,7 @@ class EpisodeStore:
     @property
     def hazard(self) -> constraints.Hazard:
         """The definition of danger in the card; CostColumn when the card has none."""
-        return constraints.from_dict(self.card["hazard"])
+        return constraints.from_dict(self.card.hazard)
 
     @functools.cached_property
     def content(self) -> str:
@@ -213,7 +213,7 @@ class EpisodeStore:
         n = self.n_agents
         if self.costs.ndim == 1 and n > 1:
             raise StoreError(
-                f"The agents of '{self.card['task']}' are homogeneous and learn from what each of them meets, but its "
+                f"The agents of '{self.card.task}' are homogeneous and learn from what each of them meets, but its "
                 "costs are the team's; give costs (T, N)."
             )
 
@@ -228,14 +228,7 @@ class EpisodeStore:
             np.tile(self.terminated, n),
             np.tile(self.truncated, n),
             np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),
-            card={
-                **self.card,
-                "state_names": None,
-                "agents": None,
-                "action_sizes": None,
-                "team": n,
-                "content": self.content,
-            },
+            card=self.card.updated(state_names=None, agents=None, action_sizes=None, team=n, content=self.content),
             constraints=None
             if self.constraints is None
             else np.moveaxis(self.constraints, 1, 0).reshape(-1, len(self.limits)),
@@ -296,7 +289,7 @@ class EpisodeStore:
             (last & ~ended[:, None]).ravel(),
             np.arange(1, e + 1) * length,
             None if state is None else _flat(state, e * (length + 1)),
-            {} if card is None else card,
+            complete_card(card or {}),
             constraints=None if several is None else _flat(several, steps),
         )
 
@@ -356,7 +349,7 @@ class EpisodeStore:
             _flags(ends[~ended], n_steps),
             ends,
             states,
-            {} if card is None else card,
+            complete_card(card or {}),
             None if speed is None else _numbers("speed", speed),
             several,
         )
@@ -393,7 +386,7 @@ class EpisodeStore:
     def save(self, path: str | os.PathLike) -> Path:
         """Write one HDF5 file, whole or not at all."""
         path = Path(path)
-        card = json.dumps(self.card)
+        card = json.dumps(self.card.to_dict())
         with whole(path) as temporary:
             try:
                 with h5py.File(temporary, "w") as f:
@@ -446,7 +439,7 @@ class EpisodeStore:
             reason = (str(error).splitlines() or [type(error).__name__])[0]
             raise StoreError(f"'{path}' is damaged or has no card ({reason}); make or import it again.") from error
         try:
-            found = cls(**content, card=card)
+            found = cls(**content, card=complete_card(card))
         except UserError as error:
             raise StoreError(f"'{path}': {error}") from None
         if digest is not None and digest != found.content:
@@ -482,8 +475,8 @@ def team(costs: np.ndarray) -> np.ndarray:
 
 
 def _several(
-    costs: Any, lead: tuple[int, ...], agents: int, card: dict | None
-) -> tuple[Any, np.ndarray | None, dict | None]:
+    costs: Any, lead: tuple[int, ...], agents: int, card: GivenCard | None
+) -> tuple[Any, np.ndarray | None, GivenCard | None]:
     """(costs, constraints, card): of a dictionary by name the largest, all of them (*lead, C) or (*lead, N, C), and the
     card with a limit of each."""
     if not isinstance(costs, dict):
@@ -496,13 +489,14 @@ def _several(
             raise StoreError(f"costs['{name}'] has shape {x.shape}, expected {lead} or {(*lead, agents)}.")
     if any(x.ndim > len(lead) for x in found.values()):  # the team's are everybody's
         found = {k: x if x.ndim > len(lead) else np.repeat(x[..., None], agents, -1) for k, x in found.items()}
-    given = dict((card or {}).get("constraints") or {})
+    fields = card.to_dict() if isinstance(card, StoreCard) else dict(card or {})
+    given = dict(fields.get("constraints") or {})
     for name in given:
         if name not in found:
             raise unknown("constraint with a limit", name, found)
     several = np.stack(list(found.values()), -1).astype(np.float32)
     limits = {name: given.get(name, 0.0) for name in found}
-    return several.max(-1), several, {**(card or {}), "constraints": limits}
+    return several.max(-1), several, {**fields, "constraints": limits}
 
 
 def _digest(card: str | bytes) -> str:

@@ -31,7 +31,7 @@ class WindowData:
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
         row, last = np.arange(store.steps) + episode, store.episode_ends[episode] + episode
-        bounds = store.card["action_low"], store.card["action_high"]
+        bounds = store.card.action_low, store.card.action_high
         seen = np.asarray(features(store.observations, store.state), np.float32)
         scores = np.zeros(store.steps) if scores is None else scores
         self.steps = store.steps

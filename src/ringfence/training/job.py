@@ -72,8 +72,8 @@ def make_job(
     if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
     limits: dict[str, float] = {}
-    if task.env is None and store is not None and a.limit is not None and "cost_limit" in store.card:
-        limits[a.limit] = float(store.card["cost_limit"])
+    if task.env is None and store is not None and a.limit is not None and store.card.cost_limit is not None:
+        limits[a.limit] = float(store.card.cost_limit)
     config = build_config(a.Config, {**a.presets[preset], **limits, **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
@@ -88,7 +88,7 @@ def make_job(
         settings = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
     elif world:
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
-    team = spec.n_agents if store is None else store.card.get("team", store.n_agents)
+    team = spec.n_agents if store is None else store.card.team or store.n_agents
     team = team if task.env is None else task.env.n_agents
     return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), settings, team)
 

@@ -386,7 +386,9 @@ def folder_of(out: str | Path, job: Job, seed: int) -> Path:
 
 
 def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
-    card = data.card if regenerated(data.card) else data.card | {"content": data.content}
+    card = data.card.to_dict()
+    if not regenerated(card):
+        card["content"] = data.content
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
         older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team")}  # that older runs do not tell

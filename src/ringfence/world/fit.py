@@ -141,10 +141,10 @@ def _fitted(
 def _data(store: EpisodeStore, several: bool) -> Data:
     """What the card says of the logs."""
     return Data(
-        task=store.card["task"],
-        content=store.card.get("content", store.content),
-        episodes=store.episodes // store.card.get("team", 1),
-        hazard=store.card["hazard"],
+        task=store.card.task,
+        content=store.card.content or store.content,
+        episodes=store.episodes // (store.card.team or 1),
+        hazard=store.card.hazard,
         constraints=store.limits if several else None,
     )
 
@@ -228,7 +228,7 @@ def _label(logged: Logged, acts: dynamics.Dynamics, settings: Settings, key: Key
     unsafe = logged.unsafe[steps]
     if unsafe.all() or not unsafe.any():
         raise UserError(
-            f"All unsafe steps of '{logged.store.card['task']}' lie in the episodes that are held out; log more of "
+            f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
             "them, or take another seed."
         )
     data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], jnp.asarray(logged.label)

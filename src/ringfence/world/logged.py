@@ -105,10 +105,10 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
     """(E,) bool: the episodes that no part of a World of this seed learns from."""
     if store.episodes < FEWEST:
         raise UserError(
-            f"'{store.card['task']}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
+            f"'{store.card.task}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
             "or more: cut long recordings into episodes."
         )
-    team = store.card.get("team", 1)  # agents of one team are held out together
+    team = store.card.team or 1  # agents of one team are held out together
     episodes = store.episodes // team
     count = max(1, round(HELD_OUT * episodes))
     out = np.zeros(episodes, bool)
@@ -130,14 +130,14 @@ def labels_of(
     else:
         labels = {"": store.costs > 0}
     for name, unsafe in labels.items():
-        _refuse_one_class(store.card["task"], name, unsafe, source)
+        _refuse_one_class(store.card.task, name, unsafe, source)
     return labels
 
 
 def _by_formula(store: EpisodeStore, map: FeatureMap, hazard: BoundHazard | None) -> np.ndarray:
     if hazard is None or not hazard.has_formula:
         raise UserError(
-            f"labels='formula' needs a formula of danger, which '{store.card['task']}' has not; take labels='costs', "
+            f"labels='formula' needs a formula of danger, which '{store.card.task}' has not; take labels='costs', "
             "or give its card a hazard."
         )
     after = np.arange(store.steps) + store.episode_of_step + 1

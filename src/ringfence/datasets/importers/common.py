@@ -51,7 +51,7 @@ def bounds_of(space: tuple[float, float] | None, asked: Asked) -> tuple[float, f
         "action_high": high if asked.high is None else asked.high,
     }
     card = complete_card(given)
-    return card["action_low"], card["action_high"]
+    return card.action_low, card.action_high
 
 
 def within(path: Path, name: str, actions: np.ndarray, bounds: tuple[float, float]) -> None:

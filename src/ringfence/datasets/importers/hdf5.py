@@ -125,7 +125,7 @@ def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: 
             flags[0],
             flags[1],
             log.ends,
-            card=card,
+            card=complete_card(card),
         )
     except UserError as error:
         raise StoreError(f"'{path}': {error}") from None

@@ -120,7 +120,7 @@ def ope(
 def check(run: Run, store: EpisodeStore) -> None:
     """Refuse logs of another task."""
     task = run.config["task"]
-    if task != store.card["task"]:
+    if task != store.card.task:
         raise UserError(
-            f"The run is of '{task}', the logs are of '{store.card['task']}'; evaluate it by logs of its own task."
+            f"The run is of '{task}', the logs are of '{store.card.task}'; evaluate it by logs of its own task."
         )

@@ -12,26 +12,27 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
+from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.features import others
 from ringfence.utils import stored
 
 
-def observe(card: Mapping[str, Any], state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
+def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
     """(N, O) what agents observe now, as in the store of a table with this `card`: for a policy at run time.
 
     `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
     `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
     are homogeneous, any number in any order.
     """
-    card = stored.card(card)
-    names: list[str] = list(card.get("observation_names") or ())
+    fields = stored.card(card.to_dict() if isinstance(card, StoreCard) else card)
+    names: list[str] = list(fields.get("observation_names") or ())
     columns = {name: np.asarray(column, np.float64) for name, column in state.items()}
     goals = {name: np.asarray(column, np.float64) for name, column in (goal or {}).items()}
     shapes = {column.shape for column in (*columns.values(), *goals.values())}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")
-    whom = _seen_by_each(card, columns, _others_in(names))
-    now = _Now(columns, goals, whom, float(card.get("sensing_radius", np.inf)))
+    whom = _seen_by_each(fields, columns, _others_in(names))
+    now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
     return np.stack([now.entry(name) for name in names], 1).astype(np.float32)
 
 
