@@ -14,7 +14,9 @@ from ringfence.cli.app import main
 from ringfence.errors import UserError
 from ringfence.evaluation import rollout
 from ringfence.guards import GUARDS
+from ringfence.logs.schema import ARRAYS
 from ringfence.logs.store import EpisodeStore
+from ringfence.training import worlds
 from ringfence.training.runs import Run
 
 
@@ -184,3 +186,30 @@ def test_a_folder_of_runs_is_what_it_holds(tmp_path):
     shutil.rmtree(tmp_path / "toy" / "bc" / "seed-1")
     assert Run.of(str(tmp_path)).path == tmp_path / "toy" / "bc" / "seed-0"
     assert Run.of(tmp_path / "nothing").path == tmp_path / "nothing", "refused where its config is read"
+
+
+def test_a_card_does_not_speak_to_the_terminal(small_store, tmp_path, capsys):
+    """Warnings and names of a stranger's store are shown, controls and all, as letters."""
+    card = {**small_store.card.to_dict(), "warnings": ["a\x1b]0;title\x07b"]}
+    arrays = {name: getattr(small_store, name) for name in ARRAYS if name != "costs"}
+    store = EpisodeStore(**arrays, costs=small_store.costs, state=small_store.state, card=card)
+    main(["data", "info", str(store.save(tmp_path / "s.h5"))])
+    said = capsys.readouterr().out
+    assert "a\\x1b]0;title\\x07b" in said and "\x1b" not in said
+
+
+@pytest.mark.parametrize("flag, value", [("--states", "0"), ("--seed", "-1"), ("--seed", str(2**31 - 1))])
+def test_ope_refuses_before_it_reads_anything(flag, value, tmp_path, capsys):
+    """Not after the World was fitted."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "config.json").write_text("{}")
+    with pytest.raises(SystemExit):
+        main(["ope", str(run), str(tmp_path / "nothing.h5"), flag, value])
+    assert f"{flag[2:]}={value} must be a whole number" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seed", [-1, 2**31, 10**30, True, "0"])
+def test_seeds_that_jax_does_not_take_are_refused(seed, small_store):
+    with pytest.raises(UserError, match="seed=.* must be a whole number from 0 to 2,147,483,647"):
+        worlds.fit(small_store, seed=seed)

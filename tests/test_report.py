@@ -417,3 +417,28 @@ def test_a_page_embeds_films_of_its_runs_alone(kind, runs, tmp_path):
         os.mkfifo(film)
     with pytest.raises(UserError, match="is no film of this run"):
         build_report(runs, tmp_path / "r.html")
+
+
+def test_names_of_strangers_are_letters_in_every_language():
+    """What Markdown strikes through or escapes, and what the end of LaTeX's row before would read as its own."""
+    from ringfence.utils import escape
+
+    assert escape.markdown("~~a~~ \\| $x$") == r"\~\~a\~\~ \\\| \$x\$"
+    assert escape.latex("[2cm]*<|>") == r"{[}2cm{]}{*}\textless{}\textbar{}\textgreater{}"
+    assert escape.page("a\x00\x1b[31m\u202e\ud800\n\tb") == "a\\x00\\x1b[31m\\u202e\\ud800\n\tb"
+    assert str(escape.lines("a\x1b]0;x\x07\n[red]b")) == "a\\x1b]0;x\\x07\n[red]b"
+
+
+def test_a_page_holds_no_control_characters(runs, tmp_path):
+    for run in runs:
+        config = json.loads((run.path / "config.json").read_text())
+        config["data"] |= {"simulator": "a\x00b\x1b[31mc"}
+        (run.path / "config.json").write_text(json.dumps(config))
+    text = build_report(runs, tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "a\\x00b\\x1b[31mc" in text and not set(text) & {"\x00", "\x1b"}
+
+
+def test_a_page_that_cannot_be_written_is_refused(runs, tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(UserError, match="is a file, no folder"):
+        build_report(runs, tmp_path / "file" / "r.html")

@@ -6,6 +6,8 @@ import difflib
 from collections.abc import Iterable
 from pathlib import Path
 
+LAST_SEED = 2**31 - 1  # that JAX takes everywhere
+
 
 class UserError(ValueError):
     """Bad input, refused before work starts. The command line prints the message alone, without a traceback, so what

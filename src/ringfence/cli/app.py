@@ -21,7 +21,7 @@ from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError, whole_number
 from ringfence.utils import interrupts
-from ringfence.utils.escape import terminal
+from ringfence.utils.escape import lines, terminal
 from ringfence.utils.files import writable
 
 if TYPE_CHECKING:
@@ -123,7 +123,7 @@ def fit(
     store = _store(data)
     settings: dict[str, Any] = dict(assignments(set))
     made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
-    out.print(str(made.card), soft_wrap=True, markup=False)
+    out.print(lines(str(made.card)), soft_wrap=True)
     if out_file is not None:
         print(world.save(made, out_file))
     if report is not None:
@@ -353,13 +353,14 @@ def ope(
     given = playing.arguments()
     report = None if report is None else writable(report)
     found = _runs([run])[0]
+    sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
+    evaluation.check_sizes(**sizes)
     store = _store(data)
     evaluation.check(found, store)
     world = worlds.fit(store, seed=seed + 1, execution=PolicySpec.of(found, **given).execution, quiet=False)
-    sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     result = evaluation.ope(found, store, evaluation_world=world, quiet=False, **sizes, **given)
     for line in result.summary():
-        out.print(line, soft_wrap=True, markup=False)
+        out.print(lines(line), soft_wrap=True)
     if report is not None:
         print(build_ope(report, world.card, audit(store), result))
 

@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, plain
 from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
 
@@ -302,7 +302,7 @@ def imported(store, file: Path) -> None:
     summary = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
     out.print(summary, soft_wrap=True, markup=False)
     for note in store.card.warnings:
-        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
+        out.print(f"[yellow]note[/] {escape(plain(note))}", soft_wrap=True)
 
 
 def info(file: Positional[Path]) -> None:
@@ -314,9 +314,9 @@ def info(file: Positional[Path]) -> None:
     for name, value in report.facts.items():
         out.print(terminal(f"{name:24} {value}"), soft_wrap=True)
     for note in report.notes:
-        out.print(f"[yellow]note[/] {escape(note)}", soft_wrap=True)
+        out.print(f"[yellow]note[/] {escape(plain(note))}", soft_wrap=True)
     for warning in report.warnings:
-        out.print(f"[yellow]warning[/] {escape(warning)}", soft_wrap=True)
+        out.print(f"[yellow]warning[/] {escape(plain(warning))}", soft_wrap=True)
 
 
 def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.episode import Cost, Episode
-from ringfence.errors import UserError, whole_number
+from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
@@ -66,6 +66,7 @@ def play(
     num_envs = options.pop("num_envs", num_envs)
     whole_number("episodes", episodes, 1)
     whole_number("num_envs", num_envs, 1)
+    whole_number("seed", seed, 0, LAST_SEED)
     if max_episode_steps is not None:
         whole_number("max_episode_steps", max_episode_steps, 1)
     if split not in rollout.RESETS:

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from ringfence.envs.episode import given_as
-from ringfence.errors import UserError, whole_number
+from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.guards.policy import Paid, costs_of_one
 from ringfence.loading.resolve import load
 from ringfence.proposals.base import act_with, heard
@@ -28,7 +28,7 @@ class Controller:
     def __init__(self, run: Run | str, planner: str = "default", seed: int = 0, **options):
         keep_programs()
         self.job, self.policy = load(run, planner=planner, **options)
-        self._key = jax.random.key(whole_number("seed", seed, 0, 2**31 - 1))
+        self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._act = jax.jit(act_with)
         self.info: dict[str, np.ndarray] = {}
         self.reset()

@@ -9,7 +9,8 @@ import jinja2
 from markupsafe import Markup
 
 from ringfence import __version__
-from ringfence.utils.files import whole
+from ringfence.utils.escape import page
+from ringfence.utils.files import whole, writable
 
 HERE = Path(__file__).parent
 
@@ -31,7 +32,7 @@ def render(template: str, context: dict[str, Any]) -> str:
         "share": share,
         "signed": signed,
     }
-    return engine.get_template(template).render(version=__version__, css=Markup(asset("style.css")), **context)
+    return page(engine.get_template(template).render(version=__version__, css=Markup(asset("style.css")), **context))
 
 
 def asset(name: str) -> str:
@@ -40,9 +41,9 @@ def asset(name: str) -> str:
 
 
 def page_file(out: str | Path) -> Path:
-    """`out`, or `report.html` in it where it is a folder."""
+    """`out`, or `report.html` in it where it is a folder; refused where no page can be written."""
     out = Path(out)
-    return out / "report.html" if out.is_dir() else out
+    return writable(out / "report.html" if out.is_dir() else out)
 
 
 def write(path: Path, text: str) -> Path:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
-from ringfence.errors import UserError
+from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.utils.compilation import keep_programs
@@ -73,8 +71,7 @@ def fit(
     keep_programs()
     if not isinstance(store, EpisodeStore):
         raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise UserError(f"seed={seed!r} must be a whole number, 0 or more.")
+    seed = whole_number("seed", seed, 0, LAST_SEED)
     task = task or registry.from_store(store)
     settings, store = settings_for(store, task, **changes), task.logs(store)
     map = task.feature_map(settings.view, store)
@@ -82,7 +79,7 @@ def fit(
     needed = settings.labels == "formula" and settings.barrier
     bind = constraints.bind if needed else constraints.bind_or_none
     hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
-    return fit_view(store, map, spec, settings, hazard=hazard, seed=int(seed), cached=cached, quiet=quiet)
+    return fit_view(store, map, spec, settings, hazard=hazard, seed=seed, cached=cached, quiet=quiet)
 
 
 def load(path: str | Path) -> World:

@@ -1,10 +1,12 @@
 """Where names of strangers become another language: a terminal's, a spreadsheet's, Markdown's, LaTeX's, a shell's.
 
-HTML is escaped by the page's templates, and figures read no mathematics in names (report/figures.py `STYLE`).
+HTML is escaped by the page's templates, and figures read no mathematics in names (report/figures.py `STYLE`); `page`
+takes what no page can hold out of both.
 """
 
 from __future__ import annotations
 
+import re
 import shlex
 
 from rich.text import Text
@@ -19,8 +21,15 @@ LATEX = {
     "±": r"$\pm$",
     "–": "--",
     "−": "$-$",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
 } | {c: f"\\{c}" for c in "&%$#_{}"}
+LATEX |= {c: f"{{{c}}}" for c in "[]*"}  # which `\\` of the row before would read as its own
 MARKDOWN = {
+    "\\": "\\\\",
+    "~": "\\~",
+    "$": "\\$",
     "|": "\\|",
     "_": "\\_",
     "*": "\\*",
@@ -34,9 +43,23 @@ MARKDOWN = {
 FORMULA = ("=", "+", "-", "@")  # what a spreadsheet computes when a cell begins with it
 
 
+# Controls but for line ends, halves of letters, and what turns the direction of text.
+_NO_PAGE = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
+
+
 def terminal(value) -> Text:
     """A cell that is shown as it stands: no markup, no control characters."""
     return Text(plain(str(value)))
+
+
+def lines(text: str) -> Text:
+    """Several lines that are shown as they stand."""
+    return Text("\n".join(plain(line) for line in text.split("\n")))
+
+
+def page(text: str) -> str:
+    """HTML without what no page can hold, shown as escapes."""
+    return _NO_PAGE.sub(lambda found: plain(found[0]), text)
 
 
 def spreadsheet(value):

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from ringfence.errors import UserError, whole_number
+from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.evaluation.ope.fqe import FQE, fitted_q
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.model_rollout import rollout
@@ -59,8 +59,8 @@ def ope(
     In `rollout_episodes` of up to `rollout_steps` steps it is played in that World, with its memory (0 episodes: not).
     `ahead` is how many steps are predicted from each logged state.
     """
-    for name, value in (("states", states), ("transitions", transitions), ("updates", updates), ("ahead", ahead)):
-        whole_number(name, value, 1)
+    check_sizes(states, transitions, updates, seed)
+    whole_number("ahead", ahead, 1)
     whole_number("rollout_episodes", rollout_episodes, 0)
     whole_number("rollout_steps", rollout_steps, 1)
     whole_number("num_ensemble", num_ensemble, 2, 100)
@@ -115,6 +115,13 @@ def ope(
         values=values,
         values_of_logs=values_of_logs,
     )
+
+
+def check_sizes(states: int, transitions: int, updates: int, seed: int) -> None:
+    """Refuse sizes that cannot be, before anything is fitted."""
+    for name, value in (("states", states), ("transitions", transitions), ("updates", updates)):
+        whole_number(name, value, 1)
+    whole_number("seed", seed, 0, LAST_SEED - 1)  # the World that evaluates has the next one
 
 
 def check(run: Run, store: EpisodeStore) -> None:
