@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -17,6 +19,42 @@ out = Console(highlight=False)
 Positional = tyro.conf.Positional
 Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
 Out = Annotated[Path, tyro.conf.arg(name="out")]
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """How rows of agents and times become episodes."""
+
+    separation: float | None = None
+    """m between two agents' centres below which a step costs 1, where nothing else says what it costs."""
+    dt: float | None = None
+    """s, of the store's steps; that of the rows by default."""
+    gap: float | None = None
+    """s without a row, after which an agent was away; five steps by default."""
+    team: int | None = None
+    """agents of an episode; by default as many as most rows have."""
+    neighbours: int | None = None
+    """episodes of one agent each, who sees so many others; one policy for any number of them."""
+    sensing_radius: float | None = None
+    """m, how far such an agent sees."""
+    min_episode_steps: int = 5
+    """steps of an episode, at least."""
+    max_episode_steps: int | None = None
+    """steps of an episode, at most; longer ones are cut."""
+    max_speed: float = 100.0
+    """m/s that nothing there can do."""
+
+    def options(self) -> dict[str, Any]:
+        """Fields of a `TableSchema`."""
+        from ringfence.problem.constraints import Separation
+
+        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        radius = given.pop("separation")
+        return {**given, "danger": None if radius is None else Separation(radius, radius / 4)}
+
+
+AS_THEY_ARE = Episodes()
+HowEpisodes = tyro.conf.OmitArgPrefixes[Episodes]
 
 
 def make(
@@ -55,15 +93,7 @@ def import_table(
     limits: list[float] = [],  # noqa: B006
     goal: list[str] = [],  # noqa: B006
     layout: Literal["highd", "interaction"] | None = None,
-    separation: float | None = None,
-    dt: float | None = None,
-    gap: float | None = None,
-    team: int | None = None,
-    neighbours: int | None = None,
-    sensing_radius: float | None = None,
-    min_episode_steps: int = 5,
-    max_episode_steps: int | None = None,
-    max_speed: float = 100.0,
+    episodes: HowEpisodes = AS_THEY_ARE,
     task: str | None = None,
 ) -> None:
     """Import a CSV or Parquet file with a row per agent and time; needs the extra `ringfence[tables]`.
@@ -81,34 +111,17 @@ def import_table(
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
         goal: columns of where it is to go, as many as its position has.
         layout: names of columns of a published format, instead of the options above.
-        separation: m between two agents' centres below which a step costs 1, where no column tells.
-        dt: s, of the store's steps; the table's own by default.
-        gap: s without a row, after which an agent was away; five steps by default.
-        team: agents of an episode; by default as many as most rows have.
-        neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
-        sensing_radius: m, how far such an agent sees.
-        min_episode_steps: steps of an episode, at least.
-        max_episode_steps: steps of an episode, at most; longer ones are cut.
-        max_speed: m/s that nothing there can do.
+        episodes: how rows become episodes.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.store import EpisodeStore
-    from ringfence.problem.constraints import Separation
 
     kept = writable(out_file)
     if limits and len(limits) != len(cost):
         raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
     bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
     options = {
-        "danger": None if separation is None else Separation(separation, separation / 4),
-        "dt": dt,
-        "gap": gap,
-        "team": team,
-        "neighbours": neighbours,
-        "sensing_radius": sensing_radius,
-        "min_episode_steps": min_episode_steps,
-        "max_episode_steps": max_episode_steps,
-        "max_speed": max_speed,
+        **episodes.options(),
         "cost": cost,
         "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **bounds},
     }
@@ -116,8 +129,9 @@ def import_table(
         if state or action or reward or goal or episode:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
         return imported(EpisodeStore.from_layout(file, layout, **options), kept)
-    columns = dict(state=state, action=action, reward=reward, goal=goal, episode=episode)
-    imported(EpisodeStore.from_table(file, time=time, agent=agent, **columns, **options), kept)
+    options |= {"time": time, "agent": agent, "episode": episode, "state": state}
+    options |= {"action": action, "reward": reward, "goal": goal}
+    imported(EpisodeStore.from_table(file, **options), kept)
 
 
 def import_bag(
@@ -128,14 +142,7 @@ def import_bag(
     cmd: str = "cmd_vel",
     joints: str | None = None,
     cost: str | None = None,
-    separation: float | None = None,
-    dt: float | None = None,
-    gap: float | None = None,
-    team: int | None = None,
-    neighbours: int | None = None,
-    sensing_radius: float | None = None,
-    min_episode_steps: int = 5,
-    max_episode_steps: int | None = None,
+    episodes: HowEpisodes = AS_THEY_ARE,
     stamps: bool = True,
     twist: Literal["child", "world"] = "child",
     task: str | None = None,
@@ -150,21 +157,13 @@ def import_bag(
         cmd: topic of commands, below the prefix.
         joints: topic of joint states, below the prefix.
         cost: topic of danger, of each agent below the prefix, or of the team.
-        separation: m between two agents' centres below which a step costs 1, where no topic tells.
-        dt: s, of the store's steps; the odometry's own by default.
-        gap: s without odometry, after which an agent was away; five steps by default.
-        team: agents of an episode; by default as many as most rows have.
-        neighbours: episodes of one agent each, who sees so many others; one policy for any number of them.
-        sensing_radius: m, how far such an agent sees.
-        min_episode_steps: steps of an episode, at least.
-        max_episode_steps: steps of an episode, at most; longer ones are cut.
+        episodes: how rows become episodes.
         stamps: take the times in headers; --no-stamps takes those of recording.
         twist: frame of the odometry's velocities, child (ROS's rule) or world.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.rosbag import read_bag
     from ringfence.logs.store import EpisodeStore
-    from ringfence.problem.constraints import Separation
 
     kept = writable(out_file)
     bag = read_bag(file, agents, odom=odom, cmd=cmd, joints=joints, cost=cost, stamps=stamps, twist=twist)
@@ -175,16 +174,9 @@ def import_bag(
         state=bag.state,
         action=bag.action,
         cost="cost" if "cost" in bag.columns else None,
-        danger=None if separation is None else Separation(separation, separation / 4),
-        dt=dt,
-        gap=gap,
-        team=team,
-        neighbours=neighbours,
-        sensing_radius=sensing_radius,
-        min_episode_steps=min_episode_steps,
-        max_episode_steps=max_episode_steps,
         notes=bag.notes,
         card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
+        **episodes.options(),
     )
     imported(store, kept)
 

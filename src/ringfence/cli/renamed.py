@@ -26,12 +26,13 @@ OLD_FLAGS["export"] |= {"--step": "--checkpoint"}
 OLD_FLAGS["play"] |= {"--at-once": "--num-envs"}
 OLD_FLAGS["fit"] = {"--sight": "--execution"}
 OLD_FLAGS["train"] = {"--together": "--vmap-seeds"}
-OLD_FLAGS["data import-bag"] = {
-    "--longest": "--max-episode-steps",
-    "--shortest": "--min-episode-steps",
-    "--sight": "--sensing-radius",
-}
-OLD_FLAGS["data import-table"] = OLD_FLAGS["data import-bag"] | {"--fastest": "--max-speed"}
+for importer in ("data import-table", "data import-bag"):
+    OLD_FLAGS[importer] = {
+        "--longest": "--max-episode-steps",
+        "--shortest": "--min-episode-steps",
+        "--fastest": "--max-speed",
+        "--sight": "--sensing-radius",
+    }
 # By today's flag.
 OLD_VALUES: dict[str, dict[str, str]] = {
     "--barrier": stored.BARRIERS,

@@ -30,14 +30,15 @@ class WindowData:
     def __init__(self, store: EpisodeStore, features: Callable, scores: np.ndarray | None = None):
         episode = store.episode_of_step
         starts = np.concatenate([[0], store.episode_ends[:-1]])
-        row, last = np.arange(store.steps) + episode, store.episode_ends[episode] + episode
-        bounds = store.card.action_low, store.card.action_high
+        row = np.arange(store.steps) + episode
+        last = store.episode_ends[episode] + episode
         seen = np.asarray(features(store.observations, store.state), np.float32)
+        actions = normalise.to_unit(jnp.asarray(store.actions), store.card.action_low, store.card.action_high)
         scores = np.zeros(store.steps) if scores is None else scores
         self.steps = store.steps
         self.arrays = {
             "features": jnp.asarray(seen),  # (M, N, D)
-            "actions": normalise.to_unit(jnp.asarray(store.actions), *bounds),  # (T, N, A)
+            "actions": actions,  # (T, N, A)
             "rewards": jnp.asarray(store.rewards),  # (T, N)
             "terminated": jnp.asarray(store.terminated),  # (T,)
             "scores": jnp.asarray(scores, jnp.float32),  # (T,)
@@ -59,7 +60,8 @@ def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) ->
     """The windows whose present is the state before `step` (B,)."""
     offset = jnp.arange(-history, horizon)
     wanted = arrays["row"][step][:, None] + offset
-    first, last = arrays["first_row"][step][:, None], arrays["last_row"][step][:, None]
+    first = arrays["first_row"][step][:, None]
+    last = arrays["last_row"][step][:, None]
     row = jnp.clip(wanted, first, last)
     valid = wanted <= last
     # Step index of the action after each row but the last; a padded one is masked out.

@@ -41,8 +41,9 @@ def _pose(position, orientation) -> tuple[float, ...]:
 
 
 def _odometry(m) -> tuple[float, ...]:
-    moved, twist = m.pose.pose, m.twist.twist
-    return *_pose(moved.position, moved.orientation), twist.linear.x, twist.linear.y, twist.angular.z
+    pose = m.pose.pose
+    twist = m.twist.twist
+    return *_pose(pose.position, pose.orientation), twist.linear.x, twist.linear.y, twist.angular.z
 
 
 def _command(twist) -> tuple[float, ...]:

@@ -360,7 +360,8 @@ def _poses(topic: Topic, time: np.ndarray, twist: str, notes: list[str]) -> dict
         )
     # of degree two above and below, so the quaternion's norm cancels
     yaw = np.arctan2(2 * (qw * qz + qx * qy), qw**2 + qx**2 - qy**2 - qz**2)
-    cos, sin = np.cos(yaw), np.sin(yaw)
+    cos = np.cos(yaw)
+    sin = np.sin(yaw)
     columns = {"time": time, "x": x, "y": y, "yaw": yaw, "cos_yaw": cos, "sin_yaw": sin}
     if not moves:
         return columns

@@ -119,17 +119,19 @@ def cut(rows: np.ndarray, fewest: int, most: int | None) -> tuple[np.ndarray, np
     if most is not None:
         pieces = np.maximum(-(-steps // most), 1)
         number = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        starts, steps = np.repeat(starts, pieces) + number * most, np.repeat(steps, pieces) - number * most
-        steps = np.minimum(steps, most)
+        starts = np.repeat(starts, pieces) + number * most
+        steps = np.minimum(np.repeat(steps, pieces) - number * most, most)
     kept = steps >= fewest
-    starts, many = starts[kept], steps[kept] + 1
+    starts = starts[kept]
+    many = steps[kept] + 1
     return np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(starts, many), many
 
 
 def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float) -> np.ndarray:
     """(R, k) rows of the agents who are nearest at the same time, −1 where nobody is within `sensing_radius` m."""
     order = np.lexsort((tracks.step, tracks.recording))
-    recording, step = tracks.recording[order], tracks.step[order]
+    recording = tracks.recording[order]
+    step = tracks.step[order]
     begins = np.ones(len(order), bool)
     begins[1:] = (np.diff(recording) != 0) | (np.diff(step) != 0)
     first = np.flatnonzero(begins)
@@ -138,7 +140,8 @@ def nearest(tracks: Tracks, position: np.ndarray, k: int, sensing_radius: float)
     by_size = np.argsort(many, kind="stable")  # so that little is padded
     while len(by_size):
         most = int(np.searchsorted(np.cumsum(many[by_size] ** 2), CHUNK)) + 1
-        now, by_size = by_size[:most], by_size[most:]
+        now = by_size[:most]
+        by_size = by_size[most:]
         width = int(many[now].max())
         place = first[now, None] + np.arange(width)
         there = np.arange(width) < many[now, None]
