@@ -292,7 +292,7 @@ def _reads_danger(cell: Path) -> bool:
     config = json.loads((cell / "config.json").read_text())
     algorithm = algos.get(config["algorithm"])
     known = {k: v for k, v in config["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
-    return algorithm.reads(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"
+    return algorithm.cost_source(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"
 
 
 def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:

@@ -50,7 +50,7 @@ QUICK = {"episodes": 4, "sampling_steps": 2}
 def job_of(name):
     """What training of an algorithm is told: tiny settings, and a World that is fitted quickly where it reads one."""
     algorithm = algos.get(name)
-    reads_world = algorithm.needs(build_config(algorithm.Config, TINY[name], name)) is not None
+    reads_world = algorithm.world_settings(build_config(algorithm.Config, TINY[name], name)) is not None
     return {"changes": TINY[name], "quiet": True} | ({"world": QUICK_WORLD} if reads_world else {})
 
 

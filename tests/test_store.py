@@ -392,15 +392,15 @@ def test_returns_to_go_is_the_discounted_sum(lengths, discount, seed):
 @given(lengths=st.lists(st.integers(1, 12), min_size=1, max_size=80), seed=st.integers(0, 999))
 def test_return_scores_keep_the_order_within_a_time_step(lengths, seed):
     time = np.concatenate([np.arange(n) for n in lengths])
-    togo = np.random.default_rng(seed).normal(size=len(time)).round(1)  # rounded: ties occur
-    scores = return_scores(togo, time)
+    returns_to_go = np.random.default_rng(seed).normal(size=len(time)).round(1)  # rounded: ties occur
+    scores = return_scores(returns_to_go, time)
     assert np.isfinite(scores).all() and abs(scores.mean()) < 0.3
     for t in range(max(lengths)):
         here = time == t
-        order = np.argsort(togo[here])
+        order = np.argsort(returns_to_go[here])
         assert (np.diff(scores[here][order]) >= 0).all()
-        for value in np.unique(togo[here]):
-            assert len(np.unique(scores[here & (togo == value)])) == 1
+        for value in np.unique(returns_to_go[here]):
+            assert len(np.unique(scores[here & (returns_to_go == value)])) == 1
 
 
 @pytest.mark.parametrize(

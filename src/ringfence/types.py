@@ -132,13 +132,12 @@ class Algorithm:
     presets: dict[str, dict[str, Any]]  # named differences from the config's defaults; the first is the default
     # config -> what training knows danger by: the hazard's labels of states, the World's barrier, the logged costs
     # alone, or nothing
-    reads: Callable[[Any], Literal["labels", "world", "costs", "nothing"]] = lambda config: "labels"
-    prepare: Callable[..., Any] | None = (
-        None  # (store, config, feature_map, world) -> WindowData, if not all of the store
-    )
+    cost_source: Callable[[Any], Literal["labels", "world", "costs", "nothing"]] = lambda config: "labels"
+    # (store, config, feature_map, world) -> WindowData, if not all of the store
+    make_windows: Callable[..., Any] | None = None
     # config -> settings of the World that training reads, if it reads one
-    needs: Callable[[Any], dict[str, Any] | None] = lambda config: None
-    of_world: Callable[[Any, Any], dict[str, PyTree]] | None = None  # (world, config) -> state["world"]
+    world_settings: Callable[[Any], dict[str, Any] | None] = lambda config: None
+    from_world: Callable[[Any, Any], dict[str, PyTree]] | None = None  # (world, config) -> state["world"]
     limit: str | None = None  # the config field that is a limit of the cost per episode: own data's card fills it
     revision: int = 1  # raised when the same settings come to train another policy; config.json tells it
 

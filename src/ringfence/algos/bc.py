@@ -71,12 +71,12 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError("bc looks at the present state alone; leave history=0 and horizon=2.")
 
 
-def reads(config: Config) -> Literal["costs", "nothing"]:
+def cost_source(config: Config) -> Literal["costs", "nothing"]:
     """Costs choose the episodes that are cloned, if anything does."""
     return "nothing" if config.cost_limit is None else "costs"
 
 
-def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: None) -> WindowData:
+def make_windows(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: None) -> WindowData:
     """All episodes, or those within the limit."""
     return WindowData(within(store, config), feature_map)
 
@@ -137,8 +137,8 @@ BC = Algorithm(
         "joint": {"view": "pruned"},
         "mujoco-joint": {"view": "pruned", "steps": 8_000},
     },
-    reads=reads,
-    prepare=prepare,
+    cost_source=cost_source,
+    make_windows=make_windows,
 )
 BC_SAFE = replace(
     BC,

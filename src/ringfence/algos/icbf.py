@@ -184,10 +184,10 @@ def init(
         norm = normalise.Normaliser(one, one, moved, moved, config.history, config.coordinates)
     else:
         norm = fit_normaliser(config, data, jax.random.split(ks)[0])
-    return jax.jit(networks)() | {"frozen": {"normaliser": norm}, "world": of_world(world, config)}
+    return jax.jit(networks)() | {"frozen": {"normaliser": norm}, "world": from_world(world, config)}
 
 
-def of_world(world: World, config: Config) -> dict[str, PyTree]:
+def from_world(world: World, config: Config) -> dict[str, PyTree]:
     """What states are worth and, where the generator follows it, the barrier."""
     return {"critic": world.values.critic} | ({"barrier": world.barrier} if follows(config) else {})
 
@@ -229,7 +229,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
             )
 
 
-def reads(config: Config) -> Literal["labels", "world", "nothing"]:
+def cost_source(config: Config) -> Literal["labels", "world", "nothing"]:
     """Joint training labels generated states; `split` follows the World's barrier; without one, danger matters at run
     time only."""
     if not config.barrier:
@@ -237,7 +237,7 @@ def reads(config: Config) -> Literal["labels", "world", "nothing"]:
     return "labels" if config.routing == "paper" else "world"
 
 
-def prepare(store, config: Config, feature_map: features.FeatureMap, world: World) -> WindowData:
+def make_windows(store, config: Config, feature_map: features.FeatureMap, world: World) -> WindowData:
     """Windows with the condition that plans are drawn for."""
     seen = feature_map(store.observations, store.state) if config.condition == "advantage" else None
     if seen is not None:
@@ -246,7 +246,7 @@ def prepare(store, config: Config, feature_map: features.FeatureMap, world: Worl
     return WindowData(store, feature_map, found)
 
 
-def needs(config: Config) -> dict:
+def world_settings(config: Config) -> dict:
     """The World that training reads: in the planner's own view, with its discount."""
     return {"view": config.view, "discount": config.discount}
 
@@ -518,10 +518,10 @@ ICBF = Algorithm(
     make_diagnose,
     make_policy,
     PRESETS,
-    reads=reads,
-    prepare=prepare,
-    needs=needs,
-    of_world=of_world,
+    cost_source=cost_source,
+    make_windows=make_windows,
+    world_settings=world_settings,
+    from_world=from_world,
     revision=4,
 )
 MADIFF = dataclasses.replace(

@@ -63,10 +63,18 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, 
     return Rest(spec)
 
 
-def reads(config: Config) -> Literal["nothing"]:
+def cost_source(config: Config) -> Literal["nothing"]:
     return "nothing"
 
 
 MPC = Algorithm(
-    "mpc", Config, lambda config, hazard: None, init, make_update, ac.no_diagnosis, make_policy, {"default": {}}, reads
+    "mpc",
+    Config,
+    lambda config, hazard: None,
+    init,
+    make_update,
+    ac.no_diagnosis,
+    make_policy,
+    {"default": {}},
+    cost_source,
 )

@@ -250,7 +250,7 @@ OMAR = Algorithm(
         **_TIERS,
         "mujoco": _MUJOCO,
     },
-    reads=lambda config: "nothing",
+    cost_source=lambda config: "nothing",
 )
 _CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "steps": 2_000}
 MA_CQL = replace(

@@ -83,7 +83,9 @@ def init(
     return bc.start(key, spec, config, data, spec.feature_dim + 1)
 
 
-def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None) -> WindowData:
+def make_windows(
+    store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None
+) -> WindowData:
     """Windows with their scores."""
     store = bc.within(store, config)
     seen = None
@@ -95,7 +97,7 @@ def prepare(store: EpisodeStore, config: Config, feature_map: features.FeatureMa
     return WindowData(store, feature_map, scores)
 
 
-def needs(config: Config) -> dict | None:
+def world_settings(config: Config) -> dict | None:
     """Values alone score an advantage."""
     return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
 
@@ -113,7 +115,7 @@ BC_BEST = replace(
     bc.BC,
     name="bc-best",
     Config=BestConfig,
-    prepare=best_of,
+    make_windows=best_of,
     presets={"default": {}, "mujoco": {"steps": 20_000}},
 )
 BC_RETURN = Algorithm(
@@ -125,8 +127,8 @@ BC_RETURN = Algorithm(
     ac.no_diagnosis,
     make_policy,
     {"default": {}, "mujoco": {"steps": 8_000}, "advantage": {"condition": "advantage"}},
-    reads=bc.reads,
-    prepare=prepare,
-    needs=needs,
-    of_world=lambda world, config: {},
+    cost_source=bc.cost_source,
+    make_windows=make_windows,
+    world_settings=world_settings,
+    from_world=lambda world, config: {},
 )

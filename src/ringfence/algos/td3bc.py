@@ -68,7 +68,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
         )
 
 
-def reads(config: Config) -> Literal["costs", "nothing"]:
+def cost_source(config: Config) -> Literal["costs", "nothing"]:
     """What cost critics learn from, if there are any."""
     return "costs" if config.lagrange else "nothing"
 
@@ -209,7 +209,7 @@ MA_TD3BC = Algorithm(
         "mujoco": _MUJOCO,
         "mujoco-long": {**_MUJOCO, "steps": 40_000},  # ant_2x4-good: 3.1 k, published 2.9 k; 1.1 k before
     },
-    reads=reads,
+    cost_source=cost_source,
 )
 MA_TD3BC_LAG = replace(
     MA_TD3BC,

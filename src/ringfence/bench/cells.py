@@ -94,7 +94,7 @@ class Cell:
     def paired(self) -> Cell | None:
         """The same cell on the task that shares this one's data under another definition of danger, if the algorithm
         reads none: it learned the same there."""
-        if algos.get(self.algorithm).reads(self.config) != "nothing":
+        if algos.get(self.algorithm).cost_source(self.config) != "nothing":
             return None
         other = registry.paired(self.task)
         return None if other is None else dataclasses.replace(self, task=other)

@@ -115,8 +115,8 @@ def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple
         return loop.learned(state)
 
     step, state = run.load_checkpoint(jax.eval_shape(blank), spec.checkpoint)
-    if world is not None and job.algorithm.of_world is not None:
-        state |= {"world": job.algorithm.of_world(world, job.config)}
+    if world is not None and job.algorithm.from_world is not None:
+        state |= {"world": job.algorithm.from_world(world, job.config)}
     return step, make_policy(job, state, {**PLANNERS[spec.planner], **dict(spec.plan_options)})
 
 

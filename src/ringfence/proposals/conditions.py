@@ -59,7 +59,7 @@ def normal_scores(x: np.ndarray) -> np.ndarray:
     return ndtri((rankdata(x) - 0.5) / len(x))
 
 
-def return_scores(togo: np.ndarray, time: np.ndarray) -> np.ndarray:
+def return_scores(returns_to_go: np.ndarray, time: np.ndarray) -> np.ndarray:
     """(T,) normal score of each return-to-go: Φ⁻¹ of its rank among the steps at the same time.
 
     Ranking within the time step keeps early windows from seeing impossible targets, and the normal score keeps the
@@ -67,14 +67,14 @@ def return_scores(togo: np.ndarray, time: np.ndarray) -> np.ndarray:
     """
     order = np.argsort(time, kind="stable")
     counts = np.bincount(time)
-    edges, start, out = [], 0, np.zeros(len(togo))
+    edges, start, out = [], 0, np.zeros(len(returns_to_go))
     for count in np.cumsum(counts):
-        if count - start >= MIN_COHORT or count == len(togo):
+        if count - start >= MIN_COHORT or count == len(returns_to_go):
             edges.append((start, count))
             start = count
     if len(edges) > 1 and edges[-1][1] - edges[-1][0] < MIN_COHORT:
         edges[-2:] = [(edges[-2][0], edges[-1][1])]
     for a, b in edges:
         cohort = order[a:b]
-        out[cohort] = normal_scores(togo[cohort])
+        out[cohort] = normal_scores(returns_to_go[cohort])
     return out

@@ -35,7 +35,7 @@ class Job:
     @property
     def reads_world(self) -> bool:
         """Whether training reads a World."""
-        return self.algorithm.needs(self.config) is not None
+        return self.algorithm.world_settings(self.config) is not None
 
     def describe(self, seed: int, card: dict) -> dict:
         """What config.json holds."""
@@ -77,13 +77,13 @@ def make_job(
     config = build_config(a.Config, {**a.presets[preset], **limits, **changes}, a.name)
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
-    reads = a.reads(config)
-    hazard = _bound(task, spec, reads, config.view, store)
+    cost_source = a.cost_source(config)
+    hazard = _bound(task, spec, cost_source, config.view, store)
     a.check(config, hazard)
-    if store is not None and reads != "nothing" and not store.costs.any():
-        _refuse_blank_costs(a.name, task, store, reads)
+    if store is not None and cost_source != "nothing" and not store.costs.any():
+        _refuse_blank_costs(a.name, task, store, cost_source)
     settings = None
-    wanted = a.needs(config)
+    wanted = a.world_settings(config)
     if wanted is not None and store is not None:
         settings = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
     elif world:
@@ -103,13 +103,13 @@ def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None
     return store.observations.shape[2], 0 if store.state is None else store.state.shape[1]
 
 
-def _bound(task: Task, spec: Spec, reads: str, view: str, store: EpisodeStore | None) -> constraints.BoundHazard:
+def _bound(task: Task, spec: Spec, cost_source: str, view: str, store: EpisodeStore | None) -> constraints.BoundHazard:
     """The hazard as the algorithm's own view tells it. Where that view lacks what the formula is about (positions that
     only the global state holds), those who label no states train all the same, with the costs for danger."""
     try:
         return constraints.bind(task.hazard, spec.feature_names, spec.n_agents)
     except UserError:
-        if reads not in ("labels", "world"):
+        if cost_source not in ("labels", "world"):
             return constraints.bind(constraints.CostColumn(), spec.feature_names, spec.n_agents)
         if view != "pruned" and store is not None and _binds(task, store):
             raise UserError(
@@ -123,7 +123,7 @@ def _binds(task: Task, store: EpisodeStore) -> bool:
     return constraints.bind_or_none(task.hazard, names, store.n_agents) is not None
 
 
-def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: str) -> None:
+def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, cost_source: str) -> None:
     """Refuse costs that were never filled in to who would call every step safe: those who learn from them alone, and
     everybody where no formula says more."""
     if isinstance(task.hazard, constraints.CostColumn):
@@ -131,7 +131,7 @@ def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, reads: 
             f"{algorithm} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard "
             "with a formula; give EpisodeStore one of them, or train an algorithm that reads none."
         )
-    if reads in ("labels", "world"):  # a World's barrier learns from the formula then
+    if cost_source in ("labels", "world"):  # a World's barrier learns from the formula then
         return
     unsafe = disagreement(store, task) or 0.0  # with costs of 0, that is the share that the formula calls unsafe
     if unsafe > (DISAGREE if isinstance(task.hazard, constraints.SpeedLimit) else 0.0):

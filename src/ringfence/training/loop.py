@@ -165,9 +165,9 @@ class _Lessons:
 
 def windows_of(job: Job, store: EpisodeStore, world: World | None = None) -> WindowData:
     """What a job draws its batches from."""
-    if job.algorithm.prepare is None:
+    if job.algorithm.make_windows is None:
         return WindowData(store, job.feature_map)
-    return job.algorithm.prepare(store, job.config, job.feature_map, world)
+    return job.algorithm.make_windows(store, job.config, job.feature_map, world)
 
 
 @dataclass(frozen=True)
