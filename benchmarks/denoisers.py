@@ -43,9 +43,9 @@ def main() -> None:
     rows = []
     for name, changes in ENTRIES:
         # The learning rate falls over `steps`, so the number of updates that fit is found first.
-        ms = trial(store, task, {**changes, "steps": 1000}, 20)[1]
+        ms = trial(store, task, {**changes, "num_updates": 1000}, 20)[1]
         steps = max(20, int(a.seconds / ms * 1e3))
-        (job, state), took = trial(store, task, {**changes, "steps": steps}, steps)
+        (job, state), took = trial(store, task, {**changes, "num_updates": steps}, steps)
         result, _ = evaluate_policy(make_policy(job, state, {}), task, 100, "validation")
         size = sum(np.size(x) for x in jax.tree.leaves(state["params"]["denoiser"]))
         for what, value, unit in (

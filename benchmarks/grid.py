@@ -32,13 +32,13 @@ BRIEF = {"tasks": ["simple_spread-medium-replay"], "algorithms": ["bc", "bc-safe
 
 def grid_of(out: Path, tasks, algorithms, seeds, episodes, steps=None):
     return make_grid(
-        "simple_spread", out, seeds=seeds, episodes=episodes, only_tasks=tasks, only=algorithms, steps=steps
+        "simple_spread", out, seeds=seeds, episodes=episodes, only_tasks=tasks, only=algorithms, num_updates=steps
     )
 
 
 def command(out: Path, tasks, algorithms, seeds, episodes, steps=None) -> list[str]:
     chosen = ["--tasks", *tasks, "--algorithms", *algorithms, "--seeds", str(seeds), "--episodes", str(episodes)]
-    chosen += [] if steps is None else ["--steps", str(steps)]
+    chosen += [] if steps is None else ["--num-updates", str(steps)]
     start = [sys.executable, "-c", "from ringfence.cli.app import main; main()", "bench", "simple_spread"]
     return [*start, *chosen, "--workers", "1", "--out", str(out)]
 

@@ -37,7 +37,7 @@ def main() -> None:
         world = worlds.fit(store, cached=False)
         row(f"{name}: fitting a World", time.perf_counter() - begun, "s")
         with tempfile.TemporaryDirectory() as folder:
-            (run,) = loop.train("bc", store, out=folder, changes={"steps": 200}, quiet=True)
+            (run,) = loop.train("bc", store, out=folder, changes={"num_updates": 200}, quiet=True)
             for guard in GUARDS:
                 how = {} if guard == "none" else {"guard": guard, "world": world}
                 took = plan_latency(load(run, **how)[1], registry.get(name))

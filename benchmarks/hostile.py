@@ -138,7 +138,7 @@ def stores(place: Path, times: int) -> Iterator[Case]:
 
 
 def checkpoints(place: Path, times: int) -> Iterator[Case]:
-    changes = {"view": "decentralized", "steps": 4, "width": 16}
+    changes = {"view": "decentralized", "num_updates": 4, "width": 16}
     run = loop.train("bc", corpus.small_store(), out=place / "runs", changes=changes, quiet=True)[0]
     for _, old in run.checkpoints()[:-1]:
         old.unlink()

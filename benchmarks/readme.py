@@ -289,7 +289,7 @@ def spent(folder: Path) -> str:
 
 
 def _reads_danger(cell: Path) -> bool:
-    config = json.loads((cell / "config.json").read_text())
+    config = stored.config(json.loads((cell / "config.json").read_text()))
     algorithm = algos.get(config["algorithm"])
     known = {k: v for k, v in config["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
     return algorithm.cost_source(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"

@@ -33,7 +33,7 @@ from ringfence.datasets.make import make
 from ringfence.training.runs import Run
 what, task, folder, steps = sys.argv[1], tasks.get(sys.argv[2]), Path(sys.argv[3]), int(sys.argv[4])
 if what == "train":
-    changes = {"steps": steps} if steps else {}
+    changes = {"num_updates": steps} if steps else {}
     training.train("icbf", make(task)[0], folder=lambda seed: folder, changes=changes, quiet=True)
 else:
     guard = {"guard": what} if what != "none" else {}

@@ -66,8 +66,8 @@ STUDIES = {
         100,
         1.0,
         {
-            ("bc", ""): [{"width": 256}, {"steps": 8_000}, {"lr": 3e-4, "steps": 8_000}],
-            ("bc-safe", ""): [{"cost_limit": 0.5}, {"cost_limit": 2.0}, {"steps": 8_000}],
+            ("bc", ""): [{"width": 256}, {"num_updates": 8_000}, {"lr": 3e-4, "num_updates": 8_000}],
+            ("bc-safe", ""): [{"cost_limit": 0.5}, {"cost_limit": 2.0}, {"num_updates": 8_000}],
             ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"centralised_critic": True}],
             ("ma-td3bc-lag", ""): [{"multiplier_max": 3.0}, {"multiplier_max": 30.0}, {"alpha": 10.0}],
             ("fisor", ""): [{"temperature_reward": 1.0}, {"expectile_danger": 0.7}, {"discount": 0.95}],
@@ -97,15 +97,15 @@ STUDIES = {
         10,
         25.0,
         {
-            ("bc", ""): [{"width": 256}, {"steps": 20_000}, {"lr": 3e-4, "steps": 20_000}],
+            ("bc", ""): [{"width": 256}, {"num_updates": 20_000}, {"lr": 3e-4, "num_updates": 20_000}],
             # preset until the search: 8000 updates
             ("bc-safe", ""): [
-                {"steps": 8_000},
-                {"steps": 8_000, "cost_limit": 100.0},
-                {"steps": 8_000, "cost_limit": 400.0},
+                {"num_updates": 8_000},
+                {"num_updates": 8_000, "cost_limit": 100.0},
+                {"num_updates": 8_000, "cost_limit": 400.0},
             ],
             # the last of each: targets that follow fast enough for so few updates
-            ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"steps": 20_000}, {"target_rate": 0.05}],
+            ("ma-td3bc", ""): [{"alpha": 1.0}, {"alpha": 5.0}, {"num_updates": 20_000}, {"target_rate": 0.05}],
             ("ma-td3bc-lag", ""): [
                 {"multiplier_max": 3.0},
                 {"multiplier_max": 30.0},
@@ -122,13 +122,13 @@ STUDIES = {
             ("ma-cql", ""): [
                 {"cql_weight": 5.0},
                 {"cql_weight": 10.0},
-                {"cql_weight": 5.0, "steps": 12_000},
+                {"cql_weight": 5.0, "num_updates": 12_000},
                 {"target_rate": 0.05},
             ],
             ("omar", ""): [
                 {"cql_weight": 5.0},
                 {"cql_weight": 5.0, "coefficient": 0.7},
-                {"cql_weight": 5.0, "steps": 12_000},
+                {"cql_weight": 5.0, "num_updates": 12_000},
                 {"target_rate": 0.05},
             ],
             ("madiff", ""): [{"lr": 1e-3}, {"discount": 0.99}, {"width": 128}],

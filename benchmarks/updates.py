@@ -78,7 +78,7 @@ def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
             store,
             seeds=(SEED,),
             quiet=True,
-            changes={"steps": wanted[-1]},
+            changes={"num_updates": wanted[-1]},
             chunk=chunk,
             checkpoint_every=wanted[0],
             on_chunk=lambda step, _: look(step - chunk),  # what was saved after the chunk before

@@ -30,19 +30,19 @@ from ringfence.utils.config import build_config
 from tests.quick import QUICK_WORLD
 
 TINY = {
-    "icbf": dict(steps=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8,
+    "icbf": dict(num_updates=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8,
                  inverse_width=16, horizon=4, diffusion_steps=20, barrier_start=0.0, barrier_full=0.2),
-    "madiff": dict(steps=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20),
-    "mpc": dict(steps=12),
-    "bc": dict(steps=12, batch=32, width=16, depth=1),
-    "bc-safe": dict(steps=12, batch=32, width=16, depth=1),
-    "bc-best": dict(steps=12, batch=32, width=16, depth=1),
-    "bc-return": dict(steps=12, batch=32, width=16, depth=1, condition="advantage"),
-    "ma-td3bc": dict(steps=12, batch=32, width=16, centralised_critic=True, delay=2, target_noise=0.2),
-    "ma-td3bc-lag": dict(steps=12, batch=32, width=16),
-    "omar": dict(steps=12, batch=32, width=16),
-    "ma-cql": dict(steps=12, batch=32, width=16, cql_actions="policy"),
-    "fisor": dict(steps=12, batch=32, width=16, candidates=2),
+    "madiff": dict(num_updates=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20),
+    "mpc": dict(num_updates=12),
+    "bc": dict(num_updates=12, batch=32, width=16, depth=1),
+    "bc-safe": dict(num_updates=12, batch=32, width=16, depth=1),
+    "bc-best": dict(num_updates=12, batch=32, width=16, depth=1),
+    "bc-return": dict(num_updates=12, batch=32, width=16, depth=1, condition="advantage"),
+    "ma-td3bc": dict(num_updates=12, batch=32, width=16, centralised_critic=True, delay=2, target_noise=0.2),
+    "ma-td3bc-lag": dict(num_updates=12, batch=32, width=16),
+    "omar": dict(num_updates=12, batch=32, width=16),
+    "ma-cql": dict(num_updates=12, batch=32, width=16, cql_actions="policy"),
+    "fisor": dict(num_updates=12, batch=32, width=16, candidates=2),
 }  # fmt: skip
 QUICK = {"episodes": 4, "sampling_steps": 2}
 
@@ -228,6 +228,17 @@ def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said)
         pilot.act(seen, state)
 
 
+def test_settings_of_before_are_read_and_said():
+    bc = algos.get("bc")
+    with pytest.warns(FutureWarning, match="steps of bc is called num_updates now"):
+        assert algos.configured(bc, "default", {"steps": 20}) == algos.configured(bc, "default", {"num_updates": 20})
+    with pytest.raises(UserError, match="num_updates and steps are two names of one choice"):
+        algos.configured(bc, "default", {"steps": 20, "num_updates": 20})
+    mine = dataclasses.replace(bc, name="mine", presets={"default": {"steps": 30}})
+    with pytest.warns(FutureWarning, match="steps of mine's preset default"):
+        assert algos.configured(mine, "default", {"num_updates": 20}).num_updates == 20
+
+
 def test_names_of_variants_follow_values(trained):
     """Neither the order nor the spelling of options makes another variant; those that results hold keep their names."""
     run = Run(trained["icbf"].path)
@@ -246,7 +257,7 @@ def test_names_of_variants_follow_values(trained):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"steps": -3}, "steps=-3 of bc must be at least 1"),
+        ({"num_updates": -3}, "num_updates=-3 of bc must be at least 1"),
         ({"batch": 0}, "batch=0 of bc must be at least 1"),
         ({"lr": -1.0}, "lr=-1.0 of bc must be positive"),
         ({"ema": 3.0}, "ema=3.0 of bc must be between 0 and 1"),
@@ -271,7 +282,7 @@ def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
     """What another agent sees changes one's own action where one plan is drawn for all, and not where each plans."""
     moved = {}
     for observe in ("all", "single"):
-        changes = {**TINY["madiff"], "view": "decentralized", "steps": 30, "observe": observe}
+        changes = {**TINY["madiff"], "view": "decentralized", "num_updates": 30, "observe": observe}
         asked = {"changes": changes, "world": {**QUICK_WORLD, "barrier": False}}
         run = loop.train("madiff", small_store, out=tmp_path / observe, **job_of("madiff") | asked)[0]
         _, policy = load(run)
@@ -288,7 +299,7 @@ def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
 
 @pytest.mark.parametrize("view, execution", [("centralized", "centralized"), ("decentralized", "decentralized")])
 def test_views(small_store, tmp_path, view, execution):
-    changes = {**TINY["madiff"], "view": view, "steps": 2, "observe": "mixed"}
+    changes = {**TINY["madiff"], "view": view, "num_updates": 2, "observe": "mixed"}
     run = loop.train(
         "madiff",
         small_store,
@@ -408,7 +419,7 @@ def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
 def test_own_data_without_a_simulator(own_store, tmp_path):
     """Anybody's logs: a store with named features, a hazard, a policy that acts; nothing of Simple Spread is known."""
     store = own_store
-    how = job_of("icbf") | {"changes": {**TINY["icbf"], "steps": 2}}
+    how = job_of("icbf") | {"changes": {**TINY["icbf"], "num_updates": 2}}
     run = loop.train("icbf", store, out=tmp_path, **how)[0]
     _, policy = load(run, guard="select", num_samples=2, sampling_steps=2)
     seen = jnp.asarray(store.observations[:4])
@@ -486,7 +497,7 @@ def test_results_that_cannot_be_read_are_refused_before_an_episode_is_played(tra
         ({"seeds": ()}, "one or more whole numbers"),
         ({"chunk": -1}, "chunk=-1 must be at least 1"),
         ({"checkpoint_every": 0}, "checkpoint_every=0 must be at least 1"),
-        ({"changes": {"steps": None}}, "steps=None of bc must be a whole number"),
+        ({"changes": {"num_updates": None}}, "num_updates=None of bc must be a whole number"),
         ({"changes": {"batch": 32.5}}, "batch=32.5 of bc must be a whole number"),
         ({"changes": {"lr": True}}, "lr=True of bc must be a number"),
         ({"changes": {"cost_limit": "abc"}}, "cannot be read as a number or none"),
@@ -499,8 +510,8 @@ def test_what_training_is_told_wrongly_is_refused_before_a_folder_is_made(small_
 
 
 def test_numbers_given_from_python_are_of_their_fields_type():
-    config = build_config(icbf.Config, {"steps": 1e3, "batch": np.int64(7), "lr": np.float32(0.5)}, "icbf")
-    assert [type(v) for v in (config.steps, config.batch, config.lr)] == [int, int, float]
+    config = build_config(icbf.Config, {"num_updates": 1e3, "batch": np.int64(7), "lr": np.float32(0.5)}, "icbf")
+    assert [type(v) for v in (config.num_updates, config.batch, config.lr)] == [int, int, float]
 
 
 def test_sizes_of_the_unet_are_refused_at_once(small_store):
@@ -566,7 +577,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
 
     monkeypatch.setattr(app, "out", Console(width=300))
     own = dataclasses.replace(small_store, card=small_store.card.updated(task="mine", hazard={"kind": "CostColumn"}))
-    dark = loop.train("bc", own, out=tmp_path, changes={**TINY["bc"], "steps": 2}, quiet=True)[0]
+    dark = loop.train("bc", own, out=tmp_path, changes={**TINY["bc"], "num_updates": 2}, quiet=True)[0]
     with pytest.raises(SystemExit) as stop:
         app.main(["eval", str(dark.path), str(trained["bc"].path), "--episodes", "2"])
     told = capsys.readouterr()
@@ -630,7 +641,7 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     """What an agent has not is the middle of the bounds, whoever learned it."""
     store = absolute(played["costs"])
     store = dataclasses.replace(store, card=store.card.updated(action_sizes=[2, 1, 2]))
-    told = {k: v for k, v in TINY[name].items() if k != "steps"} | {"view": "centralized"}
+    told = {k: v for k, v in TINY[name].items() if k != "num_updates"} | {"view": "centralized"}
     job = make_job(name, registry.from_store(store), None, told, store)
     assert (
         job.spec.action_sizes == (2, 1, 2) and type(job.spec).of(json.loads(json.dumps(job.spec.to_dict()))) == job.spec
@@ -694,12 +705,12 @@ def test_cloning_that_reads_returns_does_what_it_is_asked_for(tmp_path):
     """An actor that is told a high return earns more than one that is told a low one, and so does cloning the best."""
     store, earned = _asked_for(), {}
     for name, changes in {
-        "high": {"target": 1.5},
-        "low": {"target": -1.5},
+        "high": {"target_return": 1.5},
+        "low": {"target_return": -1.5},
         "best": {"best": 0.05},
     }.items():
-        algorithm = "bc-return" if "target" in changes else "bc-best"
-        changes |= {"view": "decentralized", "steps": 150, "width": 32, "lr": 3e-3}
+        algorithm = "bc-return" if "target_return" in changes else "bc-best"
+        changes |= {"view": "decentralized", "num_updates": 150, "width": 32, "lr": 3e-3}
         run = loop.train(algorithm, store, out=tmp_path / name, changes=changes, quiet=True)[0]
         policy = load(run)[1]
         acted = policy.act(policy.start(64), jnp.asarray(store.observations[:64]), None, jax.random.key(0))[1].action

@@ -240,6 +240,6 @@ def test_paper_needs_a_formula():
 
 
 def test_the_share_of_the_barrier_rises_on_schedule():
-    c = icbf.Config(steps=100, barrier_weight=0.4, barrier_start=0.2, barrier_full=0.6)
+    c = icbf.Config(num_updates=100, barrier_weight=0.4, barrier_start=0.2, barrier_full=0.6)
     shares = [float(icbf.barrier_share(c, step)) for step in (0, 20, 30, 40, 60, 100)]
     assert shares == pytest.approx([0, 0, 0.1, 0.2, 0.4, 0.4], abs=1e-6)

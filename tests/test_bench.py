@@ -44,7 +44,7 @@ from ringfence.training.runs import Run
 from ringfence.utils import files
 from ringfence.world import Settings
 
-QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], steps=20, transitions=500)
+QUICK = dict(seeds=2, episodes=4, only_tasks=["simple_spread-random"], num_updates=20, transitions=500)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -79,11 +79,17 @@ def test_a_finished_grid_is_not_made_again(made):
 def test_cells_are_addressed_by_what_training_depends_on(made):
     a = made.cells[0]
     assert a.id == grid.Cell(**{**a.__dict__, "evaluations": ()}).id
-    for change in ({"seed": 7}, {"changes": (("steps", 21),)}, {"transitions": 525}):
+    for change in ({"seed": 7}, {"changes": (("num_updates", 21),)}, {"transitions": 525}):
         assert grid.Cell(**{**a.__dict__, **change}).id != a.id
     ids = [c.id for c in made.cells]
     assert len(set(ids)) == 4
     assert all(c.folder(made.out).name.endswith(c.id) for c in made.cells)
+
+
+def test_ids_of_cells_do_not_follow_the_names_of_settings():
+    """Those of committed results, whose settings had other names."""
+    assert grid.Cell("crossing-hasty", "bc", "default", 0).id == "c6a6824abb"
+    assert grid.Cell("simple_spread-expert", "bc-return", "default", 0).id == "7e05f0949f"
 
 
 def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch):
@@ -124,7 +130,7 @@ def test_looking_at_an_unfinished_cell_does_not_finish_it(tmp_path):
     result = {"episodes": 4, "protocol": protocol.PROTOCOL, "options": {}, "step": 7}
     Run(cell.folder(tmp_path)).add_result("default", result)
     assert cell.state(tmp_path, 4) == "to do"
-    Run(cell.folder(tmp_path)).add_result("default", {**result, "step": cell.config.steps})
+    Run(cell.folder(tmp_path)).add_result("default", {**result, "step": cell.config.num_updates})
     assert cell.state(tmp_path, 4) == "done"
 
 
@@ -378,7 +384,7 @@ def test_one_runner_per_folder(tmp_path):
 
 
 def test_one_training_per_run_folder(small_store, tmp_path):
-    settings = dict(out=tmp_path, changes={"steps": 2, "batch": 4, "width": 8, "depth": 1}, quiet=True)
+    settings = dict(out=tmp_path, changes={"num_updates": 2, "batch": 4, "width": 8, "depth": 1}, quiet=True)
     folder = tmp_path / "simple_spread-random" / "bc" / "seed-0"
     with files.owned(folder, "not said"):
         with pytest.raises(UserError, match="Another process trains '.*seed-0'; wait for it or stop it"):
@@ -462,7 +468,7 @@ def test_ray_makes_the_same_cells_and_survives_a_killed_worker(made, tmp_path):
 
 def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
     names = ["halfcheetah_2x3-medium", "halfcheetah_2x3-medium-quantile"]
-    few = dict(seeds=1, episodes=1, only_tasks=names, only=["bc"], steps=20, transitions=1000)
+    few = dict(seeds=1, episodes=1, only_tasks=names, only=["bc"], num_updates=20, transitions=1000)
     g = make_grid("mujoco", tmp_path / "out", **few)
     native, other = g.cells
     assert other.paired() == native and native.paired() is None
@@ -494,7 +500,7 @@ def test_what_reads_no_danger_is_trained_once(tmp_path, monkeypatch):
 
 def test_a_stale_cell_is_named_and_stops_no_other(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", seeds=2, episodes=2, only_tasks=["simple_spread-random"],
-                  only=["bc"], steps=20, transitions=1000)  # fmt: skip
+                  only=["bc"], num_updates=20, transitions=1000)  # fmt: skip
     g.open()
     stale = g.cells[1].folder(g.out)
     grid.run_group([g.cells[1]], g.out, 2, lambda event, cell: None)

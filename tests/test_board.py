@@ -54,7 +54,7 @@ def cell(root: Path, results: dict | None, algorithm="bc", preset="default", see
     config = {
         "algorithm": algorithm,
         "preset": preset,
-        "config": {"steps": 100} | config,
+        "config": {"num_updates": 100} | config,
         "task": task,
         "seed": seed,
         "hazard": {"kind": "Separation", "radius": 0.3, "safe_margin": 0.075},
@@ -160,7 +160,7 @@ def test_fields_younger_than_a_run_do_not_set_it_apart(folder):
     steps = cell(folder, {"default": summary([1] * 4, [0] * 4)}, seed=2)
     config = json.loads((steps / "config.json").read_text())
     defaults = {f.name: f.default for f in dataclasses.fields(algos.get("bc").Config)}
-    write(steps / "config.json", config | {"config": defaults | {"steps": 100}})
+    write(steps / "config.json", config | {"config": defaults | {"num_updates": 100}})
     assert [m.label for m in read(folder).methods if m.algorithm == "bc"] == ["BC"]
 
 
@@ -267,7 +267,7 @@ def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
     write(twin / "config.json", config | {"seed": 5})
     with pytest.raises(UserError, match="seed-0-b2/config.json' names seed 5, its folder 0"):
         read(folder)
-    write(twin / "config.json", config | {"data": {"provenance": "public"}, "config": {"steps": 1}})
+    write(twin / "config.json", config | {"data": {"provenance": "public"}, "config": {"num_updates": 1}})
     with pytest.raises(UserError, match=r"seed-0-b2' was trained on other data \(its provenance is public\)"):
         read(folder)
 

@@ -42,9 +42,9 @@ def test_makes_and_describes_data(tmp_path, capsys):
         (["train", "icfb", "simple_spread-medium"], "did you mean 'icbf'"),
         (["train", "icbf", "simple_spread-medum"], "did you mean 'simple_spread-medium'"),
         (["train", "icbf", "simple_spread-medium", "--set", "barier_weight=3"], "did you mean 'barrier_weight'"),
-        (["train", "icbf", "simple_spread-medium", "--set", "steps"], "name=value"),
+        (["train", "icbf", "simple_spread-medium", "--set", "num_updates"], "name=value"),
         (["train", "icbf", "simple_spread-medium", "--set", "lr=1", "--set", "lr=2"], "gives lr twice, 1 and 2"),
-        (["train", "icbf", "simple_spread-medium", "--set", "steps=many"], "cannot be read as int"),
+        (["train", "icbf", "simple_spread-medium", "--set", "num_updates=many"], "cannot be read as int"),
         (["train", "icbf", "simple_spread-medium", "--set", "net=unit"], "did you mean 'unet'"),
         (["train", "icbf", "nowhere.h5"], "No episode store"),
         (["eval", "nowhere"], "does not exist"),
@@ -72,7 +72,7 @@ def test_places_that_cannot_be_written_are_refused(tmp_path, monkeypatch, capsys
         ([*make, "--out", ""], "names no file"),
         (["bench", "status", "file"], "no results folder"),
         ([*bench, "--out", "file"], "'file' is a file"),
-        ([*bench, "--steps", "10"], "--steps 10 makes other rows than the suite's own"),
+        ([*bench, "--num-updates", "10"], "--num-updates 10 makes other rows than the suite's own"),
         ([*bench, "--out", "new", "--threads", "0"], "threads=0 must be at least 1"),
         ([*bench, "--out", "new", "--engine", "ray", "--memory", "4"], "--memory is about local processes"),
         (["report", "file/x"], "does not exist"),
@@ -117,8 +117,8 @@ def test_every_set_counts(monkeypatch):
     heard = []
     monkeypatch.setattr("ringfence.training.loop.train", lambda *_, changes, **__: heard.append(changes) or [])
     monkeypatch.setattr("ringfence.cli.app._store", lambda data: None)
-    main(["train", "bc", "mine.h5", "--set", "steps=3", "batch=4", "--set", "width=8", "--seeds", "2"])
-    assert heard == [{"steps": "3", "batch": "4", "width": "8"}]
+    main(["train", "bc", "mine.h5", "--set", "num_updates=3", "batch=4", "--set", "width=8", "--seeds", "2"])
+    assert heard == [{"num_updates": "3", "batch": "4", "width": "8"}]
 
 
 def test_info_says_where_cost_and_hazard_disagree(small_store, tmp_path, capsys):

@@ -183,7 +183,7 @@ def test_learners_keep_every_limit(logs):
 
 
 def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path, capsys):
-    changes = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
+    changes = {"num_updates": 2, "batch": 16, "width": 16, "depth": 1}
     run = loop.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
     found = play(run, Sleds, episodes=3, keep=True)["constraints"]
     assert {k: v["limit"] for k, v in found.items()} == LIMITS

@@ -178,7 +178,7 @@ def test_logs_tell_whom_they_cost(logs):
 def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypatch):
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
     monkeypatch.setattr(sys.modules["ringfence.evaluation.rollout"], "CHUNK", 2)
-    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20
     result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, correction_steps=1, horizon=1)
@@ -220,7 +220,7 @@ def test_it_keeps_pettingzoos_api(logs, tmp_path):
     parallel_api_test(env, num_cycles=20)
     seen, _ = env.reset(seed=1)
     assert env.render().shape == (480, 480, 3) and seen["agent_0"].shape == (env.core.observation_dim,)
-    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     assert play(run, lambda: CrossingParallel(n_agents=3), episodes=1, agents=3)["episodes"] == 1
     with pytest.raises(UserError, match="has 3 agents, the run was trained with 8; pass agents=3"):
         play(run, lambda: CrossingParallel(n_agents=3), episodes=1)
@@ -254,7 +254,7 @@ def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     names = logs.card.observation_names
     card = {"observation_names": names, "hazard": logs.card.hazard, "task": "fleet", "homogeneous": True}
     mine = dataclasses.replace(logs, state=None, card=card)
-    run = loop.train("bc", mine, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", mine, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(mine, **QUICK_WORLD)
     assert world.map.decentralized and world.map.dt == pytest.approx(0.1)  # as names and steps tell
     assert world.map.own == Crossing().feature_map("pruned").own

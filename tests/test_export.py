@@ -35,13 +35,13 @@ STEPS = 12
 def run(small_store, tmp_path_factory):
     """Cloning of the small store."""
     out = tmp_path_factory.mktemp("runs")
-    return loop.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=out)[0]
+    return loop.train("bc", small_store, changes={"num_updates": 4, "width": 16}, quiet=True, out=out)[0]
 
 
 @pytest.fixture(scope="module")
 def planner(small_store, tmp_path_factory):
     """A diffusion planner of the small store."""
-    changes = dict(steps=2, batch=8, width=16, depth=1, diffusion_steps=10)
+    changes = dict(num_updates=2, batch=8, width=16, depth=1, diffusion_steps=10)
     out = tmp_path_factory.mktemp("runs")
     return loop.train("madiff", small_store, changes=changes, world=QUICK_WORLD, quiet=True, out=out)[0]
 
@@ -180,7 +180,7 @@ def test_agents_who_are_alike(own_store, tmp_path):
     card = {"observation_names": names, "hazard": own_store.card.hazard, "task": "fleet", "homogeneous": True}
     costs = np.repeat(own_store.costs[:, None], 3, 1)
     store = dataclasses.replace(own_store, costs=costs, card=card)
-    run = loop.train("bc", store, changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)[0]
+    run = loop.train("bc", store, changes={"num_updates": 2, "width": 8}, quiet=True, out=tmp_path)[0]
     call, told = of_stablehlo(exporting.export(run, tmp_path / "5", "stablehlo", agents=5))
     assert told["inputs"] == [{"name": "observations", "shape": [5, 14], "dtype": "float32"}] and told["n_agents"] == 5
     assert (
@@ -301,7 +301,7 @@ def test_metadata_is_json_where_nothing_was_told_yet(played, small_store, tmp_pa
     state = {"state": played["state"]}
     named = [played[name] for name in ("observations", "actions", "rewards")]
     store = EpisodeStore.from_episodes(*named, costs, card=card, **state)
-    (run,) = loop.train("bc", store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path)
+    (run,) = loop.train("bc", store, changes={"num_updates": 4, "width": 16}, quiet=True, out=tmp_path)
     options = {**SHIELD, "adapt": 0.1, "world": worlds.fit(store, labels="costs", **QUICK_WORLD)}
     file = exporting.export(run, tmp_path / "p.stablehlo", "stablehlo", **options)
     with zipfile.ZipFile(file) as packed:

@@ -255,7 +255,7 @@ def test_any_callable_is_guarded(small_world, small_store):
 
 
 def test_a_world_of_other_data_is_refused(small_store, tmp_path):
-    tiny = dict(changes={"steps": 2, "width": 8}, quiet=True, out=tmp_path)
+    tiny = dict(changes={"num_updates": 2, "width": 8}, quiet=True, out=tmp_path)
     run = loop.train("bc", small_store, **tiny)[0]
     card = small_store.card.updated(task="other")
     other = worlds.fit(dataclasses.replace(small_store, card=card), **QUICK_WORLD)
@@ -276,7 +276,7 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
 
 def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_path, monkeypatch):
     """A planner whose training read values of its own discount is guarded by the task's World, not by those."""
-    changes = dict(steps=2, batch=8, width=16, depth=1, barrier_batch=4, barrier_width=8)
+    changes = dict(num_updates=2, batch=8, width=16, depth=1, barrier_batch=4, barrier_width=8)
     far, usual = (
         loop.train(
             "icbf",

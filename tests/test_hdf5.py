@@ -539,7 +539,7 @@ def test_an_imported_store_is_described_and_trained(tmp_path, capsys):
     assert "3, 2 per agent" in said and "DSRL" in said and "note agents of different sizes" in said
     store = EpisodeStore.load(out)
     assert store.card.cost_limit == 5 and store.card.extra["columns"] == PAIR
-    run = loop.train("bc", store, out=tmp_path / "runs", changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", store, out=tmp_path / "runs", changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     assert run.metrics[-1]["step"] == 4 and np.isfinite(list(run.metrics[-1].values())).all()
 
 

@@ -81,7 +81,7 @@ def test_names_that_become_paths_stay_where_they_are(trained_run, tmp_path):
 def trained_run(tmp_path_factory):
     from ringfence.training import loop
 
-    changes = {"view": "decentralized", "steps": 4, "width": 16}
+    changes = {"view": "decentralized", "num_updates": 4, "width": 16}
     return loop.train("bc", corpus.small_store(), out=tmp_path_factory.mktemp("r"), changes=changes, quiet=True)[0]
 
 
@@ -286,7 +286,7 @@ def test_numbers_of_strangers(trained_run, value, tmp_path):
         lambda: loop.train("bc", store, out=tmp_path, seeds=value),
         lambda: loop.train("bc", store, out=tmp_path, seeds=(value,)),
         lambda: loop.train("bc", store, out=tmp_path, changes={"batch": value}),
-        lambda: loop.train("bc", store, out=tmp_path, changes={"steps": value}),
+        lambda: loop.train("bc", store, out=tmp_path, changes={"num_updates": value}),
         lambda: make(registry.get("simple_spread-random"), value if value is not None else 0),
         lambda: make(registry.get("simple_spread-random"), 25, value),
         lambda: make_grid("guards", tmp_path, seeds=value),

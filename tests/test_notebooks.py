@@ -12,7 +12,7 @@ from ringfence.guards import GUARDS
 from tests.quick import QUICK_WORLD
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
-SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"steps": 4, "width": 16}, "RUNS": 40, "EPISODES": 60, "PLAYED": 2}
+SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"num_updates": 4, "width": 16}, "RUNS": 40, "EPISODES": 60, "PLAYED": 2}
 SMALL["OPE"] = dict(states=100, transitions=400, updates=20, num_ensemble=2, rollout_episodes=8, rollout_steps=5)
 
 

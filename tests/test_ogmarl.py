@@ -211,7 +211,7 @@ def test_a_tier_of_another_name_keeps_its_simulator(tmp_path):
     assert import_vault(tmp_path / "replay", "halfcheetah_2x3", tier="mine").card.task == "halfcheetah_2x3-mine"
     assert task.name == "halfcheetah_2x3-replay" and task.env == SafeMuJoCo("2x3", 3.227)
     assert (task.cost_limit, task.return_max, task.presets) == (25.0, 9132.25, ("mujoco",))
-    small = {"steps": 2, "batch": 4, "width": 8}
+    small = {"num_updates": 2, "batch": 4, "width": 8}
     (run,) = loop.train("bc", store, out=tmp_path / "runs", changes=small, quiet=True)
     job, policy = load(run)
     assert job.task.env.limit == 3.227

@@ -41,7 +41,7 @@ def world(logs):
 
 @pytest.fixture(scope="module")
 def run(logs, tmp_path_factory):
-    changes = {"view": "pruned", "steps": 4, "width": 16}
+    changes = {"view": "pruned", "num_updates": 4, "width": 16}
     return loop.train("bc", logs, out=tmp_path_factory.mktemp("evaluated"), changes=changes, quiet=True)[0]
 
 

@@ -18,7 +18,7 @@ from ringfence.loading import resolve
 from ringfence.training import loop
 from ringfence.training.runs import Run
 
-TINY = {"steps": 2, "batch": 16, "width": 16, "depth": 1}
+TINY = {"num_updates": 2, "batch": 16, "width": 16, "depth": 1}
 
 
 @pytest.fixture(scope="module")

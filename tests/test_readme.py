@@ -30,7 +30,7 @@ def test_the_first_lines_of_python_run(tmp_path, monkeypatch):
         EpisodeStore=ringfence.EpisodeStore,
         Controller=ringfence.Controller,
         guard=ringfence.guard,
-        train=lambda *a: ringfence.train(*a, out=tmp_path, changes={"steps": 20, "width": 16}, quiet=True),
+        train=lambda *a: ringfence.train(*a, out=tmp_path, changes={"num_updates": 20, "width": 16}, quiet=True),
         fit=lambda store: ringfence.fit(store, **QUICK_WORLD),
     )
     observations = rng.normal(size=(40, 11, 2, 4)).astype(np.float32)

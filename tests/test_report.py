@@ -59,7 +59,7 @@ def folder(
     config = {
         "algorithm": algorithm,
         "preset": preset,
-        "config": {"steps": 4000, "history": 0} | config,
+        "config": {"num_updates": 4000, "history": 0} | config,
         "task": task,
         "spec": {"n_agents": 2, "feature_names": NAMES, "episode_length": 5},
         "hazard": {"kind": "Separation", "radius": 0.3, "safe_margin": 0.075},
@@ -149,7 +149,7 @@ def test_what_was_played_before_training_went_on_is_dated(runs):
     config = json.loads((runs[0].path / "config.json").read_text())
     for run in runs[:2]:
         config = json.loads((run.path / "config.json").read_text())
-        (run.path / "config.json").write_text(json.dumps(config | {"config": config["config"] | {"steps": 30}}))
+        (run.path / "config.json").write_text(json.dumps(config | {"config": config["config"] | {"num_updates": 30}}))
     results = runs[0].results
     results["split"]["step"] = 10
     (runs[0].path / "results.json").write_text(json.dumps(results))
@@ -237,9 +237,9 @@ def test_lists_in_configs_are_shown(tmp_path):
 
 def test_configs_that_differ_get_rows_of_their_own(tmp_path):
     results = {"split": result([1.0, 2.0], [0, 1])}
-    two = [folder(tmp_path / str(k), results=results, steps=k) for k in (10, 20)]
+    two = [folder(tmp_path / str(k), results=results, num_updates=k) for k in (10, 20)]
     (section,) = sections(two)
-    assert sorted(r.variant for r in section.tables["test"]) == ["split [steps=10]", "split [steps=20]"]
+    assert sorted(r.variant for r in section.tables["test"]) == ["split [num_updates=10]", "split [num_updates=20]"]
 
 
 def test_tasks_are_kept_apart(tmp_path):

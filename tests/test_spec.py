@@ -97,6 +97,8 @@ def test_commands_of_before_are_rewritten(capsys):
     assert rewritten(["fit", "data.h5", "--sight", "own"]) == new == rewritten(new)
     metres = ["data", "table", "data.csv", "--sight", "2.5"]  # how far agents see
     assert rewritten(metres)[-2:] == ["--sight", "2.5"]
+    assert rewritten(["bench", "crossing", "--steps", "3"])[2:] == ["--num-updates", "3"]
+    assert rewritten([]) == []
 
 
 def test_what_a_result_is_called():

@@ -84,7 +84,7 @@ def test_the_same_play_told_otherwise(logs):
 
 
 def test_one_checkpoint_plays_teams_of_another_size(logs, tmp_path):
-    run = loop.train("bc", logs, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.map.decentralized
     for agents in (2, 6):

@@ -118,3 +118,8 @@ def test_homogeneous_agents_of_older_files_are_known():
     spec = {"alike": True, "n_agents": 1}
     assert stored.config({"task": "x", "spec": spec})["spec"] == {"homogeneous": True, "n_agents": 1}
     assert complete_card({"task": "fleet", "alike": True}).homogeneous
+
+
+def test_settings_of_algorithms_of_older_runs_are_known():
+    older = {"algorithm": "bc-return", "config": {"steps": 20, "target": 1.5, "width": 8}}
+    assert stored.config(older)["config"] == {"num_updates": 20, "target_return": 1.5, "width": 8}

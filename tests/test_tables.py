@@ -178,7 +178,7 @@ def test_one_agent_among_its_neighbours_is_a_team_of_any_number(tmp_path):
 
     world = ringfence.fit(store, **QUICK_WORLD)
     assert world.map.dt == 0.1  # as of the table, whatever the few rows tell
-    run = ringfence.train("bc", store, out=tmp_path, changes={"steps": 4, "width": 16}, quiet=True)[0]
+    run = ringfence.train("bc", store, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     pilot = ringfence.Controller(run, agents=7, guard="shield", world=world)
     acted = pilot.act(np.tile(store.observations[0], (7, 1)), None)
     assert acted.shape == (7, 2) and np.isfinite(acted).all()

@@ -34,7 +34,7 @@ def test_they_are_few_and_small():
 
 
 def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
-    run = loop.train("bc", small_store, changes={"steps": 4, "width": 16}, quiet=True, out=tmp_path / "runs")[0]
+    run = loop.train("bc", small_store, changes={"num_updates": 4, "width": 16}, quiet=True, out=tmp_path / "runs")[0]
     other = dataclasses.replace(small_world, ood_threshold=2 * small_world.ood_threshold)
     assert len(zoo.put(run, "mine/bc", small_world, small_world, tmp_path)) == 2
     made = zoo.put(run, "mine/bc", other, small_world, tmp_path)

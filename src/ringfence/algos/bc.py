@@ -33,7 +33,7 @@ class Config:
     history: Natural = 0  # rows of the past; cloning looks at the present alone
     width: Width = 128  # units of each hidden layer
     depth: Depth = 2  # hidden layers
-    steps: Count = 4_000  # updates
+    num_updates: Count = 4_000  # updates
     batch: BatchSize = 256  # windows per update
     lr: Positive = 1e-3  # Adam
     warmup: Natural = 100  # updates
@@ -119,7 +119,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
 
 
 def _optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 BC = Algorithm(
@@ -133,9 +133,9 @@ BC = Algorithm(
     # `joint`: with all that a planner sees
     {
         "default": {},
-        "mujoco": {"steps": 8_000},
+        "mujoco": {"num_updates": 8_000},
         "joint": {"view": "pruned"},
-        "mujoco-joint": {"view": "pruned", "steps": 8_000},
+        "mujoco-joint": {"view": "pruned", "num_updates": 8_000},
     },
     cost_source=cost_source,
     make_windows=make_windows,
@@ -143,6 +143,6 @@ BC = Algorithm(
 BC_SAFE = replace(
     BC,
     name="bc-safe",
-    presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, "steps": 20_000}},
+    presets={"default": {"cost_limit": 0.0}, "mujoco": {"cost_limit": 25.0, "num_updates": 20_000}},
     limit="cost_limit",
 )

@@ -59,7 +59,7 @@ class Config:
     candidates: AtLeastOne = 16  # actions proposed per agent and step
     target_rate: Share = 0.005  # τ
     width: Width = 64  # units of both hidden layers
-    steps: Count = 5_000  # updates
+    num_updates: Count = 5_000  # updates
     batch: BatchSize = 512  # transitions per update
     lr: Positive = 1e-3  # Adam, cosine decay to a tenth
     warmup: Natural = 100  # updates
@@ -74,7 +74,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
 
 
 def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 def init(
@@ -205,7 +205,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, 
     return Proposer(target["actor"], target["danger"], norm, spec, feature_map, tuple(bar.tolist()), config.candidates)
 
 
-_MUJOCO = {"width": 128, "batch": 256, "steps": 10_000}
+_MUJOCO = {"width": 128, "batch": 256, "num_updates": 10_000}
 FISOR = Algorithm(
     "fisor", Config, check, init, make_update, ac.no_diagnosis, make_policy, {"default": {}, "mujoco": _MUJOCO}
 )

@@ -85,7 +85,7 @@ class Config:
     inverse_noise: NonNegative = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
     # --- optimisation ---
-    steps: Count = 1500  # updates
+    num_updates: Count = 1500  # updates
     batch: BatchSize = 128  # windows per update
     lr: Positive = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
     warmup: Natural = 100  # updates
@@ -111,7 +111,7 @@ _PAPER = {
 # a strong barrier leaves nothing to imitate. The return-to-go tells the policies of a mixed log apart; a window's
 # advantage does not, and the average of plans of a poor one and a good one stands still.
 _MUJOCO = {
-    "steps": 6000,
+    "num_updates": 6000,
     "width": 192,
     "condition": "return",
     "barrier_weight": 0.3,
@@ -120,7 +120,7 @@ _MUJOCO = {
 PRESETS: dict[str, dict] = {
     "split": {},
     "split-0": {"barrier_weight": 0.0},  # the ablation of `split` that follows no barrier
-    "long": {"steps": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
+    "long": {"num_updates": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
     "mujoco": _MUJOCO,
     "paper": _PAPER,
     **{f"paper-{weight}": _PAPER | {"barrier_weight": float(weight)} for weight in (1, 3, 10)},
@@ -138,7 +138,7 @@ PRESETS: dict[str, dict] = {
         "discount": 0.99,
         "batch": 64,
         "lr": 2e-4,
-        "steps": 1_000_000,
+        "num_updates": 1_000_000,
     },
 }
 
@@ -199,7 +199,7 @@ def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 81
 
 
 def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.steps, config.grad_clip)
+    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 def follows(config: Config) -> bool:
@@ -397,7 +397,7 @@ def followed(barrier: Barrier, made: Generated, config: Config) -> tuple[Array, 
 
 def barrier_share(config: Config, step: Array) -> Array:
     """λ at an update: 0 until `barrier_start`, `barrier_weight` from `barrier_full` on, linear between."""
-    progress, width = step / max(config.steps, 1), config.barrier_full - config.barrier_start
+    progress, width = step / max(config.num_updates, 1), config.barrier_full - config.barrier_start
     if width <= 0:
         return config.barrier_weight * (progress >= config.barrier_start)
     return config.barrier_weight * jnp.clip((progress - config.barrier_start) / width, 0.0, 1.0)
@@ -529,7 +529,7 @@ MADIFF = dataclasses.replace(
     name="madiff",
     presets={
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
-        "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "steps": 6000},
+        "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "num_updates": 6000},
         # MADIFF-D: everybody plans for all from its own observation
         "own": {
             "barrier": False,

@@ -24,7 +24,7 @@ class Config:
     view: features.View = "decentralized"  # nobody looks
     horizon: Rows = 2  # rows of a window
     history: Natural = 0  # rows of the past
-    steps: Count = 1  # updates
+    num_updates: Count = 1  # updates
     batch: BatchSize = 1  # windows per update
 
 

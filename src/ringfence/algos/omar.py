@@ -51,7 +51,7 @@ class Config:
     action_penalty: NonNegative = 1e-3  # weight of E π²
     logit_penalty: NonNegative = 1e-3  # weight of E (π before tanh)², beside the policy gradient in units of E |Q|
     width: Width = 64  # units of both hidden layers
-    steps: Count = 2_000  # updates
+    num_updates: Count = 2_000  # updates
     batch: BatchSize = 1024  # transitions per update
     lr: Positive = 0.01  # Adam, constant
     grad_clip: NonNegative = 0.5  # global norm, per network; 0: no bound
@@ -72,7 +72,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
 
 
 def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, 0, config.steps, config.grad_clip, floor=1.0)
+    return Optimiser(config.lr, 0, config.num_updates, config.grad_clip, floor=1.0)
 
 
 def init(
@@ -218,7 +218,7 @@ _TIERS = {
     "expert": {"cql_weight": 5.0},
     "medium": {"cql_weight": 5.0},
     "medium-replay": {"cql_weight": 1.0},
-    "random": {"cql_weight": 0.5, "steps": 6_000},
+    "random": {"cql_weight": 0.5, "num_updates": 6_000},
 }
 # The study's HalfCheetah settings (elites, samples around the policy), but for c, which is 1 as on Simple Spread (the
 # study: 1.0 to 0.5 by tier), and with fewer samples, smaller layers and fewer updates, for a CPU. With α = 5, which the
@@ -235,7 +235,7 @@ _MUJOCO = {
     "lr": 1e-3,
     "discount": 0.99,
     "target_rate": 0.005,
-    "steps": 6_000,
+    "num_updates": 6_000,
 }
 OMAR = Algorithm(
     "omar",
@@ -252,7 +252,7 @@ OMAR = Algorithm(
     },
     cost_source=lambda config: "nothing",
 )
-_CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "steps": 2_000}
+_CQL = {"coefficient": 0.0, "logit_penalty": 0.01, "lr": 3e-3, "num_updates": 2_000}
 MA_CQL = replace(
     OMAR,
     name="ma-cql",

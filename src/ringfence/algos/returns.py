@@ -45,13 +45,13 @@ def best_of(store: EpisodeStore, config: BestConfig, feature_map: features.Featu
 
 @dataclass(frozen=True)
 class Config(bc.Config):
-    """L = E ‖a_i − π_i(s̃_i, y)‖² with y the score of what followed; played with y = `target`."""
+    """L = E ‖a_i − π_i(s̃_i, y)‖² with y the score of what followed; played with y = `target_return`."""
 
     view: features.View = "pruned"  # the planner's
     condition: conditions.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
     discount: Share = 0.9  # of what y scores
     ahead: AtLeastOne = 8  # rows, of the advantage
-    target: float = 1.5  # y when it acts, as a normal score: the best 7 %
+    target_return: float = 1.5  # y when it acts, as a normal score: the best 7 %
 
 
 class Asking(eqx.Module):
@@ -107,7 +107,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options=None) -> Direct:
-    actor = Asking(state["ema"]["actor"], config.target)
+    actor = Asking(state["ema"]["actor"], config.target_return)
     return Direct(actor, state["frozen"]["normaliser"], spec, feature_map)
 
 
@@ -116,7 +116,7 @@ BC_BEST = replace(
     name="bc-best",
     Config=BestConfig,
     make_windows=best_of,
-    presets={"default": {}, "mujoco": {"steps": 20_000}},
+    presets={"default": {}, "mujoco": {"num_updates": 20_000}},
 )
 BC_RETURN = Algorithm(
     "bc-return",
@@ -126,7 +126,7 @@ BC_RETURN = Algorithm(
     make_update,
     ac.no_diagnosis,
     make_policy,
-    {"default": {}, "mujoco": {"steps": 8_000}, "advantage": {"condition": "advantage"}},
+    {"default": {}, "mujoco": {"num_updates": 8_000}, "advantage": {"condition": "advantage"}},
     cost_source=bc.cost_source,
     make_windows=make_windows,
     world_settings=world_settings,

@@ -51,7 +51,7 @@ class Config:
     limit: float = 1.0  # l, cost per episode that the multiplier allows
     multiplier_rate: NonNegative = 0.01  # η
     multiplier_max: NonNegative = 100.0  # bound on λ
-    steps: Count = 2_000  # updates
+    num_updates: Count = 2_000  # updates
     batch: BatchSize = 1024  # transitions per update
     lr: Positive = 0.01  # Adam, constant
     grad_clip: NonNegative = 0.5  # global norm, per network; 0: no bound
@@ -74,7 +74,7 @@ def cost_source(config: Config) -> Literal["costs", "nothing"]:
 
 
 def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, 0, config.steps, config.grad_clip, floor=1.0)
+    return Optimiser(config.lr, 0, config.num_updates, config.grad_clip, floor=1.0)
 
 
 def init(
@@ -192,7 +192,7 @@ _MUJOCO = {
     "target_noise": 0.2,
     "action_penalty": 0.0,
     "limit": 25.0,
-    "steps": 10_000,
+    "num_updates": 10_000,
 }
 MA_TD3BC = Algorithm(
     "ma-td3bc",
@@ -205,9 +205,9 @@ MA_TD3BC = Algorithm(
     {
         "default": {},
         "centralised": {"centralised_critic": True},
-        "random": {"steps": 6_000},
+        "random": {"num_updates": 6_000},
         "mujoco": _MUJOCO,
-        "mujoco-long": {**_MUJOCO, "steps": 40_000},  # ant_2x4-good: 3.1 k, published 2.9 k; 1.1 k before
+        "mujoco-long": {**_MUJOCO, "num_updates": 40_000},  # ant_2x4-good: 3.1 k, published 2.9 k; 1.1 k before
     },
     cost_source=cost_source,
 )

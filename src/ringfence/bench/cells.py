@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
+import inspect
 import json
 import logging
 import shutil
@@ -40,8 +41,8 @@ from ringfence.training import loop, worlds
 from ringfence.training.runs import Run, write_json
 from ringfence.utils import schemas
 from ringfence.utils import stored as names
-from ringfence.utils.config import build_config
 from ringfence.utils.files import whole
+from ringfence.utils.renamed import renamed
 from ringfence.world import Settings
 
 _log = logging.getLogger(__name__)
@@ -49,6 +50,7 @@ _log = logging.getLogger(__name__)
 FORMAT = 1  # of a results folder
 DAMAGED = "has a damaged status.json; delete that file"
 STATES = ("done", "failed", "to do")
+_FIRST_NAMES = {new: old for old, new in names.CONFIG.items()}
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Cell:
     algorithm: str
     preset: str
     seed: int
-    changes: tuple[tuple[str, float], ...] = ()  # to the preset, e.g. (("steps", 100),)
+    changes: tuple[tuple[str, float], ...] = ()  # to the preset, e.g. (("num_updates", 100),)
     evaluations: tuple[tuple[str, str], ...] = ()  # (variant in results.json, name of its PolicySpec)
     transitions: int | None = None  # of the data set; None: the task's own number
 
@@ -70,19 +72,18 @@ class Cell:
 
     @property
     def config(self) -> Any:
-        algorithm = algos.get(self.algorithm)
-        changes = {**algorithm.presets[self.preset], **dict(self.changes)}
-        return build_config(algorithm.Config, changes, self.algorithm)
+        return algos.configured(algos.get(self.algorithm), self.preset, dict(self.changes))
 
     @property
     def id(self) -> str:
-        """Hash of what training depends on; how the run is played does not count."""
+        """Hash of what training depends on, under the names that fields had first; how the run is played does not
+        count."""
         task = registry.get(self.task)
         content = {
             "format": FORMAT,
             "data": [__version__, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
             "algorithm": self.algorithm,
-            "config": dataclasses.asdict(self.config),
+            "config": {_FIRST_NAMES.get(k, k): v for k, v in dataclasses.asdict(self.config).items()},
             "seed": self.seed,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
@@ -259,10 +260,15 @@ def make_grid(
     episodes: int | None = None,
     only_tasks: Iterable[str] = (),
     only: Iterable[str] = (),
-    steps: int | None = None,
+    num_updates: int | None = None,
     transitions: int | None = None,
+    **older: Any,
 ) -> Grid:
     """The grid of a suite, or of the named tasks and entries (`algorithm` or `algorithm:preset`) of it."""
+    older = renamed(older, {"steps": "num_updates"}, "make_grid")
+    num_updates = older.pop("num_updates", num_updates)
+    if older:
+        raise unknown("argument of make_grid()", next(iter(older)), inspect.signature(make_grid).parameters)
     if suite not in SUITES:
         raise unknown("suite", suite, SUITES)
     chosen = SUITES[suite]
@@ -276,7 +282,7 @@ def make_grid(
     for name in only:
         if name not in known:
             raise unknown("entry", name, known)
-    changes = () if steps is None else (("steps", steps),)
+    changes = () if num_updates is None else (("num_updates", num_updates),)
     cells = []
     for name in names:
         task = registry.get(name)

@@ -71,7 +71,7 @@ def train(
         seeds: how many, starting with first_seed.
         first_seed: the first one.
         preset: named differences from the defaults, e.g. split or paper; by default that of the data tier, if any.
-        set: config fields, e.g. --set barrier_weight=0.5 steps=8000.
+        set: config fields, e.g. --set barrier_weight=0.5 num_updates=8000.
         out: folder of runs.
         vmap_seeds: train all seeds in one program.
         tensorboard: write TensorBoard logs, too.
@@ -460,12 +460,12 @@ def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:
     """Refuse bad names before a data set is made for them."""
     from ringfence import algos
     from ringfence.errors import unknown
-    from ringfence.utils.config import build_config
 
     a = algos.get(algorithm)
-    if preset is not None and preset not in a.presets:
+    preset = preset or a.preset_for(())
+    if preset not in a.presets:
         raise unknown(f"preset of {a.name}", preset, a.presets)
-    build_config(a.Config, changes, a.name)
+    algos.configured(a, preset, changes)
 
 
 def _store(data: str) -> EpisodeStore:

@@ -31,7 +31,7 @@ def bench(
     out_dir: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     tasks: Names = [],  # noqa: B006
     algorithms: Names = [],  # noqa: B006
-    steps: int | None = None,
+    num_updates: int | None = None,
     engine: Literal["local", "ray"] = "local",
     workers: int | None = None,
     threads: int = 1,
@@ -52,7 +52,7 @@ def bench(
         out_dir: folder of results, results/SUITE by default; of paper and attribution, the folder that holds theirs.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.
-        steps: updates of every algorithm, for a quick trial.
+        num_updates: of every algorithm, for a quick trial.
         engine: processes on this machine, or Ray tasks.
         workers: local processes; one per `threads` cores by default.
         threads: per worker; cores that Ray sets aside per task.
@@ -61,11 +61,11 @@ def bench(
     """
     from ringfence.bench import pack
 
-    if steps is not None and out_dir is None:
+    if num_updates is not None and out_dir is None:
         raise UserError(
-            f"--steps {steps} makes other rows than the suite's own; give a folder of their own with --out."
+            f"--num-updates {num_updates} makes other rows than the suite's own; give a folder of their own with --out."
         )
-    sizes = {"seeds": seeds, "episodes": episodes, "steps": steps}
+    sizes = {"seeds": seeds, "episodes": episodes, "num_updates": num_updates}
     root, grids = _grids(suite, out_dir, sum(tasks, []), sum(algorithms, []), sizes)
     for grid in grids:  # what is wrong with the last one is said before the first begins
         grid.check()

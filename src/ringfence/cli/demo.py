@@ -28,10 +28,10 @@ def run(out: Path, tier: str = "expert", quick: bool = False) -> Path:
     episodes = 10 if quick else 100
     store, path = make(task, 5_000 if quick else None)
     console.print(f"data        {store.episodes:,} episodes, return {store.returns.mean():.1f}: {path}", soft_wrap=True)
-    small = {"steps": 60, "batch": 32, "barrier_batch": 16, "width": 64}
+    small = {"num_updates": 60, "batch": 32, "barrier_batch": 16, "width": 64}
     known = {f"{part}_updates": 100 for part in ("dynamics", "value", "barrier", "future")}
     shared = {"out": out / "runs", "changes": small if quick else {}, "world": known if quick else {}}
-    cloned = loop.train("bc", store, out=out / "runs", changes={"steps": 60} if quick else {})[0]
+    cloned = loop.train("bc", store, out=out / "runs", changes={"num_updates": 60} if quick else {})[0]
     planner = loop.train("icbf", store, **shared)[0]
     rows = dict(reference.make(task, store, out / "runs", episodes))
     protocol: dict[str, Any] = {"episodes": episodes, "num_recorded": 4, "quiet": False}

@@ -87,7 +87,7 @@ def assignments(given: list[list[str]]) -> dict[str, str]:
     for pair in (pair for pairs in given for pair in pairs):
         name, equals, value = pair.partition("=")
         if not equals or not name:
-            raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set steps=8000.")
+            raise UserError(f"--set {pair} is not of the form name=value; write e.g. --set margin=0.5.")
         if name in changes:
             raise UserError(f"--set gives {name} twice, {changes[name]} and {value}; give one of them.")
         changes[name] = value

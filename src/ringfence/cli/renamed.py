@@ -25,6 +25,7 @@ OLD_FLAGS["eval"] |= {"--record": "--num-recorded", "--step": "--checkpoint"}
 OLD_FLAGS["export"] |= {"--step": "--checkpoint"}
 OLD_FLAGS["play"] |= {"--at-once": "--num-envs"}
 OLD_FLAGS["fit"] = {"--sight": "--execution"}
+OLD_FLAGS["bench"] = {"--steps": "--num-updates"}
 OLD_FLAGS["train"] = {"--together": "--vmap-seeds"}
 for importer in ("data import-table", "data import-bag"):
     OLD_FLAGS[importer] = {
@@ -50,7 +51,7 @@ def rewritten(arguments: list[str]) -> list[str]:
         _say(command, OLD_COMMANDS[command])
         command = OLD_COMMANDS[command]
         words[:length] = command.split()
-    flags = OLD_FLAGS.get("", {}) | OLD_FLAGS.get(command, {})
+    flags = OLD_FLAGS.get("", {}) | OLD_FLAGS.get("".join(words[:1]), {}) | OLD_FLAGS.get(command, {})
     for k, word in enumerate(words):
         flag, equals, value = word.partition("=")
         if flag in flags:

@@ -69,8 +69,8 @@ def evaluate_spec(
     # What cannot be kept is refused before anything is played.
     _ = run.results
     writable(run.path / "results.json")
-    if spec.checkpoint is None and resolved.step < job.config.steps:
-        message = f"'{run.path}' is at step {resolved.step} of {job.config.steps}; its training is unfinished."
+    if spec.checkpoint is None and resolved.step < job.config.num_updates:
+        message = f"'{run.path}' is at step {resolved.step} of {job.config.num_updates}; its training is unfinished."
         _log.warning(message)
     variant = resolved.variant(split)
     seed = run.config["seed"]

@@ -84,8 +84,8 @@ def complete(result: dict, task: Task) -> bool:
 
 def of_last_step(result: dict, config: dict) -> bool:
     """Whether a stored result is of a run's last step, by its config; a foreign one may tell none."""
-    steps = config.get("steps")
-    return steps is None or result.get("step", steps) == steps
+    updates = config.get("num_updates")
+    return updates is None or result.get("step", updates) == updates
 
 
 def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.training import worlds
 from ringfence.types import Algorithm, Spec
-from ringfence.utils.config import build_config
 
 
 @dataclass(frozen=True)
@@ -74,7 +73,7 @@ def make_job(
     limits: dict[str, float] = {}
     if task.env is None and store is not None and a.limit is not None and store.card.cost_limit is not None:
         limits[a.limit] = float(store.card.cost_limit)
-    config = build_config(a.Config, {**a.presets[preset], **limits, **changes}, a.name)
+    config = algos.configured(a, preset, {**limits, **changes})
     feature_map = task.feature_map(config.view, store)
     spec = task.spec(feature_map, store)
     cost_source = a.cost_source(config)

@@ -95,7 +95,7 @@ def train(
     with _undone(fresh):
         for run, seed in zip(runs, seeds):
             _prepare(run, job, seed, data)
-    steps = job.config.steps
+    steps = job.config.num_updates
     for run in runs:
         run.drop_damaged()
     left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
@@ -303,7 +303,7 @@ class _Training:
 
     def finish(self, program: Program) -> None:
         """Train to the last step; an interruption keeps what is there."""
-        steps = self.job.config.steps
+        steps = self.job.config.num_updates
         with Progress(self.label, steps, self.step, self.options.quiet) as bar:
             try:
                 while self.step < steps:

@@ -42,6 +42,7 @@ GUARD_OPTIONS = {
     "future": "terminal_value",
 }
 OPTIONS = GUARD_OPTIONS | PLANNER_OPTIONS  # of those who play
+CONFIG = {"steps": "num_updates", "target": "target_return"}  # of algorithms
 WORLD_SETTINGS = {
     "sight": "execution",
     "members": "num_ensemble",
@@ -186,9 +187,15 @@ def world_arrays(stored: Mapping[str, T]) -> dict[str, T]:
 def config(stored: Mapping[str, Any]) -> dict[str, Any]:
     """config.json of a run."""
     found = dict(stored)
-    if "spec" in found:
-        found["spec"] = spec(found["spec"])
+    for part, rename in (("spec", spec), ("config", settings)):
+        if part in found:
+            found[part] = rename(found[part])
     return found
+
+
+def settings(stored: Mapping[str, Any]) -> dict[str, Any]:
+    """An algorithm's config."""
+    return {CONFIG.get(name, name): value for name, value in stored.items()}
 
 
 def spec(stored: Mapping[str, Any]) -> dict[str, Any]:
