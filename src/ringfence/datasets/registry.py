@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypedDict
 
-from ringfence.datasets.recipes import crossing, robots, spread, spread_alike
+from ringfence.datasets.recipes import crossing, proving, robots, spread, spread_alike
 from ringfence.datasets.task import Task
-from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike
+from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, SpreadAlike, System
 from ringfence.envs.base import Env, NativeEnv
 from ringfence.envs.crossing import Body
 from ringfence.envs.mujoco import Parts
+from ringfence.envs.proving.suite import DEVELOPMENT, TEST
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
@@ -132,6 +133,24 @@ def _crossing(tier: str, body: Body = "disc") -> Task:
     )
 
 
+# What an expert driver earns (recipes/proving.py), without a step of danger: 200 test resets.
+_EXPERT: dict[str, float] = {}
+
+
+def _proving(name: str, system: System) -> Task:
+    """3000 episodes of scripted drivers; costs alone say what is dangerous."""
+    return Task(
+        f"proving-{name}",
+        system,
+        constraints.CostColumn(),
+        tier=system.drivers,
+        return_max=_EXPERT.get(name, 1.0),
+        transitions=proving.EPISODES * system.episode_length,
+        recipe=proving.RECIPE,
+        homogeneous=system.homogeneous,
+    )
+
+
 TASKS = {
     t.name: t
     for t in (
@@ -144,6 +163,8 @@ TASKS = {
         *(_crossing(tier, body) for body in _CERTIFIED for tier in crossing.TIERS),
         _spread_alike("expert"),
         _spread_alike("medium"),
+        *(_proving(name, system) for name, system in TEST.items()),
+        *(_proving(f"dev-{name}", system) for name, system in DEVELOPMENT.items()),
     )
 }
 

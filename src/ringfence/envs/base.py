@@ -103,6 +103,17 @@ class Env(Simulator, Protocol):
         ...
 
 
+@runtime_checkable
+class Measured(Protocol):
+    """A simulator that knows how far everybody is from danger."""
+
+    def from_global_state(self, flat: Array) -> PyTree: ...
+
+    def clearance(self, state: PyTree) -> Array:
+        """(..., N) signed distance, negative where it costs."""
+        ...
+
+
 class Outcome(NamedTuple):
     """What a step gives, for a batch of native simulations; what is not running has zeros."""
 

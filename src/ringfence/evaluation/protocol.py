@@ -6,6 +6,7 @@ Every episode is counted; `cost_safe_start` is the mean cost of the episodes tha
 
 from __future__ import annotations
 
+import functools
 import time
 
 import jax
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.envs.base import NativeEnv
+from ringfence.envs.base import Measured, NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import COUNTED, rollout
@@ -89,7 +90,10 @@ def of_last_step(result: dict, config: dict) -> bool:
 
 
 def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
-    """(E,) whether the first state (E, S) of an episode is already unsafe for anyone."""
+    """(E,) whether the first state (E, S) of an episode is already unsafe for anyone: by the formula of danger, or by
+    the simulator's own distances where costs alone say what is dangerous."""
+    if isinstance(task.hazard, constraints.CostColumn) and isinstance(task.env, Measured):
+        return np.asarray(_touching(task.env, jnp.asarray(states)))
     view = task.feature_map("pruned")
     bound = constraints.bind(task.hazard, view.names, view.plus.shape[0])
 
@@ -105,6 +109,11 @@ def unsafe_starts(task: Task, states: np.ndarray) -> np.ndarray:
         return labels.reshape(len(states), -1).any(-1)
 
     return np.asarray(unsafe(jnp.asarray(states)))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _touching(env: Measured, states: Array) -> Array:
+    return (env.clearance(env.from_global_state(states)) < 0).any(-1)
 
 
 def evaluate_policy(

@@ -1,0 +1,238 @@
+"""Who drives in the proving ground: straight to the goal (naive), or held back by velocity barriers, well or badly.
+
+A driver wants to move towards its goal. Of every danger of place, at a distance d with slope n, it asks
+
+    n · ċ + ḋ_others ≥ −γ (d − room)
+
+of the rate ċ that it wants, and takes the nearest one that it finds. γ is what brakes allow, times `haste`: above 1
+nobody can brake that late. Of two agents each answers for half.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.envs.proving import observations
+from ringfence.envs.proving.bodies import Motion, bounded, length
+from ringfence.envs.proving.dangers import FAR, LOW_CHARGE
+from ringfence.problem import features
+from ringfence.types import Array, Key
+
+if TYPE_CHECKING:
+    from ringfence.envs.proving.system import Drivers, System, SystemState
+
+ROUNDS = 6  # in each of which the barrier that is missed most is met
+NEAR = 0.6  # m or rad at which a driver begins to give way to the right
+GIVE_WAY = 0.35  # of the top rate
+BURST = 8  # steps that a driver who does not look does not look
+SAMPLE = 100  # episodes that tell which entries of observations vary
+SAMPLE_SEED = 37
+
+
+class Habit(NamedTuple):
+    """How somebody drives; each (..., N) or a number."""
+
+    pace: Array | float  # share of the top rate, towards the goal
+    haste: Array | float  # γ over what brakes allow
+    room: Array | float  # m or rad that it keeps
+    over: Array | float  # of a speed limit that it drives at, and how empty a battery it drives on
+    lapse: Array | float  # share of the time in which it does not look
+    unsteady: Array | float  # deviation of its hand, in actions of [−1, 1]
+
+
+CAREFUL = Habit(0.85, 0.6, 0.12, 0.85, 0.0, 0.03)
+CARELESS = Habit(1.0, 1.5, -0.01, 1.06, 0.12, 0.12)
+EXPERT = Habit(1.0, 0.65, 0.08, 0.93, 0.0, 0.0)
+FEW = 0.15  # of mostly careful drivers, who are careless
+
+
+def habits(drivers: Drivers, key: Key, shape: tuple[int, ...]) -> Habit:
+    """Habits (B, N) of an episode's drivers."""
+    key_share, key_who = jax.random.split(key)
+    share = jax.random.uniform(key_share, shape)
+    if drivers == "careless":
+        share = 0.6 + 0.6 * share
+    elif drivers == "careful":
+        share = jnp.where(jax.random.uniform(key_who, shape) < FEW, 0.7 + 0.3 * share, 0.2 * share)
+    return Habit(*(a + share * (b - a) for a, b in zip(CAREFUL, CARELESS)))
+
+
+def drive(system: System, state: SystemState, habit: Habit, key: Key, looks: Array | bool = True) -> Array:
+    """Actions (..., N, A) of drivers; `looks` (..., N): who does not goes on as if there were no danger."""
+    want = towards(system, state.goal - state.config, habit.pace)
+    want = _within_limits(system, state, want, habit)
+    distance, slope, drift, shared = _barriers(system, state)
+    body = system.made_of
+    rate = habit.haste * brake_rate(system)
+    left = distance - jnp.asarray(habit.room)[..., None]
+    bound = -jnp.asarray(rate)[..., None] * left
+    bound = jnp.where(shared, jnp.maximum(0.5 * bound, bound - drift), bound - drift)
+    kept = _kept(_aside(want, distance, slope, body.top), slope, bound)
+    cap = jnp.full(left.shape[:-1], jnp.inf)
+    ahead = body.ahead(state.pose)
+    if ahead is not None:  # what heads for a danger slows down, wherever it wants to go
+        closing = -(slope * ahead[..., None, :]).sum(-1)
+        slowest = jnp.where(closing > 0.05, jnp.maximum(-bound, 0.0) / jnp.maximum(closing, 0.05), jnp.inf)
+        cap = jnp.maximum(slowest.min(-1), 0.02)
+    seeing = jnp.broadcast_to(looks, cap.shape)
+    kept = jnp.where(seeing[..., None], kept, want)
+    cap = jnp.where(seeing, cap, jnp.inf)
+    action = system.unit(body.steer(state.motion, kept, cap, system.plant))
+    hand = jnp.asarray(habit.unsteady)[..., None] * jax.random.normal(key, action.shape)
+    return _as_taken(system, action + hand)
+
+
+def naive(system: System, observation: Array) -> Array:
+    """Actions (..., N, A) of who heads straight for its goal at full speed, from what it observes."""
+    motion, ahead = observations.read(system, observation)
+    want = towards(system, ahead, 1.0)
+    free = jnp.full(want.shape[:-1], jnp.inf)
+    return system.given(system.made_of.steer(Motion(*motion), want, free, system.plant))
+
+
+def towards(system: System, ahead: Array, pace: Array | float) -> Array:
+    """(..., N, C) the rate that leads to a goal, so far ahead (..., N, C), and stops there."""
+    body = system.made_of
+    far = length(ahead)
+    slowing = 0.6 * brake_rate(system) * far
+    speed = jnp.minimum(jnp.asarray(pace) * body.top, jnp.maximum(slowing, 0.1 * body.top))
+    return ahead / jnp.maximum(far, 1e-3)[..., None] * jnp.minimum(speed, 4 * far)[..., None]
+
+
+def brake_rate(system: System) -> float:
+    """γ, 1/s: how fast a distance may shrink, as a share of it, that brakes can keep up with."""
+    body = system.made_of
+    heaviest = float(system.plant.mass.max())
+    return 1.0 / (body.top * heaviest / body.brake + system.lag + 2 * system.dt)
+
+
+def looks(habit: Habit, key: Key, step: Array, shape: tuple[int, ...]) -> Array:
+    """(B, N) who looks in a step of an episode."""
+    drawn = jax.random.uniform(jax.random.fold_in(key, step // BURST), shape)
+    return drawn >= habit.lapse
+
+
+def _within_limits(system: System, state: SystemState, want: Array, habit: Habit) -> Array:
+    """What is wanted, less than a speed limit, and slower the emptier the battery."""
+    over = jnp.asarray(habit.over)
+    if "speed" in system.danger:
+        most = system.speed_limit * over
+        want = want * (most / jnp.maximum(length(want), most))[..., None]
+    if "battery" in system.danger:
+        reserve = jnp.maximum(2.0 - 1.9 * over, 0.02)  # 0.4 of a charge, or hardly any
+        left = (state.charge - LOW_CHARGE - 0.02) / reserve
+        want = want * jnp.clip(left, 0.0, 1.0)[..., None]
+    return want
+
+
+def _barriers(system: System, state: SystemState) -> tuple[Array, Array, Array, np.ndarray]:
+    """Of every danger of place: distances (..., N, M), their slopes (..., N, M, C) by the own config, how they change
+    by what others do (..., N, M), and whether two answer for it (M,). One that is far is always among them."""
+    mover = system.mover_at(state.phase)
+    found = system.of_place(state.config, state.config, mover)
+    n = state.config.shape[-2]
+    shared = [np.full(d.shape[-1], name in ("pairs", "apart")) for name, d in found.items()]
+
+    def joined(own: Array, others: Array, mover: Array) -> Array:
+        items = list(system.of_place(own, others, mover).values())
+        return jnp.concatenate([*items, jnp.full((*own.shape[:-1], 1), FAR)], -1)
+
+    axes = len(system.made_of.axes)
+    rest = (jnp.zeros_like(state.config), jnp.zeros_like(mover))
+    slopes = []
+    for axis in range(axes):
+        push = jnp.zeros_like(state.config).at[..., axis].set(1.0)
+        slopes.append(jax.jvp(joined, (state.config, state.config, mover), (push, *rest))[1])
+    pushed = (jnp.zeros_like(state.config), state.rate, system.mover_rate(state.phase))
+    distance, drift = jax.jvp(joined, (state.config, state.config, mover), pushed)
+    assert distance.shape[-2] == n
+    return distance, jnp.stack(slopes, -1), drift, np.concatenate([*shared, np.zeros(1, bool)])
+
+
+def _aside(want: Array, distance: Array, slope: Array, top: float) -> Array:
+    """What is wanted, and to the right of the nearest thing that is in the way."""
+    if want.shape[-1] != 2:
+        return want
+    nearest = distance.argmin(-1)
+    away = jnp.take_along_axis(slope, nearest[..., None, None], -2)[..., 0, :]
+    away = away / jnp.maximum(length(away), 1e-3)[..., None]
+    heading = want / jnp.maximum(length(want), 1e-3)[..., None]
+    blocked = jnp.maximum(-(heading * away).sum(-1), 0.0)
+    close = jnp.clip(1.0 - distance.min(-1) / NEAR, 0.0, 1.0)
+    right = jnp.stack([-away[..., 1], away[..., 0]], -1)
+    return want + (GIVE_WAY * top * blocked * close)[..., None] * right
+
+
+def _kept(want: Array, slope: Array, bound: Array) -> Array:
+    """The rate (..., N, C) near `want` of which slope · rate ≥ bound (..., N, M), as far as some rounds find it."""
+    size = (slope**2).sum(-1)
+
+    def one(rate: Array, _: None) -> tuple[Array, None]:
+        missing = jnp.where(size > 1e-4, bound - (slope * rate[..., None, :]).sum(-1), -jnp.inf)
+        scaled = missing / jnp.sqrt(jnp.maximum(size, 1e-4))
+        worst = scaled.argmax(-1)[..., None]
+        away = jnp.take_along_axis(slope, worst[..., None], -2)[..., 0, :]
+        length_ = jnp.take_along_axis(size, worst, -1)
+        lack = jnp.maximum(jnp.take_along_axis(missing, worst, -1), 0.0)
+        return rate + jnp.where(lack > 0, lack / jnp.maximum(length_, 1e-4), 0.0) * away, None
+
+    return jax.lax.scan(one, want, None, length=ROUNDS)[0]
+
+
+def _as_taken(system: System, action: Array) -> Array:
+    """Actions of [−1, 1] as `step` takes them."""
+    action = jnp.clip(action, -1.0, 1.0)
+    if system.actions == "unit":
+        return action
+    low, high = system.bounds
+    return low + (action + 1.0) / 2 * (high - low)
+
+
+def played(system: System, key: Key, batch: int, habit: Habit | None = None) -> tuple[SystemState, Array, Array, Array]:
+    """(states (L+1, B, ...), actions, rewards, costs (L, B, ...)) of the system's drivers, or of those with a habit."""
+    key_reset, key_habit, key_look, key_hand = jax.random.split(key, 4)
+    shape = (batch, system.n_agents)
+    driver = habits(system.drivers, key_habit, shape) if habit is None else habit
+    first = system.reset(key_reset, batch)
+
+    def step(state: SystemState, t: Array) -> tuple[SystemState, tuple[SystemState, Array, Array, Array]]:
+        seeing = looks(driver, key_look, t, shape)
+        action = drive(system, state, driver, jax.random.fold_in(key_hand, t), seeing)
+        after, out = system.step(state, action)
+        return after, (after, action, out.reward, out.cost)
+
+    _, (after, *rest) = jax.lax.scan(step, first, jnp.arange(system.episode_length))
+    states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, after)
+    return (states, *rest)
+
+
+@functools.lru_cache(64)
+def logged_map(system: System, view: str) -> features.FeatureMap:
+    """The view that logs of these drivers have: which entries vary, and what follows from what, as logs tell it."""
+
+    def rows(key: Key) -> Array:
+        states, _, _, _ = played(system, key, SAMPLE)
+        return jnp.swapaxes(jax.vmap(system.observe)(states), 0, 1)
+
+    with jax.ensure_compile_time_eval():  # a policy that is compiled may be the first to ask
+        seen = np.asarray(jax.jit(rows)(jax.random.key(SAMPLE_SEED)))
+    episodes, length_ = seen.shape[:2]
+    observations_ = seen.reshape(episodes * length_, *seen.shape[2:])
+    if system.homogeneous:  # each sees for itself: a team of one
+        observations_ = np.moveaxis(seen, 2, 1).reshape(-1, 1, seen.shape[-1])
+        episodes = episodes * system.n_agents
+    return features.from_data(
+        view if view in features.VIEWS and view != "centralized" else "pruned",
+        observations_,
+        None,
+        system.observation_names,
+        (),
+        first_rows=np.arange(episodes) * length_,
+        homogeneous=system.homogeneous,
+        dt=system.dt,
+    )
