@@ -30,7 +30,9 @@ def random_steps(system: System, batch: int = 6, steps: int = 12):
         after, out = system.step(state, low + 1.2 * (high - low) * (unit - 0.08))  # now and then beyond the bounds
         return after, (after, out)
 
-    return first, *jax.jit(lambda first: jax.lax.scan(step, first, jax.random.split(jax.random.key(2), steps))[1])(first)
+    return first, *jax.jit(lambda first: jax.lax.scan(step, first, jax.random.split(jax.random.key(2), steps))[1])(
+        first
+    )
 
 
 @pytest.mark.parametrize("name", FEW)
@@ -122,8 +124,8 @@ def test_a_data_set_is_made_and_begins_safe(tmp_path, monkeypatch):
     store, _ = make(task, 30 * 80)
     again, _ = make(task, 30 * 80, fresh=True)
     np.testing.assert_array_equal(store.actions, again.actions)
-    assert store.episodes == 30 and store.card["dt"] == task.env.dt and "posts" in store.card["simulator"]
-    assert not unsafe_starts(task, store.state[:: 81]).any() and isinstance(task.env, Measured)
+    assert store.episodes == 30 and store.card.dt == task.env.dt and "posts" in store.card.simulator
+    assert not unsafe_starts(task, store.state[::81]).any() and isinstance(task.env, Measured)
     view = task.feature_map("pruned")
     assert view.names[:4] == ("own.vx", "own.vy", "own.x", "own.y") and view.source == "observations"
 

@@ -95,7 +95,7 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
 @partial(jax.jit, static_argnums=(0, 2))
 def _played(system: System, key: Key, batch: int) -> dict[str, Array]:
     """Arrays (B, L, ...) of a batch of episodes."""
-    states, actions, rewards, costs = drivers.played(system, key, batch)
+    states, actions, rewards, costs = system.played(key, batch)
     kept = {
         "observations": jax.vmap(system.observe)(states),
         "state": jax.vmap(system.global_state)(states),

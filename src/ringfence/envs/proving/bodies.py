@@ -28,6 +28,7 @@ class Plant(NamedTuple):
     """What differs from one system to the next."""
 
     mass: np.ndarray  # (N, 1) of each agent; 1 is usual
+    pace: np.ndarray  # (N, 1) share of the body's top rate that each agent reaches
     drag: float  # 1/s
     dt: float  # s
 
@@ -126,11 +127,11 @@ class Point:
 
     def move(self, now: Motion, push: Array, plant: Plant) -> Motion:
         rate = now.rate + plant.dt * (push / plant.mass - plant.drag * now.rate)
-        rate = jnp.clip(rate, 0.0, self.top) if self.line else bounded(rate, self.top)
+        rate = jnp.clip(rate, 0.0, self.top * plant.pace) if self.line else bounded(rate, self.top * plant.pace[:, 0])
         return Motion(now.config + plant.dt * rate, rate, now.pose)
 
     def steer(self, now: Motion, want: Array, cap: Array, plant: Plant) -> Array:
-        return plant.mass * ((want - now.rate) / (SETTLED * plant.dt) + plant.drag * now.rate)
+        return ((want - now.rate) / (SETTLED * plant.dt) + plant.drag * now.rate) * plant.mass
 
     def show(self, pose: Array) -> Array:
         return pose
@@ -164,7 +165,7 @@ class Unicycle:
         heading = wrapped(now.pose + plant.dt * push[..., 1:])
         speed = (now.rate * along(now.pose)).sum(-1, keepdims=True)
         speed = speed + plant.dt * (push[..., :1] / plant.mass - plant.drag * speed)
-        rate = jnp.clip(speed, 0.0, self.top) * along(heading)
+        rate = jnp.clip(speed, 0.0, self.top * plant.pace) * along(heading)
         return Motion(now.config + plant.dt * rate, rate, heading)
 
     def steer(self, now: Motion, want: Array, cap: Array, plant: Plant) -> Array:
@@ -205,7 +206,7 @@ class Car:
         angle = now.pose[..., 1:]
         speed = (now.rate * along(heading)).sum(-1, keepdims=True)
         speed = speed + plant.dt * (push[..., :1] / plant.mass - plant.drag * speed)
-        speed = jnp.clip(speed, 0.0, self.top)
+        speed = jnp.clip(speed, 0.0, self.top * plant.pace)
         angle = angle + plant.dt / (self.follows + plant.dt) * (push[..., 1:] - angle)
         heading = wrapped(heading + plant.dt * speed / self.base * jnp.tan(angle))
         rate = speed * along(heading)
@@ -311,7 +312,7 @@ class Arm:
         a, b, c = self._inertia(now.config)
         asked = bounded((want - now.rate) / (4 * plant.dt), 6.0) + plant.drag * now.rate
         torque = jnp.stack([a * asked[..., 0] + b * asked[..., 1], b * asked[..., 0] + c * asked[..., 1]], -1)
-        return plant.mass * torque + self._whirl(now.config, now.rate)
+        return torque * plant.mass + self._whirl(now.config, now.rate)
 
     def show(self, pose: Array) -> Array:
         return pose
@@ -347,10 +348,11 @@ class Motor:
 
     def move(self, now: Motion, push: Array, plant: Plant) -> Motion:
         rate = now.rate + plant.dt * (push / plant.mass - plant.drag * now.rate)
+        rate = bounded(rate, self.top * plant.pace[:, 0])
         return Motion(now.config + plant.dt * rate, rate, now.pose)
 
     def steer(self, now: Motion, want: Array, cap: Array, plant: Plant) -> Array:
-        return plant.mass * (1.6 * (want - now.rate) + plant.drag * now.rate)
+        return (1.6 * (want - now.rate) + plant.drag * now.rate) * plant.mass
 
     def show(self, pose: Array) -> Array:
         return pose
@@ -382,8 +384,8 @@ def length(x: Array) -> Array:
     return jnp.sqrt((x**2).sum(-1) + 1e-12)
 
 
-def bounded(x: Array, most: float) -> Array:
-    """x with a norm of at most that."""
+def bounded(x: Array, most: float | np.ndarray) -> Array:
+    """x with a norm of at most that, or of each agent's own."""
     return x * (most / jnp.maximum(length(x), most))[..., None]
 
 

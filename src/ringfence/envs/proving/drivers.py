@@ -10,28 +10,22 @@ nobody can brake that late. Of two agents each answers for half.
 
 from __future__ import annotations
 
-import functools
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.proving import observations
-from ringfence.envs.proving.bodies import Motion, bounded, length
+from ringfence.envs.proving.bodies import Motion, length
 from ringfence.envs.proving.dangers import FAR, LOW_CHARGE
-from ringfence.problem import features
+from ringfence.envs.proving.layout import Drivers, Layout, SystemState
 from ringfence.types import Array, Key
-
-if TYPE_CHECKING:
-    from ringfence.envs.proving.system import Drivers, System, SystemState
 
 ROUNDS = 6  # in each of which the barrier that is missed most is met
 NEAR = 0.6  # m or rad at which a driver begins to give way to the right
 GIVE_WAY = 0.35  # of the top rate
 BURST = 8  # steps that a driver who does not look does not look
-SAMPLE = 100  # episodes that tell which entries of observations vary
-SAMPLE_SEED = 37
 
 
 class Habit(NamedTuple):
@@ -62,7 +56,7 @@ def habits(drivers: Drivers, key: Key, shape: tuple[int, ...]) -> Habit:
     return Habit(*(a + share * (b - a) for a, b in zip(CAREFUL, CARELESS)))
 
 
-def drive(system: System, state: SystemState, habit: Habit, key: Key, looks: Array | bool = True) -> Array:
+def drive(system: Layout, state: SystemState, habit: Habit, key: Key, looks: Array | bool = True) -> Array:
     """Actions (..., N, A) of drivers; `looks` (..., N): who does not goes on as if there were no danger."""
     want = towards(system, state.goal - state.config, habit.pace)
     want = _within_limits(system, state, want, habit)
@@ -87,7 +81,7 @@ def drive(system: System, state: SystemState, habit: Habit, key: Key, looks: Arr
     return _as_taken(system, action + hand)
 
 
-def naive(system: System, observation: Array) -> Array:
+def naive(system: Layout, observation: Array) -> Array:
     """Actions (..., N, A) of who heads straight for its goal at full speed, from what it observes."""
     motion, ahead = observations.read(system, observation)
     want = towards(system, ahead, 1.0)
@@ -95,7 +89,7 @@ def naive(system: System, observation: Array) -> Array:
     return system.given(system.made_of.steer(Motion(*motion), want, free, system.plant))
 
 
-def towards(system: System, ahead: Array, pace: Array | float) -> Array:
+def towards(system: Layout, ahead: Array, pace: Array | float) -> Array:
     """(..., N, C) the rate that leads to a goal, so far ahead (..., N, C), and stops there."""
     body = system.made_of
     far = length(ahead)
@@ -104,7 +98,7 @@ def towards(system: System, ahead: Array, pace: Array | float) -> Array:
     return ahead / jnp.maximum(far, 1e-3)[..., None] * jnp.minimum(speed, 4 * far)[..., None]
 
 
-def brake_rate(system: System) -> float:
+def brake_rate(system: Layout) -> float:
     """γ, 1/s: how fast a distance may shrink, as a share of it, that brakes can keep up with."""
     body = system.made_of
     heaviest = float(system.plant.mass.max())
@@ -117,7 +111,7 @@ def looks(habit: Habit, key: Key, step: Array, shape: tuple[int, ...]) -> Array:
     return drawn >= habit.lapse
 
 
-def _within_limits(system: System, state: SystemState, want: Array, habit: Habit) -> Array:
+def _within_limits(system: Layout, state: SystemState, want: Array, habit: Habit) -> Array:
     """What is wanted, less than a speed limit, and slower the emptier the battery."""
     over = jnp.asarray(habit.over)
     if "speed" in system.danger:
@@ -130,7 +124,7 @@ def _within_limits(system: System, state: SystemState, want: Array, habit: Habit
     return want
 
 
-def _barriers(system: System, state: SystemState) -> tuple[Array, Array, Array, np.ndarray]:
+def _barriers(system: Layout, state: SystemState) -> tuple[Array, Array, Array, np.ndarray]:
     """Of every danger of place: distances (..., N, M), their slopes (..., N, M, C) by the own config, how they change
     by what others do (..., N, M), and whether two answer for it (M,). One that is far is always among them."""
     mover = system.mover_at(state.phase)
@@ -184,55 +178,10 @@ def _kept(want: Array, slope: Array, bound: Array) -> Array:
     return jax.lax.scan(one, want, None, length=ROUNDS)[0]
 
 
-def _as_taken(system: System, action: Array) -> Array:
+def _as_taken(system: Layout, action: Array) -> Array:
     """Actions of [−1, 1] as `step` takes them."""
     action = jnp.clip(action, -1.0, 1.0)
     if system.actions == "unit":
         return action
     low, high = system.bounds
-    return low + (action + 1.0) / 2 * (high - low)
-
-
-def played(system: System, key: Key, batch: int, habit: Habit | None = None) -> tuple[SystemState, Array, Array, Array]:
-    """(states (L+1, B, ...), actions, rewards, costs (L, B, ...)) of the system's drivers, or of those with a habit."""
-    key_reset, key_habit, key_look, key_hand = jax.random.split(key, 4)
-    shape = (batch, system.n_agents)
-    driver = habits(system.drivers, key_habit, shape) if habit is None else habit
-    first = system.reset(key_reset, batch)
-
-    def step(state: SystemState, t: Array) -> tuple[SystemState, tuple[SystemState, Array, Array, Array]]:
-        seeing = looks(driver, key_look, t, shape)
-        action = drive(system, state, driver, jax.random.fold_in(key_hand, t), seeing)
-        after, out = system.step(state, action)
-        return after, (after, action, out.reward, out.cost)
-
-    _, (after, *rest) = jax.lax.scan(step, first, jnp.arange(system.episode_length))
-    states = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, after)
-    return (states, *rest)
-
-
-@functools.lru_cache(64)
-def logged_map(system: System, view: str) -> features.FeatureMap:
-    """The view that logs of these drivers have: which entries vary, and what follows from what, as logs tell it."""
-
-    def rows(key: Key) -> Array:
-        states, _, _, _ = played(system, key, SAMPLE)
-        return jnp.swapaxes(jax.vmap(system.observe)(states), 0, 1)
-
-    with jax.ensure_compile_time_eval():  # a policy that is compiled may be the first to ask
-        seen = np.asarray(jax.jit(rows)(jax.random.key(SAMPLE_SEED)))
-    episodes, length_ = seen.shape[:2]
-    observations_ = seen.reshape(episodes * length_, *seen.shape[2:])
-    if system.homogeneous:  # each sees for itself: a team of one
-        observations_ = np.moveaxis(seen, 2, 1).reshape(-1, 1, seen.shape[-1])
-        episodes = episodes * system.n_agents
-    return features.from_data(
-        view if view in features.VIEWS and view != "centralized" else "pruned",
-        observations_,
-        None,
-        system.observation_names,
-        (),
-        first_rows=np.arange(episodes) * length_,
-        homogeneous=system.homogeneous,
-        dt=system.dt,
-    )
+    return (action + 1.0) / 2 * (high - low) + low

@@ -10,19 +10,18 @@ import numpy as np
 
 from ringfence.envs.discs import FINE, HUES, LABEL, SIZE, TAIL
 from ringfence.envs.film import BLUE, DARK, EMPTY, PAPER, RED
+from ringfence.envs.proving.layout import Layout, SystemState
 
 if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageDraw import ImageDraw
-
-    from ringfence.envs.proving.system import System
 
 
 @dataclass(frozen=True)
 class Scene:
     """An episode's bodies, and how metres become pixels."""
 
-    system: System
+    system: Layout
     joints: np.ndarray  # (T+1, N, J, 2) m
     goal: np.ndarray  # (T+1, N, 2) m
     ahead: np.ndarray | None  # (T+1, N, 2)
@@ -32,15 +31,12 @@ class Scene:
     reach: float  # m from its middle to its end
 
     @classmethod
-    def of(cls, system: System, states: np.ndarray) -> Scene:
-        """Of states (T+1, S)."""
-        import jax.numpy as jnp
-
-        state = system.from_global_state(jnp.asarray(states))
+    def of(cls, system: Layout, state: SystemState, unsafe: np.ndarray) -> Scene:
+        """Of the states of an episode, (T+1, ...), and who pays in each, (T+1, N)."""
         joints = np.asarray(system.made_of.joints(state.config))
         goal = np.asarray(system.made_of.joints(state.goal))[..., -1, :]
         ahead = system.made_of.ahead(state.pose)
-        middle = np.zeros((len(states), 2))
+        middle = np.zeros((len(unsafe), 2))
         if system.body == "platoon":
             middle[:, 0] = joints[:, :, 0, 0].mean(1)
         reach = float(np.abs(joints - middle[:, None, None]).max()) + 2 * system.radius
@@ -51,7 +47,7 @@ class Scene:
             joints=joints,
             goal=goal,
             ahead=None if ahead is None else np.asarray(ahead),
-            unsafe=np.asarray(system.clearance(state) < 0),
+            unsafe=unsafe,
             mover=np.asarray(system.mover_at(state.phase)),
             middle=middle,
             reach=reach / (1 - 2 * LABEL / SIZE),  # nobody passes beneath the words
@@ -119,11 +115,11 @@ class Scene:
                 self.line(draw, step, np.stack([joints[i, 0], front]), DARK, 2 * FINE)
 
 
-def frames(system: System, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
-    """Pictures of an episode, states (T+1, S), at `moments`: (step, whether there was a cost since the last)."""
+def frames(scene: Scene, moments: list[tuple[int, bool]]) -> Iterator[Image]:
+    """Pictures of an episode at `moments`: (step, whether there was a cost since the last)."""
     from PIL import Image, ImageDraw, ImageFont
 
-    scene = Scene.of(system, states)
+    system = scene.system
     font = ImageFont.load_default(13 * FINE)
     steps = 0
     before = 0

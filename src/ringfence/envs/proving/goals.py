@@ -4,7 +4,6 @@ says what comes next."""
 from __future__ import annotations
 
 import functools
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +11,9 @@ import numpy as np
 
 from ringfence.envs.proving.bodies import length
 from ringfence.envs.proving.dangers import FAR, OF_PLACE, STANDING
+from ringfence.envs.proving.layout import Layout
 from ringfence.errors import UserError
 from ringfence.types import Array, Key
-
-if TYPE_CHECKING:
-    from ringfence.envs.proving.system import System
 
 DRAWS = 2**24  # whole numbers that a float32 tells apart
 TRIES = 8  # goals of which the first that is free and far enough is taken
@@ -30,12 +27,12 @@ RAISED = ((1.3, -0.4), (1.8, 0.4))  # rad, where arms begin
 SHAFTS = 3.0  # rad to either side, goals of motors
 
 
-def reach(system: System) -> float:
+def reach(system: Layout) -> float:
     """m or rad from a goal at which the next one is given."""
     return REACHED
 
 
-def slots(system: System) -> np.ndarray:
+def slots(system: Layout) -> np.ndarray:
     """(N, C) where an agent of a formation stands in it."""
     n = np.arange(system.n_agents)
     if system.body == "platoon":
@@ -46,7 +43,7 @@ def slots(system: System) -> np.ndarray:
     return zigzag.astype(np.float32)
 
 
-def region(system: System) -> tuple[np.ndarray, np.ndarray]:
+def region(system: Layout) -> tuple[np.ndarray, np.ndarray]:
     """(C,) twice: between what bounds goals are drawn."""
     if system.body == "platoon":
         return np.array(AHEAD[:1]), np.array(AHEAD[1:])
@@ -65,7 +62,7 @@ def region(system: System) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def room(system: System, config: Array) -> Array:
+def room(system: Layout, config: Array) -> Array:
     """(..., N) from what stands still and is dangerous."""
     found = [OF_PLACE[name] for name in STANDING if name in system.danger]
     least = jnp.full(config.shape[:-1], FAR)
@@ -74,7 +71,7 @@ def room(system: System, config: Array) -> Array:
     return least
 
 
-def starts(system: System, key: Key, batch: int) -> Array:
+def starts(system: Layout, key: Key, batch: int) -> Array:
     """(B, N, C) places to begin in."""
     key_cell, key_jitter = jax.random.split(key)
     shape = (batch, system.n_agents, len(system.made_of.axes))
@@ -83,11 +80,11 @@ def starts(system: System, key: Key, batch: int) -> Array:
         low, high = np.array(RAISED[0]), np.array(RAISED[1])
         if "joints" in system.danger:
             low, high = np.full(2, -0.4), np.full(2, 0.4)
-        return low + (jitter + 1) / 2 * (high - low)
+        return (jitter + 1) / 2 * (high - low) + low
     if system.body == "motor":
         return 0.1 * jitter if system.goals == "team" else 0.5 * jitter
     if system.body == "platoon":
-        return slots(system) + 0.2 * jitter
+        return 0.2 * jitter + slots(system)
     cells, size = _cells(system)
     if system.goals == "team":
         index = jax.random.randint(key_cell, (batch,), 0, len(cells))
@@ -98,7 +95,7 @@ def starts(system: System, key: Key, batch: int) -> Array:
 
 
 @functools.lru_cache(64)
-def _cells(system: System) -> tuple[np.ndarray, float]:
+def _cells(system: Layout) -> tuple[np.ndarray, float]:
     """(M, 2) middles of cells that are free all over, of an agent or of a whole formation, and their size."""
     slot = slots(system) if system.goals == "team" else np.zeros((1, 2), np.float32)
     end = system.side / 2 - system.radius - 0.1
@@ -118,7 +115,7 @@ def _cells(system: System) -> tuple[np.ndarray, float]:
     raise UserError(f"{system.n_agents} agents find no free place in a room of {system.side:g} m; give a larger side.")
 
 
-def following(system: System, config: Array, goal: Array, draw: Array) -> tuple[Array, Array]:
+def following(system: Layout, config: Array, goal: Array, draw: Array) -> tuple[Array, Array]:
     """(goals (..., N, C), what the ones after are drawn by): of some that are drawn, the first that is free and far
     enough from here, else the freest."""
     axes = len(system.made_of.axes)

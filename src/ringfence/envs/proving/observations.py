@@ -3,40 +3,36 @@ them."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.proving.bodies import Motion
 from ringfence.envs.proving.dangers import BY_PLACE
+from ringfence.envs.proving.layout import Layout, SystemState
 from ringfence.envs.sight import approaches
 from ringfence.types import Array
-
-if TYPE_CHECKING:
-    from ringfence.envs.proving.system import System, SystemState
 
 SIGHT = 3.0  # m; who is farther away is not seen, where not all are observed
 SOON = 1.0  # s in which who comes nearest is observed
 
 
-def placed(system: System) -> bool:
+def placed(system: Layout) -> bool:
     """Whether agents know where they are."""
     return not system.planar and system.body != "platoon" or any(name in BY_PLACE for name in system.danger)
 
 
-def nearest_only(system: System) -> bool:
+def nearest_only(system: Layout) -> bool:
     """Whether not all others are observed, but those who come nearest."""
     return system.homogeneous or system.n_agents - 1 > system.neighbours
 
 
-def observed(system: System) -> int:
+def observed(system: Layout) -> int:
     """How many others have entries."""
     return system.neighbours if nearest_only(system) else system.n_agents - 1
 
 
-def names(system: System) -> tuple[str, ...]:
+def names(system: Layout) -> tuple[str, ...]:
     """Entries of an observation."""
     body = system.made_of
     own = [*body.rates, *body.posed]
@@ -57,7 +53,7 @@ def names(system: System) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _relative(system: System) -> tuple[str, ...]:
+def _relative(system: Layout) -> tuple[str, ...]:
     """What is observed of another: where it is, and how that changes."""
     if system.body == "arm":
         return ("dx", "dy", "dvx", "dvy")
@@ -65,14 +61,14 @@ def _relative(system: System) -> tuple[str, ...]:
     return tuple(f"d{name}" for name in (*body.axes, *body.rates))
 
 
-def spots(system: System, state: SystemState) -> tuple[Array, Array]:
+def spots(system: Layout, state: SystemState) -> tuple[Array, Array]:
     """(..., N, G) twice: where others see an agent, and how fast that moves: of an arm its hand."""
     if system.body != "arm":
         return state.config, state.rate
     return jax.jvp(lambda config: system.made_of.joints(config)[..., -1, :], (state.config,), (state.rate,))
 
 
-def observe(system: System, state: SystemState) -> Array:
+def observe(system: Layout, state: SystemState) -> Array:
     """(..., N, O) as `names` says."""
     spot, speed = spots(system, state)
     parts = [state.rate, system.made_of.show(state.pose)]
@@ -101,7 +97,7 @@ def _everybody(spot: Array, speed: Array) -> Array:
     return rows.reshape(*spot.shape[:-1], -1)
 
 
-def _nearest(system: System, spot: Array, speed: Array) -> Array:
+def _nearest(system: Layout, spot: Array, speed: Array) -> Array:
     """(..., N, k (2G + 1)): those who come nearest, first; who is not seen stands at the end of sight."""
     k = system.neighbours
     count = min(k, system.n_agents - 1)
@@ -120,7 +116,7 @@ def _nearest(system: System, spot: Array, speed: Array) -> Array:
     return jnp.concatenate([rows, missing], -2).reshape(*spot.shape[:-1], -1)
 
 
-def read(system: System, observation: Array) -> tuple[Motion, Array]:
+def read(system: Layout, observation: Array) -> tuple[Motion, Array]:
     """(its motion, the way to its goal (..., N, C)) of what an agent observes; where it is stays 0 where it does not
     know."""
     body = system.made_of

@@ -8,9 +8,7 @@ from ringfence.envs.proving.system import System
 TEST: dict[str, System] = {
     "discs": System("integrator", ("pairs",), 4),
     "posts": System("integrator", ("pairs", "posts"), 4, drag=0.3),
-    "flock": System(
-        "integrator", ("apart", "pairs"), 5, goals="team", lag=0.2, mass=1.3, side=6.0, episode_length=100
-    ),
+    "flock": System("integrator", ("apart", "pairs"), 5, goals="team", lag=0.2, mass=1.3, side=6.0, episode_length=100),
     "hall": System(
         "unicycle",
         ("pairs", "walls", "posts"),
@@ -20,9 +18,7 @@ TEST: dict[str, System] = {
         posts=((1.2, 0.8, 0.3), (-1.2, 0.6, 0.4), (0.1, -1.2, 0.25)),
         episode_length=100,
     ),
-    "crowd": System(
-        "unicycle", ("pairs",), 12, costs="each", drivers="careless", homogeneous=True, side=7.0, drag=0.2
-    ),
+    "crowd": System("unicycle", ("pairs",), 12, costs="each", drivers="careless", homogeneous=True, side=7.0, drag=0.2),
     "couriers": System("unicycle", ("battery", "pairs"), 5, costs="each", side=5.0, episode_length=100),
     "street": System("car", ("mover", "pairs"), 3, side=6.0, dt=0.08, mass=1.2, mover=(0.35, 1.4, 10.0)),
     "lane": System(
