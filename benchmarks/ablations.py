@@ -95,7 +95,7 @@ class Way:
 
 
 ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
-MEMBERS = {f"an ensemble of {k}": Way(world={"members": k}) for k in (1, 5)}
+MEMBERS = {f"an ensemble of {k}": Way(world={"num_ensemble": k}) for k in (1, 5)}
 RETAIN = {"condition (3), not a margin": Way({"condition": "retain"})}
 FORMULA = {"danger by the true formula": Way({"barrier": "analytic"})}
 TRUE = {

@@ -35,8 +35,8 @@ WAYS: dict[str, dict] = {
     "hinges, gradient penalty 0.1": {"loss": "gradient-penalty", "penalty": 0.1},
     "hinges, gradient penalty 1": {"loss": "gradient-penalty", "penalty": 1.0},
     "half the updates": {"half": True},
-    "state alone": {"both_ends": False},
-    "both ends of steps": {"both_ends": True},
+    "state alone": {"use_transition": False},
+    "both ends of steps": {"use_transition": True},
 }
 GUARDS: dict[str, dict] = {
     "margin": {},

@@ -2,7 +2,7 @@
 
 # A World that is fitted in a second and knows little.
 QUICK_WORLD = dict(
-    members=2,
+    num_ensemble=2,
     dynamics_updates=20,
     dynamics_width=16,
     value_updates=20,

@@ -104,7 +104,7 @@ def test_an_evaluation_with_other_options_is_missing_again(tmp_path, monkeypatch
         patch.setitem(GUARDS, "shield", {**GUARDS["shield"], "horizon": 5})
         assert cell.state(tmp_path, 4) == "to do"
     world = grid.dataclasses.asdict(Settings(labels="formula"))  # which follows from the data
-    for change, state in (({}, "done"), ({"members": 5}, "to do"), ({"view": "centralized"}, "to do")):
+    for change, state in (({}, "done"), ({"num_ensemble": 5}, "to do"), ({"view": "centralized"}, "to do")):
         stored = result | {"world_settings": world | change}
         Run(cell.folder(tmp_path)).add_result("default+shield-learned", stored)
         assert cell.state(tmp_path, 4) == state

@@ -74,7 +74,7 @@ def logs():
 
 @pytest.fixture(scope="module")
 def fitted(logs):
-    settings = dict(members=2, dynamics_updates=1500, dynamics_width=32, value_updates=50)
+    settings = dict(num_ensemble=2, dynamics_updates=1500, dynamics_width=32, value_updates=50)
     return worlds.fit(logs, **settings, barrier_updates=800, barrier_width=32, future_updates=100)
 
 

@@ -121,5 +121,13 @@ def test_homogeneous_agents_of_older_files_are_known():
 
 
 def test_settings_of_algorithms_of_older_runs_are_known():
-    older = {"algorithm": "bc-return", "config": {"steps": 20, "target": 1.5, "width": 8}}
+    older = {"algorithm": "bc-return", "config": {"steps": 20, "target": 1.5, "width": 8}, "world": None}
+    assert stored.config(older)["world"] is None
+    older["world"] = {"sight": "own", "members": 3, "both_ends": None, "missed": 0.001}
+    assert stored.config(older)["world"] == {
+        "execution": "decentralized",
+        "num_ensemble": 3,
+        "use_transition": None,
+        "miscoverage": 0.001,
+    }
     assert stored.config(older)["config"] == {"num_updates": 20, "target_return": 1.5, "width": 8}

@@ -126,8 +126,8 @@ def test_costs_that_tell_nothing_are_refused(small_store, value, said):
 def test_a_formula_that_is_not_there_is_refused(small_store):
     with pytest.raises(UserError, match="labels='formula' needs a formula of danger"):
         worlds.fit(with_costs(small_store, small_store.costs), **QUICK_WORLD, labels="formula")
-    with pytest.raises(UserError, match="did you mean 'members'"):
-        worlds.fit(small_store, membres=3)
+    with pytest.raises(UserError, match="did you mean 'num_ensemble'"):
+        worlds.fit(small_store, num_ensembles=3)
 
 
 def test_names_tell_who_is_who():
@@ -142,7 +142,7 @@ def test_names_tell_who_is_who():
     )
     assert "own.x" in [spread.names[d] for d in shape.own]
     body = cbf.shape_of(registry.get("ant_4x2-poor").feature_map("pruned"))
-    assert body.joint and body.blame == "all" and body.both_ends and not body.pairs
+    assert body.joint and body.blame == "all" and body.use_transition and not body.pairs
     table = np.zeros((2, 3), int)
     unnamed = FeatureMap("pruned", ("a", "b", "c"), "observations", table, table - 1)
     assert cbf.shape_of(unnamed).groups == 2 and not cbf.shape_of(unnamed).pairs

@@ -152,7 +152,7 @@ class Guard(eqx.Module):
 
         def loss(actions: Array) -> Array:
             rows, spread = self.imagined(present, actions)
-            value = self.world.values.of_plan(rows, actions) / self.world.values.usual
+            value = self.world.values.of_plan(rows, actions) / self.world.values.value_std
             short = jnp.minimum(self.clear(rows, spread, margin), 0.0).sum((2, 3))
             return -(value.sum() + self.options.safety_weight * short.sum())
 

@@ -187,8 +187,8 @@ def world_arrays(stored: Mapping[str, T]) -> dict[str, T]:
 def config(stored: Mapping[str, Any]) -> dict[str, Any]:
     """config.json of a run."""
     found = dict(stored)
-    for part, rename in (("spec", spec), ("config", settings)):
-        if part in found:
+    for part, rename in (("spec", spec), ("config", settings), ("world", world_settings)):
+        if found.get(part) is not None:
             found[part] = rename(found[part])
     return found
 

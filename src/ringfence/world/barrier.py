@@ -46,7 +46,7 @@ class Shape(eqx.Module):
     pairs: tuple[tuple[str, tuple[tuple[int, ...], ...]], ...] = eqx.field(static=True)  # kind -> entries of each pair
     # kind -> which of a pair's entries are the offset (dx, ...) and the relative velocity (dvx, ...)
     offsets: tuple[tuple[tuple[int, ...], tuple[int, ...]], ...] = eqx.field(static=True)
-    both_ends: bool = eqx.field(static=True)  # read the change of the step, too
+    use_transition: bool = eqx.field(static=True)  # read the change of the step, too
     groups: int = eqx.field(static=True)  # 1: agents share weights
     joint: bool = eqx.field(static=True)  # a body: one look, everybody's score
     blame: Literal["worst", "all"] = eqx.field(static=True)  # who explains a team's label
@@ -83,7 +83,7 @@ class Barrier(eqx.Module):
     def standardised(self, before: Array, after: Array) -> Array:
         """What ℓ reads of steps: where they lead, and how they move where both ends are read."""
         x = (after - self.mean) / self.scale
-        if not self.shape.both_ends:
+        if not self.shape.use_transition:
             return x
         return jnp.concatenate([x, (after - before - self.step_mean) / self.step_scale], -1)
 
@@ -125,7 +125,7 @@ def soft(score: Array) -> Array:
 # --- what is read ---
 
 
-def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = True) -> Shape:
+def shape_of(map: FeatureMap, use_transition: bool | None = None, distances: bool = True) -> Shape:
     """The shape that a view's names tell; without `distances` pairs do not read how far apart they are. A body's danger
     is of a step (a mean speed), so both its ends are read; of agents in a plane it is of the state that a step leads
     to, by default."""
@@ -136,7 +136,7 @@ def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = T
             own=tuple(range(len(names))),
             pairs=(),
             offsets=(),
-            both_ends=map.shared_body if both_ends is None else both_ends,
+            use_transition=map.shared_body if use_transition is None else use_transition,
             groups=1 if map.joint else map.plus.shape[0],
             joint=map.joint,
             blame="all" if map.shared_body else "worst",
@@ -149,7 +149,7 @@ def shape_of(map: FeatureMap, both_ends: bool | None = None, distances: bool = T
         own=tuple(d for d in range(len(names)) if d not in inside),
         pairs=pairs,
         offsets=tuple(_offsets(names, kind, each[0]) if distances else ((), ()) for kind, each in pairs),
-        both_ends=bool(both_ends),
+        use_transition=bool(use_transition),
         groups=1,
         joint=False,
         blame="worst",
@@ -188,7 +188,7 @@ def _offsets(names: tuple[str, ...], kind: str, pair: tuple[int, ...]) -> tuple[
 
 def networks(key: Key, shape: Shape, width: int) -> dict[str, MLP]:
     """g_0 and one g for each kind of pair, 3 hidden layers each."""
-    twice = 2 if shape.both_ends else 1
+    twice = 2 if shape.use_transition else 1
     keys = jax.random.split(key, 1 + len(shape.pairs))
     made = {}
     if shape.own:
@@ -217,17 +217,17 @@ def isotropic(shape: Shape, mean: np.ndarray, scale: np.ndarray) -> tuple[np.nda
 
 def _still(shape: Shape) -> Shape:
     """The same of states instead of steps."""
-    return replace(shape, both_ends=False)
+    return replace(shape, use_transition=False)
 
 
 def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
     """Scores (..., N) of standardised entries (..., N, D or 2D); `agents` is that shape."""
-    half = z.shape[-1] // (2 if shape.both_ends else 1)
+    half = z.shape[-1] // (2 if shape.use_transition else 1)
     if shape.joint:
         z = z[..., :1, :]
 
     def read(entries: np.ndarray) -> Array:
-        index = np.concatenate([entries, entries + half], -1) if shape.both_ends else entries
+        index = np.concatenate([entries, entries + half], -1) if shape.use_transition else entries
         return z[..., index]
 
     parts = []
@@ -342,7 +342,7 @@ def fit_future(
     shape = _still(barrier.shape)
     few = batch // 4 if len(close) else 0
     net = barrier.label
-    if barrier.shape.both_ends:
+    if barrier.shape.use_transition:
         width = next(iter(barrier.label.values())).weights[0].shape[-1]
         net = networks(key_nets, shape, width)
 
@@ -372,9 +372,9 @@ def fit_future(
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
-def blank_barrier(map: FeatureMap, width: int, both_ends: bool | None = None, distances: bool = True) -> Barrier:
+def blank_barrier(map: FeatureMap, width: int, use_transition: bool | None = None, distances: bool = True) -> Barrier:
     """A barrier of the right shapes that says nothing."""
-    shape = shape_of(map, both_ends, distances)
+    shape = shape_of(map, use_transition, distances)
     one = jnp.ones(len(map.names))
     key = jax.random.key(0)
     return Barrier(

@@ -111,7 +111,7 @@ def fit_dynamics(
     map: FeatureMap,
     key: Key,
     *,
-    members: int,
+    num_ensemble: int,
     updates: int,
     width: int,
     label: str = "",
@@ -124,8 +124,8 @@ def fit_dynamics(
     shown = slice(0, 1) if map.joint else slice(None)
     before = np.asarray(features[some, shown], np.float64).reshape(-1, features.shape[-1])
     after = np.asarray(features[some + 1, shown], np.float64).reshape(before.shape)
-    model = _standardised(blank_dynamics(map, actions.shape[-1], members, width), before, after)
-    nets = _networks(key_nets, map, actions.shape[-1], members, width)
+    model = _standardised(blank_dynamics(map, actions.shape[-1], num_ensemble, width), before, after)
+    nets = _networks(key_nets, map, actions.shape[-1], num_ensemble, width)
     whose = others(map.plus.shape[0])
 
     def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array) -> Array:
@@ -146,10 +146,10 @@ def fit_dynamics(
         def of(nets: tuple[MLP, MLP | None], step: Array) -> Array:
             return of_member(nets, features[row[step]], actions[step], features[row[step] + 1])
 
-        return jax.vmap(of)(nets, pick.reshape(members, -1)).sum()
+        return jax.vmap(of)(nets, pick.reshape(num_ensemble, -1)).sum()
 
     data = features, actions, row
-    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * members, 4e-3, label))
+    return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * num_ensemble, 4e-3, label))
 
 
 def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:
@@ -162,9 +162,9 @@ def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dyn
     return eqx.tree_at(lambda d: (d.mean, d.scale, d.step_mean, d.step_scale), model, statistics)
 
 
-def blank_dynamics(map: FeatureMap, action: int, members: int, width: int) -> Dynamics:
+def blank_dynamics(map: FeatureMap, action: int, num_ensemble: int, width: int) -> Dynamics:
     """An ensemble of the right shapes that says nothing."""
-    net, guesses = _networks(jax.random.key(0), map, action, members, width)
+    net, guesses = _networks(jax.random.key(0), map, action, num_ensemble, width)
     one = jnp.ones(len(map.names))
     some = jnp.ones(len(_predicted(map)))
     return Dynamics(net, guesses, mean=one, scale=one, step_mean=some, step_scale=some, map=map)
@@ -181,7 +181,7 @@ def _of_first(map: FeatureMap) -> np.ndarray:
     return np.array([[at[source] for source in row] for row in map.plus.tolist()])
 
 
-def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) -> tuple[MLP, MLP | None]:
+def _networks(key: Key, map: FeatureMap, action: int, num_ensemble: int, width: int) -> tuple[MLP, MLP | None]:
     """Of what moves, and of what others see and do where that is guessed. Agents of one kind share weights: all of a
     team whose entries are named alike, and the one body of robots."""
     n = map.plus.shape[0]
@@ -189,10 +189,10 @@ def _networks(key: Key, map: FeatureMap, action: int, members: int, width: int) 
     read = n * (entries + action) if map.models_others else entries + (n if map.joint else 1) * action
     groups = 1 if map.joint or map.follows else n
     sizes = (read, width, width, len(_predicted(map)))
-    keys = jax.random.split(key, members)
+    keys = jax.random.split(key, num_ensemble)
     nets = jax.vmap(lambda k: MLP(k, sizes, groups=groups, linear=True))(keys)
     if not map.models_others:
         return nets, None
-    keys = jax.random.split(jax.random.fold_in(key, 1), members)
+    keys = jax.random.split(jax.random.fold_in(key, 1), num_ensemble)
     sizes = (entries, width, width, read - entries - action)
     return nets, jax.vmap(lambda k: MLP(k, sizes, groups=groups))(keys)

@@ -41,7 +41,7 @@ STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
 PARTS = {
-    "dynamics": ("members", "dynamics_updates", "dynamics_width"),
+    "dynamics": ("num_ensemble", "dynamics_updates", "dynamics_width"),
     "values": ("discount", "value_updates"),
     "label": (
         "labels",
@@ -49,7 +49,7 @@ PARTS = {
         "penalty",
         "predicted_share",
         "distances",
-        "both_ends",
+        "use_transition",
         "barrier_width",
         "barrier_updates",
     ),
@@ -164,7 +164,7 @@ def _dynamics(logged: Logged, moved: str, blank: dynamics.Dynamics, parts: _Part
             arrays["row"][steps],
             logged.map,
             key,
-            members=settings.members,
+            num_ensemble=settings.num_ensemble,
             updates=settings.dynamics_updates,
             width=settings.dynamics_width,
             label="" if quiet else "forward dynamics, what actions do",

@@ -23,7 +23,7 @@ class Settings:
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent in its own view
     labels: Literal["costs", "formula"] = "costs"  # where labels of danger come from
     discount: Share = 0.9  # of values
-    members: Annotated[int, Meta(ge=1, le=20)] = 3  # of the ensemble of forward models
+    num_ensemble: Annotated[int, Meta(ge=1, le=20)] = 3  # of the ensemble of forward models
     dynamics_updates: Count = 20_000
     dynamics_width: Width = 128  # units of each of 2 hidden layers
     value_updates: Count = 8000  # of the critic, and again of rewards
@@ -32,7 +32,7 @@ class Settings:
     penalty: NonNegative = 1.0  # weight of the gradient's, where the loss has one
     predicted_share: Share = 0.5  # share of labelled steps that end where they were predicted to end
     distances: bool = True  # pairs read how far apart they are and how fast they close
-    both_ends: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
+    use_transition: bool | None = None  # danger is of a step, not of the state it leads to; None: of bodies
     barrier_width: Width = 64  # units of each of 3 hidden layers
     barrier_updates: Count = 6000  # of the labels
     future_updates: Count = 4000  # of the value of danger

@@ -36,7 +36,7 @@ def blank_world(
     alone = settings.execution == "decentralized"
 
     def shapes() -> World:
-        acts = dynamics.blank_dynamics(map, spec.action_dim, settings.members, settings.dynamics_width)
+        acts = dynamics.blank_dynamics(map, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
         value = values.blank_values(map, spec.action_dim, settings.discount, alone)
         barrier = blank_barrier(map, settings) if settings.barrier else None
         names = tuple(constraints)
@@ -48,7 +48,7 @@ def blank_world(
 
 
 def blank_barrier(map: features.FeatureMap, settings: Settings) -> cbf.Barrier:
-    return cbf.blank_barrier(map, settings.barrier_width, settings.both_ends, settings.distances)
+    return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances)
 
 
 def save(

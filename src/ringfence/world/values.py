@@ -66,7 +66,7 @@ class Values(eqx.Module):
         return state_values(self.critic, x, self.alone)[1]
 
     @property
-    def usual(self) -> Array:
+    def value_std(self) -> Array:
         """The deviation of the logs' returns-to-go: the unit that values are compared in."""
         return self.critic["value"][1, 1]
 

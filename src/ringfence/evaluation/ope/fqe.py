@@ -102,17 +102,17 @@ def fitted_q(
     return Values(Mean.of_bootstrap(found[:, 0]), Mean.of_bootstrap(found[:, 1]))
 
 
-def _bootstrap(episode_of_step: np.ndarray, members: int, key: Key) -> np.ndarray:
+def _bootstrap(episode_of_step: np.ndarray, num_ensemble: int, key: Key) -> np.ndarray:
     """(T, M): how often each member drew the episode of a step."""
     episodes, which = np.unique(episode_of_step, return_inverse=True)
     rng = np.random.default_rng(int(jax.random.bits(key)))
-    return rng.poisson(1.0, (len(episodes), members))[which]
+    return rng.poisson(1.0, (len(episodes), num_ensemble))[which]
 
 
-def _networks(data: Steps, joint: bool, members: int, key: Key) -> Q:
+def _networks(data: Steps, joint: bool, num_ensemble: int, key: Key) -> Q:
     agents, actions = data.next_action.shape[1:]
     sizes = (data.x.shape[-1] + (agents * actions if joint else actions), WIDTH, WIDTH, 2)
-    return jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), joint))(jax.random.split(key, members))
+    return jax.vmap(lambda k: Q(MLP(k, sizes, linear=True), joint))(jax.random.split(key, num_ensemble))
 
 
 def _fitted(nets: Q, data: Steps, nothing: Array, settings: FQE, key: Key, label: str) -> Q:
