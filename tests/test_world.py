@@ -224,7 +224,6 @@ def test_own_entries_tell_the_rest_where_the_logs_agree(played):
 
 def test_a_hazard_keeps_what_it_reads(small_store):
     card = small_store.card.updated(task="mine", observation_names=None, hazard=constraints.Separation(0.3))
-    card = {**card, "hazard": constraints.to_dict(card["hazard"])}
     own = dataclasses.replace(small_store, card=card)
     task = registry.from_store(own)
     assert {"agent0.x", "agent2.y"} <= set(task.feature_map("pruned", own).names)
