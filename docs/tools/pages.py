@@ -12,7 +12,7 @@ from pathlib import Path
 import ringfence
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
-from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread
+from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, System
 from ringfence.problem import constraints
 from ringfence.utils import stored
 
@@ -90,6 +90,8 @@ ABOUT: dict[type, str] = {
     "Multi-Agent MuJoCo ([simulator](../data.md#robots-the-simulator), [data](../data.md#halfcheetah-and-ant)).",
     Crossing: "Discs with momentum find their way through one another, any number of them; each sees and decides for "
     "itself ([Crossing](../crossing.md)).",
+    System: "A system of the proving ground: small, of a kind that the library was not made for. Costs alone say what is "
+    "dangerous.",
 }
 FILMS = {
     "halfcheetah_2x3-good": ("rollout.gif", "Left a planner as it is, right one that keeps the limit"),
@@ -212,7 +214,7 @@ def groups() -> dict[str, list[Task]]:
     """Tasks by simulator and, where it has several, by limit."""
     found = defaultdict(list)
     for task in TASKS.values():
-        words = " ".join(re.findall("[A-Z][a-z]+", type(task.env).__name__))
+        words = " ".join(re.findall("[A-Z][a-z]+", type(task.env).__name__)).replace("System", "Proving ground")
         found[f"Robots, {task.protocol} limits" if task.protocol else words].append(task)
     return dict(found)
 
@@ -223,6 +225,8 @@ def danger(hazard: constraints.Hazard) -> str:
         return f"a speed above {hazard.limit:g} m/s"
     if isinstance(hazard, constraints.Separation):
         return f"two centres nearer than {hazard.radius:g} m"
+    if isinstance(hazard, constraints.CostColumn):
+        return "what the cost column says"
     return str(hazard)
 
 
@@ -298,6 +302,8 @@ def _rows(task: Task) -> list[str]:
     """The committed results, a table for each suite that played the task."""
     lines = []
     for suite in SUITES:
+        if not (RESULTS / suite / "table.csv").exists():  # not played in full yet
+            continue
         found = defaultdict(list)
         for row in stored.table(RESULTS / suite / "table.csv"):
             if row["task"] == task.name:
