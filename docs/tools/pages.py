@@ -90,8 +90,8 @@ ABOUT: dict[type, str] = {
     "Multi-Agent MuJoCo ([simulator](../data.md#robots-the-simulator), [data](../data.md#halfcheetah-and-ant)).",
     Crossing: "Discs with momentum find their way through one another, any number of them; each sees and decides for "
     "itself ([Crossing](../crossing.md)).",
-    System: "A system of the proving ground: small, of a kind that the library was not made for. Costs alone say what is "
-    "dangerous.",
+    System: "A system of the proving ground: small, and of a kind that the library was not made for. Costs alone "
+    "say what is dangerous.",
 }
 FILMS = {
     "halfcheetah_2x3-good": ("rollout.gif", "Left a planner as it is, right one that keeps the limit"),
