@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-.PHONY: demo test versions docs lint types clean
+.PHONY: demo test versions docs lint clean
 
 $(BIN)/python:
 	$(PYTHON) -c 'import sys; sys.exit("Ringfence needs Python 3.11 or newer, found " + sys.version.split()[0] + "; run make PYTHON=python3.12") if sys.version_info < (3, 11) else None'
@@ -36,9 +36,6 @@ docs: $(VENV)/.docs
 lint: $(VENV)/.ready
 	$(BIN)/ruff check src tests benchmarks docs/tools
 	$(BIN)/lint-imports
-
-# Not yet part of `lint`: errors are left in src/ringfence.
-types: $(VENV)/.ready
 	$(BIN)/basedpyright --level error
 
 clean:

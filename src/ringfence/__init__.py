@@ -9,7 +9,7 @@ import importlib
 
 from ringfence.utils import moved
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 # Loaded on first use, so that `import ringfence` and `ringfence --help` start at once.
 _WHERE = {

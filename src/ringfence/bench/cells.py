@@ -22,12 +22,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ringfence import __version__, algos
+from ringfence import algos
 from ringfence.bench.packed import unpack
 from ringfence.bench.suites import COLLECTIONS, SUITES
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.task import Task
+from ringfence.datasets.version import RECIPES
 from ringfence.errors import RunConflict, UserError, unknown, whole_number
 from ringfence.evaluation import protocol, reference
 from ringfence.evaluation.evaluate import evaluate_spec
@@ -81,7 +82,7 @@ class Cell:
         task = registry.get(self.task)
         content = {
             "format": FORMAT,
-            "data": [__version__, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
+            "data": [RECIPES, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
             "algorithm": self.algorithm,
             "config": {_FIRST_NAMES.get(k, k): v for k, v in dataclasses.asdict(self.config).items()},
             "seed": self.seed,

@@ -27,11 +27,15 @@ def renamed(given: Mapping[str, Any], names: Mapping[str, str], of: str, warn: b
 
 def renamed_values(given: Mapping[str, T], values: Mapping[str, Mapping[str, T]], warn: bool = True) -> dict[str, T]:
     """The same with today's names of values; `values` maps those of before to them, by what they are values of."""
-    found = {name: values.get(name, {}).get(value, value) for name, value in given.items()}
+    found = {name: _today(values.get(name), value) for name, value in given.items()}
     for name, value in given.items():
         if found[name] != value and warn:
             deprecated(f"{name}={value}", f"{name}={found[name]}")
     return found
+
+
+def _today(values: Mapping[str, T] | None, value: T) -> T:
+    return values[value] if values and isinstance(value, str) and value in values else value
 
 
 def deprecated(what: str, instead: str) -> None:

@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ringfence import __version__
 from ringfence.datasets.behaviour import gather, rollout
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.datasets.version import RECIPES
 from ringfence.envs.crossing import DT, PUSH, RADIUS, SOON, TURN, Crossing, CrossingState, length
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
@@ -50,9 +50,7 @@ def about(task: Task) -> Card:
     """The simulator, for the card."""
     env = _env(task)
     room = f"{env.body}, goals {env.goals}, {env.spacing:g} m apart"
-    return {
-        "simulator": f"ringfence {__version__} crossing, {room}, {env.neighbours} seen who come nearest in {SOON:g} s"
-    }
+    return {"simulator": f"ringfence {RECIPES} crossing, {room}, {env.neighbours} seen who come nearest in {SOON:g} s"}
 
 
 class Driven(eqx.Module):

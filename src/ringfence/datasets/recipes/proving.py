@@ -9,10 +9,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from ringfence import __version__
 from ringfence.datasets.behaviour import gather
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.datasets.version import RECIPES
 from ringfence.envs.proving import System, drivers
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
@@ -31,7 +31,7 @@ def about(task: Task) -> Card:
         if getattr(system, f.name) != f.default or f.name in ("body", "danger", "drivers")
     }
     words = ", ".join(f"{name} {value}" for name, value in changed.items())
-    return {"simulator": f"ringfence {__version__} proving ground, {words}", "dt": system.dt}
+    return {"simulator": f"ringfence {RECIPES} proving ground, {words}", "dt": system.dt}
 
 
 class Driven(eqx.Module):

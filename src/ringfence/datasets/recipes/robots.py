@@ -10,10 +10,10 @@ from importlib import metadata
 
 import numpy as np
 
-from ringfence import __version__
 from ringfence.datasets import robots as policies
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.datasets.version import RECIPES
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
@@ -24,7 +24,7 @@ def about(task: Task) -> Card:
     env = _env(task)
     if getattr(task.hazard, "limit", None) != env.limit:
         raise UserError(f"Task '{task.name}' has the danger {task.hazard}, its simulator counts above {env.limit} m/s.")
-    return {"simulator": f"ringfence {__version__} {env.name}, mujoco {metadata.version('mujoco')}"}
+    return {"simulator": f"ringfence {RECIPES} {env.name}, mujoco {metadata.version('mujoco')}"}
 
 
 def as_asked(task: Task, transitions: int) -> int:

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ringfence import __version__
 from ringfence.datasets import behaviour as policies
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.datasets.version import RECIPES
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.logs.store import EpisodeStore
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
@@ -19,7 +19,7 @@ def about(task: Task) -> Card:
     """The simulator, for the card."""
     env = _env(task)
     return {
-        "simulator": f"ringfence {__version__} simple_spread",
+        "simulator": f"ringfence {RECIPES} simple_spread",
         "integrator": env.integrator,
         "reward": env.reward,
     }

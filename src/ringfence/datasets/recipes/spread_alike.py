@@ -5,9 +5,9 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from ringfence import __version__
 from ringfence.datasets.recipes import spread
 from ringfence.datasets.task import Card, Recipe, Task
+from ringfence.datasets.version import RECIPES
 from ringfence.envs.spread_alike import LANDMARKS, OTHERS, SIGHT, SpreadAlike, touching
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
@@ -19,7 +19,7 @@ CHUNK = 2000  # episodes whose views are computed at once
 def about(task: Task) -> Card:
     """The simulator, for the card."""
     seen = f"{LANDMARKS} landmarks and {OTHERS} others seen within {SIGHT:g} m"
-    return {"simulator": f"ringfence {__version__} simple_spread, {seen}"}
+    return {"simulator": f"ringfence {RECIPES} simple_spread, {seen}"}
 
 
 def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
