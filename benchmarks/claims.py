@@ -179,16 +179,16 @@ TWO = (("none", ""), ("shield", "one"), ("shield", "each"))
 
 
 def brakes_in_time() -> tuple[bool, str]:
-    """Of the clone three rows leave next to nothing; of the blind controller they leave most, and V nothing."""
+    """Of the clone three rows leave next to nothing; of the naive controller they leave most, and V nothing."""
     ask = dict(guard="shield", barrier="learned")
-    clone, blind, seen = (
+    clone, naive, seen = (
         float(rows_of("yard.csv", method=who, options=how, **ask)[0]["contact"])
         for who, how in (("BC", "terminal_value=False"), (NAIVE, "terminal_value=False"), (NAIVE, ""))
     )
     text = (
-        f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * blind:.3g} % of the blind; V: {100 * seen:.2g} %"
+        f"3 rows: {100 * clone:.2g} % of the clone's episodes, {100 * naive:.3g} % of the naive; V: {100 * seen:.2g} %"
     )
-    return clone <= 0.005 and blind > 0.5 and seen <= 0.01, text
+    return clone <= 0.005 and naive > 0.5 and seen <= 0.01, text
 
 
 def learned_sees_more() -> tuple[bool, str]:
@@ -280,10 +280,10 @@ def no_size_touches() -> tuple[bool, str]:
 
 
 def has_to_have_seen() -> tuple[bool, str]:
-    """Logs with contact in one episode of twenty teach a World that leaves most with it; of blind drivers, none."""
+    """Logs with contact in one episode of twenty teach a World that leaves most with it; of naive drivers, none."""
     words = "logs of IR-SIM"
     few, many = (
-        [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight blind")
+        [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight naive")
     )
     text = " / ".join(f"{100 * x:.3g} %" for x in (*few, *many))
     return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {text} of episodes"

@@ -32,11 +32,11 @@ from ringfence.utils.files import whole
 OUT = Path(__file__).resolve().parent.parent / "results" / "export.csv"
 TASK, OTHER, STATES, CLOSE = "simple_spread-expert", "simple_spread-medium-replay", 500, 1e-5
 POLICIES = (
-    ("cloning", "bc", {}),
-    ("cloning, `shield`, learned", "bc", {"guard": "shield"}),
-    ("cloning, `shield`, formula", "bc", {"guard": "shield", "barrier": "analytic"}),
-    ("cloning, `adapt`, learned", "bc", {"guard": "adapt"}),
-    ("cloning, `full`, learned", "bc", {"guard": "full"}),
+    ("BC", "bc", {}),
+    ("BC, `shield`, learned", "bc", {"guard": "shield"}),
+    ("BC, `shield`, formula", "bc", {"guard": "shield", "barrier": "analytic"}),
+    ("BC, `adapt`, learned", "bc", {"guard": "adapt"}),
+    ("BC, `full`, learned", "bc", {"guard": "full"}),
     ("`madiff`", "madiff", {}),
     ("`icbf`", "icbf-split", {}),
     ("`icbf`, `shield`, learned", "icbf-split", {"guard": "shield"}),

@@ -44,11 +44,11 @@ class IrSim:
 
     metadata: dict = {}
 
-    def __init__(self, n: int = 8, behaviour: str | None = None, blind: int = 0):
+    def __init__(self, n: int = 8, behaviour: str | None = None, naive: int = 0):
         self.n, self.side = n, Crossing(n_agents=n).side
         self.possible_agents = [f"agent{i}" for i in range(n)]
         robots = {
-            "number": n - blind,
+            "number": n - naive,
             "kinematics": {"name": "omni"},
             "shape": {"name": "circle", "radius": RADIUS},
             "vel_max": [1.0, 1.0],
@@ -58,7 +58,7 @@ class IrSim:
         }
         if behaviour:
             robots["behavior"] = {"name": behaviour, "vxmax": 0.9, "vymax": 0.9, "acce": BELIEVED}
-        groups = [robots] if not blind else [robots, robots | {"number": blind, "behavior": {"name": "dash"}}]
+        groups = [robots] if not naive else [robots, robots | {"number": naive, "behavior": {"name": "dash"}}]
         size = 10 * self.side  # far enough that nobody meets its walls
         world = {"height": size, "width": size, "offset": [-size / 2, -size / 2], "step_time": DT, "sample_time": DT}
         with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
@@ -129,10 +129,10 @@ class IrSim:
         return dict(zip(self.possible_agents, np.asarray(LOOK[self.n](state))[0]))
 
 
-def record(episodes: int, blind: int) -> EpisodeStore:
+def record(episodes: int, naive: int) -> EpisodeStore:
     """Logs of IR-SIM's robots under its reciprocal velocity obstacles, but for some; pushes are what their velocities
     did."""
-    env, kept = IrSim(behaviour="rvo", blind=blind), {k: [] for k in ("observations", "actions", "rewards", "costs")}
+    env, kept = IrSim(behaviour="rvo", naive=naive), {k: [] for k in ("observations", "actions", "rewards", "costs")}
     for e in range(episodes):
         seen, _ = env.reset(seed=e)
         rows = [list(seen.values())]
@@ -147,9 +147,9 @@ def record(episodes: int, blind: int) -> EpisodeStore:
         for k, v in steps.items():
             kept[k].append(v)
     card = {
-        "task": f"irsim-rvo-{blind}-blind" if blind else "irsim-rvo",
+        "task": f"irsim-rvo-{naive}-blind" if naive else "irsim-rvo",
         "provenance": "recorded in IR-SIM, robots under its reciprocal velocity obstacles"
-        + (f" but for {blind} that make straight for their goals" if blind else ""),
+        + (f" but for {naive} that make straight for their goals" if naive else ""),
         "simulator": f"ir-sim {irsim.__version__}",
         "observation_names": list(Crossing().observation_names),
         "hazard": Separation(0.30),
@@ -180,8 +180,8 @@ def main() -> None:
         print(row, flush=True)
         write(OUT, rows)
 
-    def recorded(words: str, blind: int) -> EpisodeStore:
-        logs = record(a.logs, blind)
+    def recorded(words: str, naive: int) -> EpisodeStore:
+        logs = record(a.logs, naive)
         rows.append(
             {
                 "learned from": f"{words} themselves",
@@ -202,7 +202,7 @@ def main() -> None:
     sources = {
         "crossing-hasty": lambda words: make(registry.get("crossing-hasty"))[0],
         "logs of IR-SIM": lambda words: recorded(words, 0),
-        "logs of IR-SIM, two of eight blind": lambda words: recorded(words, 2),
+        "logs of IR-SIM, two of eight naive": lambda words: recorded(words, 2),
     }
     with tempfile.TemporaryDirectory() as folder:
         for words in a.of or sources:

@@ -49,7 +49,7 @@ HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_l
 AT = {name: k for k, name in enumerate(yard.NAMES)}
 
 
-def blind(observations: np.ndarray, state: None) -> np.ndarray:
+def naive(observations: np.ndarray, state: None) -> np.ndarray:
     """Full speed to the goal, past nobody."""
     gap, speed = (observations[:, [AT[f"{n}x"], AT[f"{n}y"]]] for n in ("goal.d", "own.v"))
     far = np.maximum(np.linalg.norm(gap, axis=-1, keepdims=True), 0.3)
@@ -81,7 +81,7 @@ def main() -> None:
             )
         else:
             asked = asked or {"correction_steps": 0, "select": True}  # of one proposal: a guard that only looks on
-            pilot = ringfence.guard(blind, world, hazard=hazard, **asked)
+            pilot = ringfence.guard(naive, world, hazard=hazard, **asked)
             r = ringfence.play(pilot, yard.Yard, episodes=episodes, num_envs=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]
         bound = upper_bound(round(r["violation_rate"] * episodes), episodes)

@@ -260,14 +260,14 @@ def test_a_folder_of_validation_results_is_refused(tmp_path):
 
 
 def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
-    twin = cell(folder, {"default": summary([1] * 4, [0] * 4)}, mark="b2")
+    copied = cell(folder, {"default": summary([1] * 4, [0] * 4)}, mark="b2")
     with pytest.raises(UserError, match="seed-0-a1' and .*seed-0-b2' are the same cell"):
         read(folder)
-    config = json.loads((twin / "config.json").read_text())
-    write(twin / "config.json", config | {"seed": 5})
+    config = json.loads((copied / "config.json").read_text())
+    write(copied / "config.json", config | {"seed": 5})
     with pytest.raises(UserError, match="seed-0-b2/config.json' names seed 5, its folder 0"):
         read(folder)
-    write(twin / "config.json", config | {"data": {"provenance": "public"}, "config": {"num_updates": 1}})
+    write(copied / "config.json", config | {"data": {"provenance": "public"}, "config": {"num_updates": 1}})
     with pytest.raises(UserError, match=r"seed-0-b2' was trained on other data \(its provenance is public\)"):
         read(folder)
 

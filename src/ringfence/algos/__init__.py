@@ -18,8 +18,8 @@ from ringfence.utils import stored
 from ringfence.utils.config import build_config, fields_of
 from ringfence.utils.renamed import renamed
 
-_CLONING, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
-ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, *_CLONING, *_CRITICS)}
+_BC, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, *_BC, *_CRITICS)}
 
 
 def get(name: str) -> Algorithm:

@@ -1,4 +1,4 @@
-"""Model-predictive control with no prior at all: nothing is learned but the World, nothing is proposed but rest, and
+"""Model-predictive control from a zero proposal: nothing is learned but the World, nothing is proposed but rest, and
 whatever is done a guard finds by climbing value from noise (guards/guard.py, `refine`). What a learned proposal is
 worth is what it adds to this."""
 

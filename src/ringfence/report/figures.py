@@ -68,7 +68,7 @@ STYLE = {
 # (title, y axis, logarithmic, [(metric, line style, what it is on)])
 PANELS = (
     ("Denoising loss", "loss", True, [("loss/denoising", "-", "")]),
-    ("Cloning loss", "loss", True, [("loss/cloning", "-", "")]),
+    ("BC loss", "loss", True, [("loss/cloning", "-", "")]),
     ("Barrier loss (h learns)", "loss", False, [("loss/barrier", "-", "")]),
     ("Shaping loss (the planner learns)", "loss", False, [("loss/shaping", "-", "")]),
     (

@@ -64,14 +64,20 @@ BARRIERS = {"formula": "analytic"}
 EXECUTIONS = {"all": "centralized", "own": "decentralized"}
 GUARD = {"danger": "barrier", "sight": "execution"}  # beside its options
 PLANNERS = {"plain": "default", "climbing": "value_guided", "steady": "low_temperature"}
+_GUARDED = (", `shield`, learned", ", `shield`, formula", ", `adapt`, learned", ", `full`, learned")
+_PARTLY_NAIVE = ("logs of IR-SIM, two of eight",)
 METHODS = {
     "cloning": "BC",
     "cloning, guarded": "BC, guarded",
     "cloning, episodes within": "BC on episodes within the limit",
     "blind": "naive controller",
 }
+POLICIES = {f"cloning{guard}": f"BC{guard}" for guard in ("", *_GUARDED)}
+SOURCES = {f"{name} blind{more}": f"{name} naive{more}" for name in _PARTLY_NAIVE for more in ("", " themselves")}
 VALUES = {
     "method": METHODS,
+    "policy": POLICIES,
+    "learned from": SOURCES,
     "barrier": BARRIERS,
     "execution": EXECUTIONS,
     "planner": PLANNERS,
