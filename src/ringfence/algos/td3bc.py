@@ -20,10 +20,13 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ringfence.algos import actor_critic as ac
+from ringfence.datasets import registry
 from ringfence.errors import UserError
-from ringfence.logs.windows import WindowData
+from ringfence.logs.store import EpisodeStore, team
+from ringfence.logs.windows import NOT_ARRIVED, WindowData
 from ringfence.nets.optim import Optimiser
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
@@ -73,6 +76,33 @@ def cost_source(config: Config) -> Literal["costs", "nothing"]:
     return "costs" if config.lagrange else "nothing"
 
 
+def make_windows(store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: None) -> WindowData:
+    """All episodes. Where the logs name several constraints and the limit is the card's, a step costs what it takes of
+    the limit of the constraint that it takes most of: who keeps `limit` in this cost keeps each of theirs."""
+    windows = WindowData(store, feature_map)
+    if config.lagrange and store.limits and config.limit == store.card.cost_limit:
+        shares = np.max([share_of_limit(store, name) for name in store.limits], 0)
+        starts = np.concatenate([[0], store.episode_ends[:-1]])
+        costs = np.insert(config.limit * shares, starts, NOT_ARRIVED)
+        windows.arrays["costs"] = jnp.asarray(costs, jnp.float32)
+    return windows
+
+
+def share_of_limit(store: EpisodeStore, name: str) -> np.ndarray:
+    """(T,) what every step takes of a constraint's limit; where nothing is allowed, any cost is over it."""
+    cost = team(store.of_constraint(name)).astype(np.float64)
+    limit = store.limits[name]
+    if limit > 0:
+        return cost / limit
+    return 2.0 * cost / (cost[cost > 0].min() if (cost > 0).any() else 1.0)
+
+
+def cost_unit(config: Config, spec: Spec) -> float:
+    """What cost critics count in: the limit, so that the unit of somebody's own costs changes nothing. Tasks of the
+    package count steps, as their published settings do."""
+    return 1.0 if spec.task in registry.TASKS else config.limit
+
+
 def optimiser(config: Config) -> Optimiser:
     return Optimiser(config.lr, 0, config.num_updates, config.grad_clip, floor=1.0)
 
@@ -111,7 +141,9 @@ def threshold(config: Config, spec: Spec) -> float:
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
-    opt, allowed = optimiser(config), threshold(config, spec)
+    opt = optimiser(config)
+    unit = cost_unit(config, spec)
+    allowed = threshold(config, spec) / unit
 
     def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
         return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
@@ -132,7 +164,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             metrics = {"loss/critic": error}
             if config.lagrange:
                 later = jax.nn.relu(target["cost"](*there).max(1))
-                cost = batch.costs[:, 1][None] + config.discount * t.bootstrap.T * later
+                cost = batch.costs[:, 1][None] / unit + config.discount * t.bootstrap.T * later
                 metrics["loss/cost"] = ((p["cost"](*here) - cost[:, None]) ** 2).mean(2).sum()
             return sum(metrics.values(), jnp.zeros(())), metrics
 
@@ -173,7 +205,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             opts["actor"] = keep(opts["actor"], state["opt"]["actor"])
         if config.lagrange:
             scale = jnp.clip(scale + config.multiplier_rate * excess, 0.0, config.multiplier_max)
-            more |= {"multiplier": scale.mean(), "cost_value": (allowed * (excess + 1.0)).mean()}
+            more |= {"multiplier": scale.mean(), "cost_value": (unit * allowed * (excess + 1.0)).mean()}
         state = {**state, "params": new, "target": moved, "opt": opts, "step": state["step"] + 1, "multiplier": scale}
         return state, metrics | more | norms | actor_norms
 
@@ -210,6 +242,7 @@ MA_TD3BC = Algorithm(
         "mujoco-long": {**_MUJOCO, "num_updates": 40_000},  # ant_2x4-good: 3.1 k, published 2.9 k; 1.1 k before
     },
     cost_source=cost_source,
+    make_windows=make_windows,
 )
 MA_TD3BC_LAG = replace(
     MA_TD3BC,

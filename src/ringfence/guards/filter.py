@@ -239,15 +239,15 @@ class Guard(eqx.Module):
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has
-        the rate of half its limit.
+        the rate of half the steps that its limit allows.
 
         Adaptive conformal inference (Gibbs and Candès 2021) on the guard's own predictions: whatever their errors, the
         share of unsafe steps tends to `rate` as long as a margin within the bounds can prevent them.
         """
         rate = self.options.rate
-        limits = self.barrier.limits
-        if limits:
-            rate = jnp.array([0.5 * limit / self.world.spec.episode_length for limit in limits.values()])
+        if self.barrier.limits:
+            allowed = self.world.unsafe_steps
+            rate = jnp.array([0.5 * allowed[name] / self.world.spec.episode_length for name in self.barrier.limits])
         moved = margin + self.options.adapt * (unsafe - rate)
         return jnp.clip(moved, 0.0, max(MAX_MARGIN, self.options.margin))
 

@@ -175,7 +175,8 @@ def scatter(section: Section[LineT], rows: Sequence[LineT], x_label: str, name: 
         for row in points:
             _point(ax, row)
         ax.margins(0.08, 0.1)
-        _cost_axis(ax, section.constants["cost_limit"] if section.constants else 0.0)
+        several = any(row.limits for row in points)  # one line is no limit of theirs
+        _cost_axis(ax, section.constants["cost_limit"] if section.constants and not several else 0.0)
         ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
         made.canvas.draw()

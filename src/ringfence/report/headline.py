@@ -37,6 +37,10 @@ def headline(section: Section[LineT], split: str = "test") -> list[str]:
     cost_limit = section.constants["cost_limit"]
     counted = unit.replace("steps", "step") if cost_limit == 1 else unit
     limit = f"the limit of {cost_limit:g} {counted} per episode"
+    limits = {name: limit for row in rows for name, limit in row.limits.items()}
+    if limits:
+        each = ", ".join(f"{name} {own:g}" for name, own in limits.items())
+        limit = f"the limit of each constraint ({each} per episode)"
     safe = [row for row in rows if row.safe]
     sentences = _best(rows, safe, section.references, limit, unit, event) if safe else _nearest(rows, limit)
     for row in section.references:
@@ -49,6 +53,12 @@ def headline(section: Section[LineT], split: str = "test") -> list[str]:
 
 def _nearest(rows: Sequence[Line], limit: str) -> list[str]:
     """Where nobody keeps the limit."""
+    if any(row.limits for row in rows):
+        least = min(rows, key=lambda row: row.cost_norm)
+        return [
+            f"No method keeps its costs within {limit}. {least.label} comes nearest, with {least.cost_norm:.3g} times "
+            f"the limit of its worst constraint, at a return of {least.returns:.1f}."
+        ]
     least = min(rows, key=lambda row: row.cost)
     return [
         f"No method keeps its cost within {limit}. {least.label} comes nearest, with {least.cost:.3f} "

@@ -86,6 +86,7 @@ def _section(section: Section[Row], k: int, out: Path) -> dict[str, Any]:
             for split, rows in section.tables.items()
         ],
         "constants": section.constants,
+        "limits": {name: limit for row in section.rows for name, limit in row.limits.items()},
         "ceiling": section.card.get("return_ceiling"),
         "protocol": section.protocol,
         "several_seeds": any(len(r.seeds) > 1 for r in section.rows),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,7 +33,8 @@ class Numbers:
     violation_upper: float  # exact, one-sided, of the resets on which any run has one
     unsafe_starts: int
     cvar: float  # mean of the tenth of episodes with the highest cost
-    safe: bool  # the upper end of the cost's interval is within the limit
+    safe: bool  # the upper end of the cost's interval is within the limit, and so it is of every named constraint
+    limits: dict[str, float] = field(default_factory=dict)  # per episode, of the constraints that are named
 
     @property
     def violation_rate(self) -> float:
@@ -66,14 +67,47 @@ def pool(results: list[Result], name: str = "the runs of a row") -> Numbers:
     """
     measured = _of_one(results[0]) if len(results) == 1 else _of_several(results, name)
     constants = results[0]["constants"]
+    limits = limits_of(results)
+    kept = all(_keeps(result, limits) for result in results)
     return Numbers(
         **measured,
         episodes=sum(r["episodes"] for r in results),
         violations=sum(map(_violations, results)),
         returns_norm=normal_return(measured["returns"], constants),
-        cost_norm=normal_cost(measured["cost"], constants),
-        safe=measured["cost_interval"][1] <= constants["cost_limit"],
+        cost_norm=_worst_share(results, limits) if limits else normal_cost(measured["cost"], constants),
+        safe=kept and measured["cost_interval"][1] <= constants["cost_limit"],
+        limits=limits,
     )
+
+
+def limits_of(results: Iterable[Result]) -> dict[str, float]:
+    """The limit of every constraint that a result names. Their sum is no limit: what one leaves, another must not
+    use up."""
+    limits: dict[str, float] = {}
+    for result in results:
+        for name, constraint in result.get("constraints", {}).items():
+            if constraint.get("limit") is not None:
+                limits[name] = min(constraint["limit"], limits.get(name, constraint["limit"]))
+    return limits
+
+
+def _keeps(result: Result, limits: Mapping[str, float]) -> bool:
+    """Whether a run keeps every limit, by the upper ends of the costs' intervals; what was not measured is not kept."""
+    for name, limit in limits.items():
+        measured = result.get("constraints", {}).get(name)
+        if measured is None or measured.get("cost_interval", (0.0, measured["cost_mean"]))[1] > limit:
+            return False
+    return True
+
+
+def _worst_share(results: Iterable[Result], limits: Mapping[str, float]) -> float:
+    """Of the constraints' mean costs the largest as a share of its own limit: 1 at the limit."""
+    shares = [0.0]
+    for result in results:
+        for name, limit in limits.items():
+            cost = result.get("constraints", {}).get(name, {}).get("cost_mean", np.inf)
+            shares.append(cost / limit if limit > 0 else np.inf if cost > 0 else 0.0)
+    return float(max(shares))
 
 
 def _of_one(result: Result) -> dict[str, Any]:

@@ -94,7 +94,8 @@ def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
     """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
     rest, by cost."""
     returns = [r.returns for r in rows]
-    costs = [r.cost_interval[1] for r in rows]
+    # Who keeps the sum but not each constraint's own limit is over the limit.
+    costs = [r.cost_interval[1] if r.safe or not r.limits else max(r.cost_interval[1], 2 * limit + 1) for r in rows]
     for row, place in zip(rows, statistics.places(returns, costs, limit)):
         row.rank = int(place)
         row.best = row.safe and bool(place == 1)

@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from ringfence.errors import UserError
-from ringfence.logs.store import EpisodeStore
+from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, PyTree, Spec
@@ -83,7 +83,7 @@ def fit_view(
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
     content = [validate.VERSION, store.content, features.to_dict(map), settings.miscoverage, settings.barrier]
-    content += [store.limits] if store.limits else []
+    content += [store.limits, "unsafe costs"] if store.limits else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
@@ -146,7 +146,14 @@ def _data(store: EpisodeStore, several: bool) -> Data:
         episodes=store.episodes // (store.card.team or 1),
         hazard=store.card.hazard,
         constraints=store.limits if several else None,
+        unsafe_costs={name: _unsafe_cost(store, name) for name in store.limits} if several else None,
     )
+
+
+def _unsafe_cost(store: EpisodeStore, name: str) -> float:
+    """What a step that a constraint charges for costs on average; 1 where none is charged."""
+    cost = team(store.of_constraint(name))
+    return float(cost[cost > 0].mean(dtype=np.float64)) if (cost > 0).any() else 1.0
 
 
 # --- parts ---

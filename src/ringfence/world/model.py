@@ -29,3 +29,9 @@ class World(eqx.Module):
     def limits(self) -> dict[str, float]:
         """Limit per episode of each constraint that the logs name; empty where they name none."""
         return self.card.data.constraints or {}
+
+    @property
+    def unsafe_steps(self) -> dict[str, float]:
+        """Unsafe steps of an episode that each limit allows, which is no question of the costs' units."""
+        costs = self.card.data.unsafe_costs or {}
+        return {name: limit / costs.get(name, 1.0) for name, limit in self.limits.items()}
