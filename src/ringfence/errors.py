@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 LAST_SEED = 2**31 - 1  # that JAX takes everywhere
 
@@ -15,6 +16,15 @@ class UserError(ValueError):
 
     def __str__(self) -> str:
         return plain(super().__str__())
+
+
+class NoSafeAction(UserError):
+    """A policy at run time cannot act: what it was given, or what came of it, cannot be acted upon. `last_action` is
+    the last one that was (N, A), None before the first."""
+
+    def __init__(self, message: str, last_action: Any = None):
+        super().__init__(message)
+        self.last_action = last_action
 
 
 class StoreError(UserError):

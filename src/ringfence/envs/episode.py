@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.utils.given import NUMBERS, given_as
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
 ByAgent = Mapping[Any, Any]
@@ -98,7 +99,8 @@ class Episode:
 
     def step(self, action: np.ndarray, cost: Cost | None = None) -> None:
         """Act (N, A) and take note of what came of it."""
-        step = _checked(self.name, self.env.step(dict(zip(self.agents, action))))
+        own = [np.array(one) for one in action]  # a simulator may write into what it is given
+        step = _checked(self.name, self.env.step(dict(zip(self.agents, own))))
         number = len(self.rewards) + 1
         self._check_all_in("rewards", step.rewards, number)
         ended = self._ended(step, number)
@@ -177,8 +179,9 @@ class Episode:
 
     def _of_agents(self, cost: Any, whose: str) -> float | np.ndarray:
         """A number, or one of each agent."""
-        if isinstance(cost, np.ndarray) and cost.shape == (len(self.agents),):
-            return cost
+        array = isinstance(cost, np.ndarray) and not isinstance(cost, np.ma.MaskedArray)
+        if array and cost.shape == (len(self.agents),) and cost.dtype.kind in NUMBERS:
+            return np.array(cost, np.float64)
         return _number(cost, "cost", whose)
 
     def _check_all_in(self, what: str, by_agent: ByAgent, step: int) -> None:
@@ -228,26 +231,11 @@ def _costs_by_agent(step: Step) -> ByAgent:
     return {a: info["cost"] for a, info in step.infos.items() if isinstance(info, Mapping) and "cost" in info}
 
 
-def given_as(name: str, value: Any, expected: tuple[int | None, ...]) -> np.ndarray:
-    """What a policy is given, as numbers of the expected shape; None stands for a width that nobody knows."""
-    letters = "NO" if len(expected) == 2 else "S"
-    wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
-    try:
-        array = np.asarray(value, np.float32)
-    except (TypeError, ValueError):
-        raise UserError(f"{name} is no array of numbers; pass one of shape {wanted}.") from None
-    if array.ndim != len(expected) or any(n not in (None, m) for m, n in zip(array.shape, expected)):
-        raise UserError(f"{name} has shape {array.shape}, this run takes {wanted}; pass what its data holds.")
-    if not np.isfinite(array).all():
-        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
-        raise UserError(
-            f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
-        )
-    return array
-
-
 def _number(value: Any, what: str, whose: str) -> float:
     try:
-        return float(np.asarray(value, np.float64).reshape(()))
+        array = np.asarray(value)
+        if isinstance(value, np.ma.MaskedArray) or array.dtype.kind not in NUMBERS:
+            raise TypeError
+        return float(array.reshape(()))
     except (TypeError, ValueError):
         raise UserError(f"{whose} tells the {what} {str(value)[:80]!r}, which is no number; give one.") from None

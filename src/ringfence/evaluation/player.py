@@ -24,6 +24,7 @@ from ringfence.proposals.options import DEFAULT
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
+from ringfence.world import World
 
 Unsafe = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
@@ -95,12 +96,20 @@ def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:
         policy=_OneByOne(pilot.policy),
         act=act_with,
         task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
-        shape=Shape(pilot.policy.agents, None, None if world.map.reads_state else 0, spec.homogeneous),
+        shape=_shape_of(world, pilot.policy.agents),
         episode_length=spec.episode_length,
         unsafe=None,
         about={"guard": "own"},
         limits=world.limits,
     )
+
+
+def _shape_of(world: World, agents: int) -> Shape:
+    """What a simulator must show to a World."""
+    width, state_width = world.widths
+    if world.map.reads_state:
+        return Shape(agents, None, state_width, world.spec.homogeneous)
+    return Shape(agents, width, 0, world.spec.homogeneous)
 
 
 class _OneByOne:
@@ -113,5 +122,6 @@ class _OneByOne:
 
     def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         function = self.policy.function
-        wanted = [function(x, None if state is None else state[k]) for k, x in enumerate(observations)]
+        # Copies: a function that writes into what it sees must not blind its guard.
+        wanted = [function(x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations)]
         return self.policy.decided(memory, observations, state, wanted, key)

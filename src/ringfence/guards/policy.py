@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from types import MappingProxyType
 from typing import Any
 
@@ -12,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError, unknown
+from ringfence.errors import NoSafeAction, UserError, unknown
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
@@ -20,6 +21,7 @@ from ringfence.problem import constraints, normalise
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
+from ringfence.utils.given import cost_given
 from ringfence.world import World
 from ringfence.world.card import Avoidable
 
@@ -65,12 +67,14 @@ class Guarded(eqx.Module):
         if not isinstance(cost, dict):
             return {**memory, "cost": _of_team(cost)}
         costs = {name: _of_team(c) for name, c in cost.items()}
-        if "costs" not in memory:
-            return {**memory, "cost": functools.reduce(jnp.maximum, costs.values())}
         names = self.guard.barrier.limits
         for name in costs:
-            if name not in names:
+            if names and name not in names:
                 raise unknown("constraint", name, names)
+        if not costs:
+            raise UserError("cost names no constraint; give the cost of each, or None where nobody knows it.")
+        if "costs" not in memory:
+            return {**memory, "cost": functools.reduce(jnp.maximum, costs.values())}
         nothing = jnp.full_like(memory["cost"], jnp.nan)
         return {**memory, "costs": jnp.stack([costs.get(name, nothing) for name in names], -1)}
 
@@ -137,11 +141,34 @@ class Guarded(eqx.Module):
         return memory, held(action, options.horizon), {}
 
 
-def costs_of_one(cost: Paid) -> np.ndarray | dict[str, np.ndarray]:
-    """What one environment's step cost, as `hear` takes it."""
-    if isinstance(cost, Mapping):
-        return {name: np.full(1, c, np.float32) for name, c in cost.items()}
-    return np.full(1, cost, np.float32)
+def costs_of_one(cost: Paid, agents: int) -> np.ndarray | dict[str, np.ndarray]:
+    """What one environment's step cost, as `hear` takes it; what is no cost is refused."""
+    given = cost_given(cost, agents)
+    if isinstance(given, dict):
+        return {name: np.full(1, one, np.float32) for name, one in given.items()}
+    return np.full(1, given, np.float32)
+
+
+def acted(step: PolicyStep, who: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """(action (N, A) float32, info) of one environment's step; what is not finite is refused, since nobody can act
+    upon it."""
+    action = np.array(step.action[0], np.float32)
+    info = {name: np.array(value[0]) for name, value in step.info.items()}
+    if not np.isfinite(action).all():
+        raise UserError(f"{who} gave actions that are not finite; it has diverged: train or fit it again.")
+    if "clearance" in info and np.isnan(info["clearance"]).any():
+        raise UserError(f"{who} cannot judge this step: its World predicts what is no number; fit it again.")
+    return action, info
+
+
+@contextmanager
+def no_safe_action(last_action: np.ndarray | None) -> Iterator[None]:
+    """A refusal at run time says what the last action was: somebody has to do something in its place."""
+    try:
+        yield
+    except UserError as error:
+        last = "there was no action before" if last_action is None else f"the last action was {last_action.tolist()}"
+        raise NoSafeAction(f"{str(error).rstrip('.')} ({last}).", last_action) from error
 
 
 def _of_team(cost: Array) -> Array:

@@ -10,13 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import UserError
-from ringfence.guards.policy import Guarded, Paid, build, costs_of_one
+from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.guards.policy import Guarded, Paid, acted, build, costs_of_one, no_safe_action
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
+from ringfence.utils.given import NUMBERS, given_as
 from ringfence.utils.renamed import renamed, renamed_values
 from ringfence.world import World
 
@@ -49,21 +50,52 @@ class Callback:
         wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
         return self.decided(memory, observations, state, wanted, key)
 
-    def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
-        """What becomes of the function's actions (B, N, A)."""
+    def seen(self, observations: Any, state: Any) -> tuple[np.ndarray, np.ndarray | None]:
+        """What one environment shows, (N, O) and (S,) or None: copies, of the widths that the World was fitted to."""
         world = self.guarded.guard.world
-        spec, batch = world.spec, len(observations)
+        width, state_width = world.widths
+        needed = int(world.map.plus.max()) + 1
+        reads_state = world.map.reads_state
+        remedy = "pass what its logs hold"
+        shape = (self.agents, None if reads_state else width)
+        shown = given_as("observations", observations, shape, "this World", remedy)
+        if reads_state and state is None:
+            raise UserError(f"This World reads the global state ({state_width or 'S'} entries), and there is none.")
+        whole = None
+        if state is not None:
+            whole = given_as("state", state, (state_width if reads_state else None,), "this World", remedy)
+        there = len(whole) if reads_state and whole is not None else shown.shape[-1]
+        if there < needed:
+            name = "state" if reads_state else "observations"
+            raise UserError(f"{name} has {there} entries, this World reads {needed}; {remedy}.")
+        return shown, whole
+
+    def _wanted(self, wanted: Any, batch: int) -> np.ndarray:
+        """The function's actions (B, N, A), or a refusal."""
+        each = wanted if isinstance(wanted, list) else [wanted]
+        if any(isinstance(one, np.ma.MaskedArray) for one in each):
+            raise UserError("The policy under guard returned a masked array; return actions (N, A).")
         try:
-            wanted = np.asarray(wanted, np.float32)
+            wanted = np.asarray([np.asarray(one) for one in each] if isinstance(wanted, list) else wanted)
+            if wanted.dtype.kind not in NUMBERS:
+                raise TypeError
+            wanted = np.array(wanted, np.float32)
         except (TypeError, ValueError):
             raise UserError("The policy under guard returned no array of numbers; return actions (N, A).") from None
-        expected = (batch, self.agents, spec.action_dim)
+        expected = (batch, self.agents, self.guarded.guard.world.spec.action_dim)
         if wanted.shape != expected:
             raise UserError(
                 f"The policy under guard returned actions of shape {wanted.shape[1:]}; this World takes {expected[1:]}."
             )
         if not np.isfinite(wanted).all():
             raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
+        return wanted
+
+    def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
+        """What becomes of the function's actions (B, N, A)."""
+        world = self.guarded.guard.world
+        spec, batch = world.spec, len(observations)
+        wanted = self._wanted(wanted, batch)
         action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
         given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
         present = local_features(world.map, spec.homogeneous, *given)
@@ -84,8 +116,9 @@ class Pilot:
 
     def __init__(self, policy: Callback, seed: int = 0):
         self.policy = policy
-        self._key = jax.random.key(seed)
+        self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self.info: dict[str, np.ndarray] = {}
+        self.last_action: np.ndarray | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -94,15 +127,22 @@ class Pilot:
 
     def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
         """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, in all or
-        by each constraint's name, which an adapting guard follows."""
-        wanted = self.policy.function(observations, state)
-        self._key, key = jax.random.split(self._key)
-        if cost is not None:
-            self._memory = self.policy.hear(self._memory, costs_of_one(cost))
-        shown = np.asarray(observations)[None], None if state is None else np.asarray(state)[None]
-        self._memory, step = self.policy.decided(self._memory, *shown, np.asarray(wanted)[None], key)
-        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
-        return np.asarray(step.action[0])
+        by each constraint's name, which an adapting guard follows.
+
+        What nobody can act upon safely is refused with `NoSafeAction`, whose `last_action` is that of the step before:
+        arrays of another shape than the World's, what is not finite, and what is no cost."""
+        with no_safe_action(self.last_action):
+            seen, whole = self.policy.seen(observations, state)
+            paid = None if cost is None else costs_of_one(cost, self.policy.agents)
+            # Copies: a function that writes into what it sees must not blind its guard.
+            wanted = self.policy.function(seen.copy(), None if whole is None else whole.copy())
+            memory = self._memory if paid is None else self.policy.hear(self._memory, paid)
+            key, now = jax.random.split(self._key)
+            shown = seen[None], None if whole is None else whole[None]
+            memory, step = self.policy.decided(memory, *shown, [wanted], now)
+            action, info = acted(step, "The guard")
+        self._memory, self._key, self.info, self.last_action = memory, key, info, action.copy()
+        return action
 
 
 class Nothing(eqx.Module):

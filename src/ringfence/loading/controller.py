@@ -5,13 +5,13 @@ from __future__ import annotations
 import jax
 import numpy as np
 
-from ringfence.envs.episode import given_as
 from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.guards.policy import Paid, costs_of_one
+from ringfence.guards.policy import Paid, acted, costs_of_one, no_safe_action
 from ringfence.loading.resolve import load
 from ringfence.proposals.base import act_with, heard
 from ringfence.training.runs import Run
 from ringfence.utils.compilation import keep_programs
+from ringfence.utils.given import given_as
 
 
 class Controller:
@@ -31,6 +31,7 @@ class Controller:
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._act = jax.jit(act_with)
         self.info: dict[str, np.ndarray] = {}
+        self.last_action: np.ndarray | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -41,7 +42,23 @@ class Controller:
         """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
         constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so
         is what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow
-        NaN."""
+        NaN.
+
+        A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
+        with no_safe_action(self.last_action):
+            seen, whole = self._seen(observations, state)
+            memory = self._memory
+            if cost is not None:
+                memory = heard(self.policy, memory, costs_of_one(cost, self.job.team))
+            key, now = jax.random.split(self._key)
+            whole = None if whole is None else whole[None]
+            memory, step = self._act(self.policy, memory, seen[None], whole, now)
+            action, info = acted(step, "The run's policy")
+        self._memory, self._key, self.info, self.last_action = memory, key, info, action.copy()
+        return action
+
+    def _seen(self, observations: np.ndarray, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """Copies of what one environment shows, of the widths of the run's data."""
         width, state_width = self.job.widths
         seen = given_as("observations", observations, (self.job.team, width))
         if state is not None and state_width == 0:
@@ -57,13 +74,7 @@ class Controller:
         whole = None if state is None else given_as("state", state, (state_width,))
         if None in self.job.widths:
             self._reaches(seen, whole)
-        self._key, key = jax.random.split(self._key)
-        whole = None if whole is None else whole[None]
-        if cost is not None:
-            self._memory = heard(self.policy, self._memory, costs_of_one(cost))
-        self._memory, step = self._act(self.policy, self._memory, seen[None], whole, key)
-        self.info = {k: np.asarray(v[0]) for k, v in step.info.items()}
-        return np.asarray(step.action[0])
+        return seen, whole
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
         """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""

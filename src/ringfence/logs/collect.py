@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from ringfence.envs.episode import Cost, Episode, Shape, check, given_as
+from ringfence.envs.episode import Cost, Episode, Shape, check
 from ringfence.errors import StoreError, UserError, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils.files import writable
+from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import deprecated, renamed
 
@@ -176,7 +177,8 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         if player.act is None:
             action = chance.uniform(bounds.low, bounds.high, shape)
         else:
-            action = player.act(episode.seen, episode.state)
+            state = episode.state
+            action = player.act(episode.seen.copy(), None if state is None else state.copy())  # it may write there
         actions.append(bounds.clipped(given_as("actions", action, shape)))
         episode.step(actions[-1], rules.cost)
         episode.charge(0.0)

@@ -29,6 +29,8 @@ class Data(Part, frozen=True):
     content: str = ""  # digest of its arrays
     episodes: int = 0
     constraints: dict[str, float] | None = None  # limit per episode of each one that the logs name
+    observation_width: int | None = None  # entries of what an agent sees
+    state_width: int | None = None  # of the global state
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
 
 

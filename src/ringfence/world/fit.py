@@ -146,6 +146,8 @@ def _data(store: EpisodeStore, several: bool) -> Data:
         episodes=store.episodes // (store.card.team or 1),
         hazard=store.card.hazard,
         constraints=store.limits if several else None,
+        observation_width=store.observations.shape[2],
+        state_width=None if store.state is None else store.state.shape[1],
         unsafe_costs={name: _unsafe_cost(store, name) for name in store.limits} if several else None,
     )
 

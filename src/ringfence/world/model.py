@@ -31,6 +31,11 @@ class World(eqx.Module):
         return self.card.data.constraints or {}
 
     @property
+    def widths(self) -> tuple[int | None, int | None]:
+        """Entries of an observation and of the global state in the logs; None where an older World does not say."""
+        return self.card.data.observation_width, self.card.data.state_width
+
+    @property
     def unsafe_steps(self) -> dict[str, float]:
         """Unsafe steps of an episode that each limit allows, which is no question of the costs' units."""
         costs = self.card.data.unsafe_costs or {}

@@ -1,0 +1,70 @@
+"""What strangers give at run time, read once: numbers of the right kind and shape, finite, and a copy of one's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ringfence.errors import UserError
+
+NUMBERS = "biuf"  # kinds of NumPy's types; complex, text, times and objects are none
+LETTERS = {1: "S", 2: "NO", 3: "BNA"}  # axes that messages name
+
+
+def given_as(
+    name: str,
+    value: Any,
+    expected: tuple[int | None, ...],
+    who: str = "this run",
+    remedy: str = "pass what its data holds",
+) -> np.ndarray:
+    """A new float32 array of the expected shape, with finite numbers alone; None stands for a width that nobody knows.
+
+    It is a copy: whoever gave it may go on writing into theirs.
+    """
+    letters = LETTERS[len(expected)]
+    wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
+    if isinstance(value, np.ma.MaskedArray):
+        raise UserError(f"{name} is a masked array, whose hidden entries nobody may act upon; fill them in.")
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind == "V" and array.dtype.names is None:  # bfloat16 and its like
+            array = array.astype(np.float32)
+        if array.dtype.kind not in NUMBERS:
+            raise TypeError
+        with np.errstate(over="ignore"):
+            array = np.array(array, np.float32)
+    except (TypeError, ValueError):
+        raise UserError(f"{name} is no array of numbers; pass one of shape {wanted}.") from None
+    if array.ndim != len(expected) or any(n not in (None, m) for m, n in zip(array.shape, expected)):
+        raise UserError(f"{name} has shape {array.shape}, {who} takes {wanted}; {remedy}.")
+    if not np.isfinite(array).all():
+        where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+        raise UserError(
+            f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
+        )
+    return array
+
+
+def cost_given(value: Any, agents: int) -> float | dict[str, float]:
+    """What a step cost: a number, one of each agent, of which the largest counts, or these by constraint."""
+    if isinstance(value, Mapping):
+        return {str(name): _cost(cost, f"cost['{name}']", agents) for name, cost in value.items()}
+    return _cost(value, "cost", agents)
+
+
+def _cost(value: Any, name: str, agents: int) -> float:
+    remedy = "give a number, 0 or more, or one of each agent"
+    if isinstance(value, np.ma.MaskedArray):
+        raise UserError(f"{name} is a masked array; {remedy}.")
+    try:
+        cost = np.asarray(value)
+    except (TypeError, ValueError):
+        cost = np.asarray(None)
+    if cost.dtype.kind not in NUMBERS or cost.shape not in ((), (1,), (agents,)):
+        raise UserError(f"{name} is {str(value)[:60]!r}, which is no number; {remedy}.")
+    if not np.isfinite(cost).all() or cost.min() < 0:
+        raise UserError(f"{name} is {str(value)[:60]}; {remedy}.")
+    return float(cost.max())

@@ -1,0 +1,189 @@
+"""What strangers give at run time: what is no number of the right shape is refused, and nothing is written into."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ringfence
+from ringfence import world as world_files
+from ringfence.envs.episode import Episode, Shape
+from ringfence.errors import NoSafeAction, UserError
+from ringfence.logs.collect import collect
+from ringfence.logs.store import EpisodeStore
+from ringfence.training import loop, worlds
+from ringfence.utils.given import cost_given, given_as
+from tests.quick import QUICK_WORLD
+
+STRANGE = {
+    "NaN": lambda x: x * np.nan,
+    "infinite": lambda x: x + np.inf,
+    "too large": lambda x: x.astype(np.float64) + 1e300,
+    "too narrow": lambda x: x[:, :-1],
+    "too wide": lambda x: np.concatenate([x, x[:, :1]], 1),
+    "one agent": lambda x: x[:1],
+    "one agent more": lambda x: np.concatenate([x, x[:1]]),
+    "flat": lambda x: x.ravel(),
+    "masked": lambda x: np.ma.masked_array(x, x > 0),
+    "complex": lambda x: x.astype(complex),
+    "words": lambda x: x.astype(str),
+    "objects": lambda x: x.astype(object),
+    "times": lambda x: x.astype("datetime64[s]"),
+    "nothing": lambda x: None,
+    "text": lambda x: "observations",
+    "a ragged list": lambda x: [x[0].tolist(), x[1, :2].tolist()],
+}
+COSTS = [-1.0, float("nan"), float("inf"), "free", [1.0, 2.0, 3.0], None.__class__, 1j, np.ma.masked, {}, {"zz": 1.0}]
+
+
+@pytest.fixture(scope="module")
+def store() -> EpisodeStore:
+    g = np.random.default_rng(0)
+    x = g.normal(size=(20, 11, 2, 4)).astype(np.float32)
+    a = np.tanh(g.normal(size=(20, 10, 2, 2)))
+    costs = (g.random((20, 10)) < 0.2) * 1.0
+    return EpisodeStore.from_episodes(x, a, a.sum(-1), {"a": costs, "b": np.roll(costs, 3)}, card={"task": "toy"})
+
+
+@pytest.fixture(scope="module")
+def world(store):
+    return worlds.fit(store, **QUICK_WORLD)
+
+
+@pytest.fixture(scope="module")
+def controllers(store, world, tmp_path_factory):
+    out = tmp_path_factory.mktemp("runs")
+    changes = {"num_updates": 4, "width": 8, "cost_limit": None}
+    (run,) = loop.train("bc", store, changes=changes, quiet=True, out=out)
+    file = world_files.save(world, out / "w.safetensors")
+    return {
+        "function": lambda: ringfence.guard(lambda o, s: np.zeros((2, 2)), world, guard="adapt"),
+        "run": lambda: ringfence.Controller(run, guard="adapt", world=file),
+    }
+
+
+@pytest.mark.parametrize("whose", ["function", "run"])
+def test_nobody_acts_upon_what_is_no_observation(whose, controllers, store):
+    """NaN let everything pass, and was called feasible."""
+    controller = controllers[whose]()
+    good = store.observations[0]
+    for what, spoil in STRANGE.items():
+        with pytest.raises(NoSafeAction, match="there was no action before") as refused:
+            controller.act(spoil(good))
+        assert refused.value.last_action is None, what
+    first = controller.act(good)
+    assert first.dtype == np.float32 and first.shape == (2, 2)
+    first[:] = 7.0
+    with pytest.raises(NoSafeAction, match=r"the last action was \[\[") as refused:
+        controller.act(good * np.nan)
+    assert (np.abs(refused.value.last_action) <= 1).all(), "a copy of what was done"
+
+
+@pytest.mark.parametrize("whose", ["function", "run"])
+@pytest.mark.parametrize("cost", COSTS, ids=repr)
+def test_what_is_no_cost_is_refused(whose, cost, controllers, store):
+    """A negative one meant safe."""
+    controller = controllers[whose]()
+    controller.act(store.observations[0])
+    with pytest.raises(UserError):
+        controller.act(store.observations[1], cost=cost)
+    again = controllers[whose]()
+    again.act(store.observations[0])
+    np.testing.assert_array_equal(again.act(store.observations[1]), controller.act(store.observations[1]))
+
+
+def test_a_function_that_writes_into_what_it_sees_does_not_blind_its_guard(world, store):
+    def blinding(observations, state):
+        observations[:] = 0.0
+        return np.zeros((2, 2))
+
+    honest = ringfence.guard(lambda o, s: np.zeros((2, 2)), world)
+    seen = store.observations[3].copy()
+    np.testing.assert_array_equal(ringfence.guard(blinding, world).act(seen), honest.act(store.observations[3]))
+    np.testing.assert_array_equal(seen, store.observations[3])
+
+
+@pytest.mark.parametrize(
+    "actions", [np.full((2, 2), np.nan), np.ma.masked_array(np.zeros((2, 2)), True), "go", [[0.0], [0.0, 1.0]]]
+)
+def test_actions_that_are_none_are_refused(actions, world, store):
+    with pytest.raises(NoSafeAction, match="policy under guard returned"):
+        ringfence.guard(lambda o, s: actions, world).act(store.observations[0])
+
+
+def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):
+    controller = controllers["run"]()
+    step = controller._act
+
+    def diverged(*arguments):
+        memory, found = step(*arguments)
+        return memory, found._replace(action=found.action * np.nan)
+
+    controller._act = diverged
+    with pytest.raises(NoSafeAction, match="actions that are not finite; it has diverged"):
+        controller.act(store.observations[0])
+
+
+def test_costs_of_agents_and_constraints():
+    assert cost_given(np.float32(2), 3) == 2.0 and cost_given([0, 1, 3], 3) == 3.0
+    assert cost_given({"a": 1, "b": [0.0, 2.0]}, 2) == {"a": 1.0, "b": 2.0}
+    array = np.ones((2, 3), np.float32)
+    assert not np.shares_memory(given_as("x", array, (2, 3)), array)
+
+
+class Reusing:
+    """A simulator that returns its own buffers, and writes into the actions that it is given."""
+
+    possible_agents = ["a", "b"]
+
+    def __init__(self):
+        self.now = np.zeros((2, 3), np.float32)
+        self.costs = np.zeros(2)
+
+    def action_space(self, agent):
+        from gymnasium.spaces import Box
+
+        return Box(-1.0, 1.0, (2,))
+
+    def reset(self, seed=None):
+        self.t = 0
+        self.now[:] = 0
+        return self.seen(), {}
+
+    def seen(self):
+        return {"a": self.now[0], "b": self.now[1]}
+
+    def state(self):
+        return self.now.reshape(-1)
+
+    def step(self, actions):
+        self.t += 1
+        self.now += 1
+        self.costs += 1
+        for action in actions.values():
+            action *= 0
+        done = {agent: self.t == 4 for agent in self.possible_agents}
+        infos = {agent: {"cost": float(self.costs[0])} for agent in self.possible_agents}
+        return self.seen(), dict.fromkeys(self.possible_agents, 1.0), done, dict.fromkeys(done, False), infos
+
+
+def test_buffers_of_a_simulator_are_copied():
+    """Every recorded state was the last one, and every action 0."""
+
+    def policy(observations, state):
+        observations[:] = 9.0
+        state[:] = 9.0
+        return np.full((2, 2), 0.5)
+
+    store = collect(Reusing, policy, episodes=2)
+    np.testing.assert_array_equal(store.observations[:5, 0, 0], np.arange(5))
+    np.testing.assert_array_equal(store.state[:5, 0], np.arange(5))
+    np.testing.assert_array_equal(store.actions, 0.5)
+
+
+def test_costs_of_a_simulator_are_copied():
+    env = Reusing()
+    episode = Episode(env, Shape(), 0, 10)
+    for _ in range(2):
+        episode.step(np.zeros((2, 2)), lambda infos: env.costs)
+    np.testing.assert_array_equal(episode.costs, [[1, 1], [2, 2]])
