@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from ringfence.bench import pack, rows, unpack
 from ringfence.bench.cells import statuses
@@ -427,3 +429,108 @@ def test_a_pipe_among_logs_is_not_waited_for(tmp_path, in_time):
     os.mkfifo(tmp_path / "a.mcap")
     with pytest.raises(UserError, match="no regular file"):
         read_bag(tmp_path / "a.mcap", "/robot_{i}")
+
+
+@pytest.fixture(scope="module")
+def world_file(tmp_path_factory):
+    from ringfence import world
+    from ringfence.training import worlds
+    from tests.quick import QUICK_WORLD
+
+    made = worlds.fit(corpus.small_store(), **QUICK_WORLD)
+    return world.save(made, tmp_path_factory.mktemp("w") / "w.safetensors")
+
+
+def rewritten(file: Path, out: Path, edit=lambda about: None, arrays=lambda arrays: None) -> Path:
+    """A World with other metadata or arrays and no digest, as an older version, or a stranger, would write it."""
+    with safe_open(file, "numpy") as opened:
+        about = json.loads(opened.metadata()["ringfence_world"])
+        kept = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    del about["digest"]
+    edit(about)
+    arrays(kept)
+    save_file(kept, out, {"ringfence_world": json.dumps(about)})
+    return out
+
+
+def test_a_flipped_bit_of_a_world_is_refused(world_file, tmp_path):
+    """Whichever: weights that are nearly right guard nobody."""
+    from ringfence import world
+
+    raw = world_file.read_bytes()
+    for what, content in corpus.broken_bytes(raw, random.Random(5), 80):
+        (tmp_path / "w.safetensors").write_bytes(content)
+        assert tried(what, lambda: world.load(tmp_path / "w.safetensors")), what
+
+
+WORLDS = {
+    "spec.zz": lambda about: about["spec"].update(zz=3),
+    "beyond the data": lambda about: about["map"].update(plus=[[10**6] * len(r) for r in about["map"]["plus"]]),
+    "before the data": lambda about: about["map"].update(plus=[[-5] * len(r) for r in about["map"]["plus"]]),
+    "bounds of 1e300": lambda about: about["spec"].update(action_low=-1e300, action_high=1e300),
+    "one bound": lambda about: about["spec"].update(action_low=1, action_high=1),
+    "another team": lambda about: about["spec"].update(n_agents=7),
+    "steps of no time": lambda about: about["map"].update(dt=-1),
+    "card.team": lambda about: about["card"]["data"].update(team=0),
+}
+
+
+@pytest.mark.parametrize("what", WORLDS)
+def test_worlds_of_strangers(what, world_file, tmp_path):
+    from ringfence import world
+
+    with pytest.raises(UserError):
+        world.load(rewritten(world_file, tmp_path / "w.safetensors", WORLDS[what]))
+    world.load(rewritten(world_file, tmp_path / "old.safetensors"))  # older ones tell no digest
+
+
+def test_a_world_of_numbers_that_are_none_is_refused(world_file, tmp_path):
+    """NaN in weights let everything pass."""
+    from ringfence import world
+
+    def spoil(arrays):
+        name = next(name for name in arrays if name.startswith("barrier") and arrays[name].ndim > 1)
+        arrays[name].flat[0] = np.nan
+
+    with pytest.raises(UserError, match="holds numbers in 'barrier.* that are not finite"):
+        world.load(rewritten(world_file, tmp_path / "w.safetensors", arrays=spoil))
+
+
+RUNS = {
+    "spec.zz": lambda config: config["spec"].update(zz=3),
+    "team": lambda config: config["data"].update(team=0),
+    "cost_limit": lambda config: config["data"].update(cost_limit=[]),
+    "beyond the data": lambda config: config["feature_map"].update(
+        plus=[[10**6] * len(r) for r in config["feature_map"]["plus"]]
+    ),
+    "bounds": lambda config: config["spec"].update(action_low=5.0, action_high=1.0),
+}
+
+
+@pytest.mark.parametrize("what", RUNS)
+def test_configs_of_strangers(what, trained_run, tmp_path):
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    config = json.loads((run.path / "config.json").read_text())
+    RUNS[what](config)
+    (run.path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError):
+        load(run)
+
+
+def test_a_world_of_another_task_in_the_run_folder_is_refused(trained_run, world_file, tmp_path):
+    run = Run(shutil.copytree(trained_run.path, tmp_path / "run"))
+    shutil.copy(world_file, run.path / "world.safetensors")
+    load(run, guard="shield")
+    edit = lambda about: about["card"]["data"].update(task="another")  # noqa: E731
+    rewritten(world_file, run.path / "world.safetensors", edit)
+    with pytest.raises(UserError, match="is a World of 'another', the run is of 'strange'"):
+        load(run, guard="shield")
+
+
+@pytest.mark.parametrize("team", [0, -1, 2.5, "x", True])
+def test_teams_on_a_card_are_counts(team):
+    with pytest.raises(UserError, match="team="):
+        EpisodeStore.from_episodes(
+            *[np.zeros((2, 3, 1, 1)), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1)), np.zeros((2, 2))],
+            card={"team": team},
+        )

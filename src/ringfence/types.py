@@ -7,16 +7,19 @@ D feature, A action, K diffusion steps.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
 
+from ringfence.errors import UserError
+
 Array = jax.Array
 Key = jax.Array
 PyTree = Any
 Metrics = dict[str, Array]
+LARGEST_BOUND = 1e30  # of an action: the range still has a size in float32
 
 
 class Transition(NamedTuple):
@@ -50,7 +53,14 @@ class Spec:
     def of(cls, stored: Mapping[str, Any]) -> Spec:
         """What `to_dict` gave."""
         values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
+        if foreign := sorted(values.keys() - {f.name for f in fields(cls)}):
+            raise UserError(f"The spec has '{foreign[0]}', unknown to this version; use the one that wrote it.")
         return cls(**values)
+
+    def __post_init__(self):
+        low, high = self.action_low, self.action_high
+        if not -LARGEST_BOUND <= low < high <= LARGEST_BOUND:  # NaN included
+            raise UserError(f"Actions from {low:g} to {high:g} are no range; give finite bounds, the lower first.")
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is the same for nearly all data is left out."""

@@ -97,6 +97,7 @@ def resolve(spec: PolicySpec) -> Resolved:
     if spec.guarded:
         execution = worlds.execution_of(job.task, spec.execution)
         world = run_worlds.for_guard(run, execution, spec.world, read=world, quiet=False)
+        _check_width(job, world.map, "The World")
         usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
         options = dict(spec.guard_options)
         policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, **options)
@@ -146,7 +147,16 @@ def load_job(run: Run, agents: int | None = None) -> Job:
         task = registry.of_team(task, agents)
         team = agents
     bound = constraints.bind(hazard, spec.feature_names, spec.n_agents)
-    return Job(algorithm, stored["preset"], config, task, spec, feature_map, bound, widths, team=team)
+    found = Job(algorithm, stored["preset"], config, task, spec, feature_map, bound, widths, team=team)
+    _check_width(found, feature_map, f"'{run.path}'")
+    return found
+
+
+def _check_width(job: Job, map: features.FeatureMap, who: str) -> None:
+    """Refuse a view that reads beyond the end of what there is: JAX would read the last entry in its place."""
+    name, width = ("state", job.widths[1]) if map.reads_state else ("observations", job.widths[0])
+    if width is not None and map.width > width > 0:
+        raise UserError(f"{who} reads entry {map.width - 1} of {name} with {width}; it is of other data.")
 
 
 def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:

@@ -15,7 +15,19 @@ from ringfence.world import Settings, World
 def of_run(run: Run, quiet: bool = True) -> World:
     """The World that a run's training read, in its folder; of runs that read none, that of their data (`for_guard`)."""
     kept = run.path / WORLD
-    return load(kept) if kept.exists() else _of_data(run, None, quiet)
+    return _kept(run, kept) if kept.exists() else _of_data(run, None, quiet)
+
+
+def _kept(run: Run, file: Path) -> World:
+    """A World in the run's folder, which must be of the run's task."""
+    found = load(file)
+    task = run.config["task"]
+    if found.card.data.task != task or found.spec.action_dim != run.config["spec"]["action_dim"]:
+        raise UserError(
+            f"'{file}' is a World of '{found.card.data.task}', the run is of '{task}'; put the run's own World there, "
+            "or delete that file."
+        )
+    return found
 
 
 def for_guard(
@@ -34,7 +46,7 @@ def for_guard(
         world = world if isinstance(world, World) else load(world)
         _of_same(run, world, execution)
         return world
-    if (run.path / GUARD).exists() and (kept := load(run.path / GUARD)).alone == (execution == "decentralized"):
+    if (run.path / GUARD).exists() and (kept := _kept(run, run.path / GUARD)).alone == (execution == "decentralized"):
         return kept
     if read is not None or (run.path / WORLD).exists():
         found = read or of_run(run, quiet)

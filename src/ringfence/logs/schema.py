@@ -233,6 +233,12 @@ def _seconds_of_a_step(card: dict) -> None:
         raise StoreError(f"The card has dt={card['dt']!r}; it must be the seconds of a step, a number above 0.")
 
 
+def _team(card: dict) -> None:
+    team = card.get("team")
+    if team is not None and not (_is_number(team) and team >= 1 and float(team).is_integer()):
+        raise StoreError(f"The card has team={team!r}; it must be the number of agents of a team, 1 or more.")
+
+
 def _homogeneous(card: dict) -> None:
     if not isinstance(card.get("homogeneous", False), bool):
         raise StoreError(f"The card has homogeneous={card['homogeneous']!r}; it must be true or false.")
@@ -265,6 +271,7 @@ CARD_RULES: tuple[Callable[[dict], None], ...] = (
     _constraint_limits,
     _lists_of_words,
     _seconds_of_a_step,
+    _team,
     _homogeneous,
     _hazard,
 )

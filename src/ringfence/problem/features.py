@@ -11,6 +11,7 @@ exact, differentiable and linear in the number of entries. Three views exist, be
 from __future__ import annotations
 
 import functools
+import math
 import re
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -67,6 +68,11 @@ class FeatureMap:
     @property
     def reads_state(self) -> bool:
         return self.source == "state"
+
+    @property
+    def width(self) -> int:
+        """Entries that its source must have at least."""
+        return int(max(self.plus.max(initial=-1), self.minus.max(initial=-1))) + 1
 
     def __call__(self, observations: X | None, state: X | None) -> X:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out. Only the
@@ -466,6 +472,10 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
     widths = {len(row) for row in (*plus, *minus)}
     if len(plus) != len(minus) or widths != {len(data["names"])}:
         raise UserError("The run's feature map is damaged: its rows are not of one length; train the run again.")
+    if min((k for row in plus for k in row), default=0) < 0 or min((k for row in minus for k in row), default=0) < -1:
+        raise UserError("The run's feature map is damaged: it reads entries before the first; train the run again.")
+    if data.get("dt") is not None and not 0 < data["dt"] < math.inf:
+        raise UserError(f"The run's feature map is damaged: steps of {data['dt']} s are none; train the run again.")
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
     if data.get("dt") is not None:

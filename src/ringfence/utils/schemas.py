@@ -65,6 +65,13 @@ class Data(TypedDict, total=False):
     """What a run or a World says of its data; whatever else a card holds is there, too."""
 
     constraints: Limits | None
+    team: Few | None
+    cost_limit: Annotated[float, msgspec.Meta(ge=0)] | None
+    action_low: float
+    action_high: float
+    agents: list[str] | None
+    observation_names: list[str] | None
+    state_names: list[str] | None
 
 
 class Config(TypedDict):
@@ -97,6 +104,7 @@ class World(TypedDict):
     map: Map
     spec: Spec
     card: Card
+    digest: NotRequired[str]  # of all else, arrays included
 
 
 class PerEpisode(TypedDict, total=False):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas, stored
 from ringfence.utils.files import regular, whole
-from ringfence.utils.pytrees import as_tree, named_arrays
+from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
 from ringfence.world.card import Card
@@ -56,11 +57,22 @@ def save(
 ) -> Path:
     """Write one file, whole or not at all: arrays, as `kept` makes them, and the card as its metadata."""
     path = Path(path)
-    about = {"map": features.to_dict(world.map), "spec": world.spec.to_dict(), "card": world.card.to_json()}
+    about: dict[str, Any] = {
+        "map": features.to_dict(world.map),
+        "spec": world.spec.to_dict(),
+        "card": world.card.to_json(),
+    }
     with whole(path) as temporary:
         arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
+        about["digest"] = _digest(arrays, about)
         save_file(arrays, temporary, {"ringfence_world": json.dumps(about)})
     return path
+
+
+def _digest(arrays: dict[str, np.ndarray], about: Mapping[str, Any]) -> str:
+    """Of all that a file holds but the digest itself."""
+    words = json.dumps({name: value for name, value in about.items() if name != "digest"}, sort_keys=True)
+    return digest_of([*sorted(arrays.items()), ("about", np.frombuffer(words.encode(), np.uint8))])
 
 
 def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> World:
@@ -83,6 +95,12 @@ def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> W
 def _read(path: Path, map_of: MapOf) -> World:
     with safe_open(path, "numpy") as file:
         about = schemas.decode((file.metadata() or {})["ringfence_world"], schemas.World)
+    raw = load_file(path)
+    if about.get("digest", _digest(raw, about)) != _digest(raw, about):  # older Worlds tell none
+        raise UserError(f"'{path}' holds another World than was written (its digest differs); fit or copy it again.")
+    for name, array in raw.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise UserError(f"'{path}' holds numbers in '{name}' that are not finite; fit it again.")
     card = Card.from_json(about["card"])
     spec = Spec.of(stored.spec(about["spec"]))
     settings = card.settings
@@ -92,5 +110,16 @@ def _read(path: Path, map_of: MapOf) -> World:
     if map.names != spec.feature_names:
         raise UserError(f"'{path}' is a World of another view; fit it again.")
     names = (card.data.constraints or ()) if settings.labels == "costs" else ()
-    arrays = stored.world_arrays(load_file(path))
+    if not map.source == "state" and card.data.observation_width is not None:
+        _check_width(path, map, card.data.observation_width)
+    if map.source == "state" and card.data.state_width is not None:
+        _check_width(path, map, card.data.state_width)
+    if map.plus.shape[0] != spec.n_agents:
+        raise UserError(f"'{path}' is of {spec.n_agents} agents and sees {map.plus.shape[0]}; fit it again.")
+    arrays = stored.world_arrays(raw)
     return as_tree(arrays, blank_world(map, spec, settings, names, card), path)
+
+
+def _check_width(path: Path, map: features.FeatureMap, width: int) -> None:
+    if map.width > width:
+        raise UserError(f"'{path}' reads entry {map.width - 1} of {width} in its logs; fit it again.")
