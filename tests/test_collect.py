@@ -91,7 +91,7 @@ def test_an_interrupted_collection_goes_on(tmp_path, monkeypatch):
     monkeypatch.setattr(Progress, "advance", stops)
     with pytest.raises(KeyboardInterrupt):
         ringfence.collect(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
-    assert EpisodeStore.load(tmp_path / "d.h5").episodes == 4
+    assert EpisodeStore.load(tmp_path / "d.h5").episodes == 7
     again = ringfence.collect(Drift, None, episodes=11, seed=1, out=tmp_path / "d.h5")
     assert len(count) == 14 and again.content == whole.content == EpisodeStore.load(tmp_path / "d.h5").content
     assert ringfence.collect(Drift, None, episodes=5, seed=1, out=tmp_path / "d.h5").episodes == 5

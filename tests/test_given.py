@@ -187,3 +187,92 @@ def test_costs_of_a_simulator_are_copied():
     for _ in range(2):
         episode.step(np.zeros((2, 2)), lambda infos: env.costs)
     np.testing.assert_array_equal(episode.costs, [[1, 1], [2, 2]])
+
+
+class Leaving(Reusing):
+    """A simulator whose second agent leaves before the first, in every third episode."""
+
+    def reset(self, seed=None):
+        self.leaves = seed % 3 == 1
+        return super().reset(seed)
+
+    def step(self, actions):
+        observations, rewards, terminations, truncations, infos = super().step(actions)
+        if self.leaves and self.t == 3:
+            terminations["b"] = True
+        if self.leaves and self.t == 4:
+            raise AssertionError("nobody plays on")
+        return {a: x.copy() for a, x in observations.items()}, rewards, terminations, truncations, infos
+
+
+def still(observations, state):
+    return np.zeros((2, 2))
+
+
+def test_an_episode_that_an_agent_leaves_costs_no_other(tmp_path):
+    """What was finished is kept; whoever says what is to become of such episodes goes on from there."""
+    file = tmp_path / "s.h5"
+    with pytest.raises(UserError, match="b ended at step 3 before its team, in the episode of Leaving with the seed 1"):
+        collect(Leaving, still, episodes=6, out=file)
+    assert EpisodeStore.load(file).episodes == 1
+    cut = collect(Leaving, still, episodes=6, out=file, early_ends="cut")
+    assert cut.lengths.tolist() == [4, 3, 4, 4, 3, 4] and cut.terminated[cut.episode_ends - 1].tolist() == [
+        True,
+        False,
+        True,
+        True,
+        False,
+        True,
+    ]
+    skipped = collect(Leaving, still, episodes=6, out=tmp_path / "t.h5", early_ends="skip")
+    assert skipped.episodes == 4 and skipped.card.extra["skipped_episodes"] == 2
+    assert collect(Leaving, still, episodes=6, out=tmp_path / "t.h5", early_ends="skip").content == skipped.content
+    with pytest.raises(UserError, match="early_ends='drop' is none of its choices"):
+        collect(Leaving, still, episodes=1, early_ends="drop")
+
+
+def test_ctrl_c_keeps_what_was_collected(tmp_path):
+    played = []
+
+    def policy(observations, state):
+        played.append(0)
+        if len(played) > 9:
+            raise KeyboardInterrupt
+        return np.zeros((2, 2))
+
+    with pytest.raises(KeyboardInterrupt):
+        collect(Reusing, policy, episodes=6, out=tmp_path / "s.h5")
+    assert EpisodeStore.load(tmp_path / "s.h5").episodes == 2
+
+
+@pytest.fixture(scope="module")
+def pilot(tmp_path_factory):
+    """A function under guard in that simulator."""
+    g = np.random.default_rng(0)
+    x = g.normal(size=(20, 11, 2, 3)).astype(np.float32)
+    a = np.tanh(g.normal(size=(20, 10, 2, 2)))
+    store = EpisodeStore.from_episodes(x, a, a.sum(-1), (g.random((20, 10)) < 0.2) * 1.0, card={"task": "leaving"})
+    return ringfence.guard(still, worlds.fit(store, **QUICK_WORLD))
+
+
+def test_playing_keeps_what_was_finished(pilot):
+    with pytest.raises(UserError, match="b ended at step 3 before its team.*episodes were finished") as refused:
+        ringfence.play(pilot, Leaving, episodes=6, num_envs=1)
+    assert refused.value.finished["episodes"] in (1, 2)
+    cut = ringfence.play(pilot, Leaving, episodes=6, num_envs=4, early_ends="cut")
+    assert cut["episodes"] == 6 and cut["cut_episodes"] == 2 and cut["steps_mean"] == (4 * 4 + 2 * 3) / 6
+    skipped = ringfence.play(pilot, Leaving, episodes=6, num_envs=4, early_ends="skip")
+    assert skipped["episodes"] == 4 and skipped["skipped_episodes"] == 2 and skipped["steps_mean"] == 4
+
+
+@pytest.mark.parametrize("flag", ["False", None, [], {}])
+def test_text_is_no_flag(flag):
+    """Though Python takes "False" for true."""
+
+    class Odd(Reusing):
+        def step(self, actions):
+            observations, rewards, _, truncations, infos = super().step(actions)
+            return observations, rewards, dict.fromkeys(self.possible_agents, flag), truncations, infos
+
+    with pytest.raises(UserError, match="neither true nor false"):
+        collect(Odd, still, episodes=1)

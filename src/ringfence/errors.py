@@ -57,6 +57,12 @@ def whole_number(name: str, value, low: int = 0, high: int = 10**9) -> int:
     return number
 
 
+def known(name: str, value: Any, choices: Iterable[str]) -> None:
+    """Refuse a value that is none of the choices."""
+    if not isinstance(value, str) or value not in choices:
+        raise UserError(f"{name}={str(value)[:60]!r} is none of its choices; take one of: {', '.join(choices)}.")
+
+
 def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
     """`UserError` for a name that is not in `known`, suggesting the nearest one."""
     known = sorted(known)

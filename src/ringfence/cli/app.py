@@ -227,6 +227,7 @@ def play(
     episodes: int = 100,
     split: Literal["test", "validation"] = "test",
     num_envs: int = 16,
+    early_ends: Literal["refuse", "cut", "skip"] = "refuse",
     playing: How = AS_IT_IS,
 ) -> None:
     """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports.
@@ -237,6 +238,7 @@ def play(
         episodes: a bound of 1 % takes 300 without an accident.
         split: test resets, or validation resets for choosing settings.
         num_envs: simulators that are stepped side by side.
+        early_ends: what becomes of an episode that an agent leaves before its team.
     """
     from ringfence.evaluation.play import play as run_play
     from ringfence.evaluation.simulators import simulator
@@ -244,7 +246,14 @@ def play(
     given = playing.arguments()
     found = _some_runs(runs)
     make = simulator(env)
-    given |= {"episodes": episodes, "split": split, "num_envs": num_envs, "keep": True, "quiet": False}
+    given |= {
+        "episodes": episodes,
+        "split": split,
+        "num_envs": num_envs,
+        "early_ends": early_ends,
+        "keep": True,
+        "quiet": False,
+    }
     table = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
     refusals = Refusals()
     for run in found:

@@ -13,6 +13,7 @@ from ringfence.utils.given import NUMBERS, given_as
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
 ByAgent = Mapping[Any, Any]
+EARLY_ENDS = ("refuse", "cut", "skip")  # what becomes of an episode that one agent leaves before the others
 
 
 class ParallelEnv(Protocol):
@@ -51,8 +52,12 @@ class Episode:
     by the constraint's name, where the simulator names costs.
     """
 
-    def __init__(self, env: Any, shape: Shape, seed: int, max_steps: int):
+    def __init__(self, env: Any, shape: Shape, seed: int, max_steps: int, early_ends: str = "refuse"):
         check(env)
+        self.seed = seed
+        self.early_ends = early_ends
+        self.was_cut = False  # one agent left before the others, and the episode ends there
+        self.skipped = False  # one agent left before the others, and the episode counts for nothing
         self.env: ParallelEnv = env
         self.name = type(env).__name__
         self.shape = shape
@@ -102,8 +107,11 @@ class Episode:
         own = [np.array(one) for one in action]  # a simulator may write into what it is given
         step = _checked(self.name, self.env.step(dict(zip(self.agents, own))))
         number = len(self.rewards) + 1
+        left = self._left(step)
+        if left is not None and self._is_over_without(left, step, number):
+            return
         self._check_all_in("rewards", step.rewards, number)
-        ended = self._ended(step, number)
+        ended = left is not None or self._ended(step)
         self.rewards.append(np.array([_number(step.rewards[a], "reward", self.name) for a in self.agents]))
         self._take_cost(step, cost)
         if number >= self.max_steps and not ended:
@@ -115,7 +123,7 @@ class Episode:
         if not np.isfinite(np.concatenate(numbers)).all():
             raise UserError(f"Step {number} has a reward or cost that is not finite; repair the simulator.")
         self.running = not ended
-        self.terminated = all(bool(step.terminations.get(a)) for a in self.agents)
+        self.terminated = left is None and all(bool(step.terminations.get(a)) for a in self.agents)
         self.showed_end = bool(step.observations)
         if self.running or self.showed_end:
             self._observe(step.observations)
@@ -124,12 +132,35 @@ class Episode:
                 "step() tells neither a cost nor the state that an episode ends in; return the last observations."
             )
 
-    def _ended(self, step: Step, number: int) -> bool:
-        ended = [bool(step.terminations.get(a) or step.truncations.get(a)) for a in self.agents]
-        if any(ended) and not all(ended):
-            gone = self.agents[ended.index(True)]
-            raise UserError(f"{gone} ended at step {number} before its team; agents must end together.")
-        return all(ended)
+    def _ended(self, step: Step) -> bool:
+        return all(_is_set(step.terminations, a) or _is_set(step.truncations, a) for a in self.agents)
+
+    def _left(self, step: Step) -> Any:
+        """The first agent that ended, or is not there any more, while others go on; None where they stay together."""
+        going = [a for a in self.agents if a in step.rewards and not self._agent_ended(step, a)]
+        gone = [a for a in self.agents if a not in going]
+        ended = [a for a in gone if self._agent_ended(step, a)]
+        return gone[0] if going and ended else None
+
+    def _agent_ended(self, step: Step, agent: Any) -> bool:
+        return _is_set(step.terminations, agent) or _is_set(step.truncations, agent)
+
+    def _is_over_without(self, left: Any, step: Step, number: int) -> bool:
+        """Whether the episode is over without the step in which an agent left its team: it is skipped, or nobody shows
+        where that step led. Refused where nobody said what is to become of it."""
+        if self.early_ends == "refuse":
+            raise UserError(
+                f"{left} ended at step {number} before its team, in the episode of {self.name} with the seed "
+                f"{self.seed}; let agents end together, or pass early_ends='cut', which ends the episode there, or "
+                "'skip', which leaves it out and counts it."
+            )
+        self.was_cut = self.early_ends == "cut"
+        shown = all(a in step.rewards and a in step.observations for a in self.agents)
+        if self.was_cut and shown:
+            return False
+        self.skipped = not self.was_cut or not self.rewards
+        self.running = False
+        return True
 
     def _take_cost(self, step: Step, cost: Cost | None) -> None:
         """The step's cost, if there is one: that of `cost`, what `step` gives beside rewards, or what infos hold."""
@@ -229,6 +260,14 @@ def _costs_by_agent(step: Step) -> ByAgent:
     if step.costs is not None:
         return step.costs
     return {a: info["cost"] for a, info in step.infos.items() if isinstance(info, Mapping) and "cost" in info}
+
+
+def _is_set(flags: ByAgent, agent: Any) -> bool:
+    """Whether an agent's flag is set; text is none, though "False" is true to Python."""
+    flag = flags.get(agent, False)
+    if not isinstance(flag, bool | int | float | np.bool_ | np.number | np.ndarray):
+        raise UserError(f"{agent} has the flag {str(flag)[:60]!r}, which is neither true nor false; give a bool.")
+    return bool(flag)
 
 
 def _number(value: Any, what: str, whose: str) -> float:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.envs.episode import Cost, Episode
-from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
+from ringfence.errors import LAST_SEED, UserError, known, whole_number
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
@@ -39,6 +39,7 @@ def play(
     cost: Cost | None = None,
     num_envs: int = 16,
     max_episode_steps: int | None = None,
+    early_ends: Literal["refuse", "cut", "skip"] = "refuse",
     keep: bool = False,
     quiet: bool = True,
     **options: Any,
@@ -50,8 +51,10 @@ def play(
     `num_envs` of them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
     7 000 001 + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
     `max_episode_steps` (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's
-    noise. `planner` and `options` (guard, barrier, execution, world, ...) are as in `ringfence.load`. `keep` adds the
-    result to the run's results.json, as `ringfence eval` does, for reports.
+    noise. `early_ends` says what becomes of an episode that an agent leaves before its team: it is refused, cut there
+    (`cut_episodes` counts them), or skipped (`skipped_episodes`). A refusal's `finished` is the summary of the episodes
+    that were finished before. `planner` and `options` (guard, barrier, execution, world, ...) are as in
+    `ringfence.load`. `keep` adds the result to the run's results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -67,6 +70,7 @@ def play(
     whole_number("episodes", episodes, 1)
     whole_number("num_envs", num_envs, 1)
     whole_number("seed", seed, 0, LAST_SEED)
+    known("early_ends", early_ends, EARLY_ENDS)
     if max_episode_steps is not None:
         whole_number("max_episode_steps", max_episode_steps, 1)
     if split not in rollout.RESETS:
@@ -82,8 +86,12 @@ def play(
     with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
         for first in range(0, episodes, len(envs)):
             resets = [rollout.RESETS[split] + k for k in range(first, min(first + len(envs), episodes))]
-            table = Table(player, [Episode(env, player.shape, r, max_steps) for env, r in zip(envs, resets)])
-            key = table.play(cost, key)
+            try:
+                beginning = zip(envs, resets)
+                table = Table(player, [Episode(env, player.shape, r, max_steps, early_ends) for env, r in beginning])
+                key = table.play(cost, key)
+            except UserError as error:
+                raise _with_finished(error, player, tables) from error
             tables.append(table)
             bar.advance(len(resets))
     summary = _summary(player, tables)
@@ -94,6 +102,26 @@ def play(
         player.run.add_result(player.variant, summary | about | of_file)
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
+
+
+class PlayInterrupted(UserError):
+    """A simulator was refused while it was played; `finished` is the summary of the episodes finished before, or None
+    where there is none."""
+
+    def __init__(self, message: str, finished: dict[str, Any] | None):
+        super().__init__(message)
+        self.finished = finished
+
+
+def _with_finished(error: UserError, player: Player, tables: list[Table]) -> UserError:
+    """The refusal, with what was finished before."""
+    done = [episode for table in tables for episode in table.episodes if not episode.skipped]
+    if not done:
+        return error
+    message = (
+        f"{str(error).rstrip('.')} ({len(done)} episodes were finished; the refusal's `finished` has their summary)."
+    )
+    return PlayInterrupted(message, _summary(player, tables))
 
 
 def _check_kept(player: Player) -> None:
@@ -137,7 +165,7 @@ class Table:
             for episode, action in zip(self.episodes, np.asarray(decided.action)):
                 if episode.running:
                     episode.step(action, cost)
-            if any(e.lacks_cost for e in self.episodes):
+            if any(e.lacks_cost for e in self.episodes if not e.skipped):
                 self._charge_by_formula()
             memory = heard(policy, memory, self._last_costs())
         return key
@@ -167,17 +195,28 @@ class Table:
 
     def _last_costs(self) -> Array | dict[str, Array]:
         """(B,) what the last step of each cost, or that by constraint."""
-        if not self.episodes[0].constraints:
-            return jnp.asarray([np.max(e.costs[-1]) for e in self.episodes], jnp.float32)
-        names = self.episodes[0].constraints[0]
-        return {k: jnp.asarray([np.max(e.constraints[-1][k]) for e in self.episodes], jnp.float32) for k in names}
+        named = [e.constraints[0] for e in self.episodes if e.constraints]
+        if not named:
+            return jnp.asarray([np.max(e.costs[-1]) if e.costs else 0.0 for e in self.episodes], jnp.float32)
+        nothing = dict.fromkeys(named[0], 0.0)  # of an episode that was skipped at its first step
+        last = [e.constraints[-1] if e.constraints else nothing for e in self.episodes]
+        return {k: jnp.asarray([np.max(costs[k]) for costs in last], jnp.float32) for k in nothing}
 
 
 def _summary(player: Player, tables: list[Table]) -> dict[str, Any]:
     """The protocol's numbers of all episodes."""
-    played = [episode for table in tables for episode in table.episodes]
-    arrays = _arrays(played) | {k: np.concatenate([t.counts[k] for t in tables]) for k in tables[0].counts}
+    every = [episode for table in tables for episode in table.episodes]
+    counted = np.array([not episode.skipped for episode in every])
+    played = [episode for episode in every if not episode.skipped]
+    if not played:
+        raise UserError(f"All {len(every)} episodes were skipped, since agents left them; pass early_ends='cut'.")
+    counts = {k: np.concatenate([t.counts[k] for t in tables])[counted] for k in tables[0].counts}
+    arrays = _arrays(played) | counts
     summary = protocol.summarise(arrays, player.task, np.array([e.unsafe_start for e in played]))
+    if cut := sum(episode.was_cut for episode in played):
+        summary["cut_episodes"] = cut
+    if len(played) < len(every):
+        summary["skipped_episodes"] = len(every) - len(played)
     if played[0].constraints:
         summary["constraints"] = {k: _of_constraint(played, k, player.limits) for k in played[0].constraints[0]}
     return summary

@@ -5,14 +5,14 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from ringfence.envs.episode import Cost, Episode, Shape, check
-from ringfence.errors import StoreError, UserError, whole_number
+from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
+from ringfence.errors import StoreError, UserError, known, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.utils.files import writable
 from ringfence.utils.given import given_as
@@ -31,6 +31,7 @@ def collect(
     seed: int = 0,
     cost: Cost | None = None,
     max_episode_steps: int = 100_000,
+    early_ends: Literal["refuse", "cut", "skip"] = "refuse",
     card: dict | None = None,
     quiet: bool = True,
 ) -> EpisodeStore:
@@ -43,8 +44,11 @@ def collect(
     dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0 by default).
 
     With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy's name
-    and seed goes on from there. `max_episode_steps` without an end are refused. `card` adds fields to the store's.
+    and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept.
+    `max_episode_steps` without an end are refused. `early_ends` says what becomes of an episode that an agent leaves
+    before its team: it is refused, cut there, or skipped and counted on the card. `card` adds fields to the store's.
     """
+    known("early_ends", early_ends, EARLY_ENDS)
     whole_number("episodes", episodes, 1)
     whole_number("seed", seed, 0, 2**31)
     whole_number("max_episode_steps", max_episode_steps, 1)
@@ -56,7 +60,7 @@ def collect(
     player = _Player.of(policy)
     source = {"simulator": type(env).__name__, "policy": player.name, "first_seed": seed}
     kept = _kept_before(file, source, episodes)
-    begun = 0 if kept is None else kept.episodes
+    begun = 0 if kept is None else kept.episodes + _skipped(kept)
     if kept is not None and begun >= episodes:
         return kept
     rules = _Rules(
@@ -64,22 +68,67 @@ def collect(
         shape=Shape(state=None if _has_state(env, seed) else 0),
         cost=cost,
         max_steps=max_episode_steps,
+        early_ends=early_ends,
     )
-    fresh: list[_Played] = []
+    keeper = _Keeper(env, rules.bounds, source, card, file, kept)
     with Progress(f"collecting {source['simulator']}", episodes, begun, quiet) as bar:
-        for k in range(begun, episodes):
-            fresh.append(_played(env, player, rules, seed, k))
-            bar.advance(1)
-            if k + 1 == episodes or (file is not None and len(fresh) == EACH):
-                made = _store(
-                    fresh, env, rules.bounds, source, card, by_agent=kept is not None and kept.costs.ndim == 2
-                )
-                kept = made if kept is None else kept.followed_by(made)
-                fresh = []
-                if file is not None:
-                    kept.save(file)
-    assert kept is not None  # the last episode is always kept
-    return kept
+        try:
+            for k in range(begun, episodes):
+                keeper.add(_played(env, player, rules, seed, k))
+                bar.advance(1)
+        finally:  # a refusal or an interruption costs no episode that was finished
+            keeper.keep()
+    if keeper.kept is None:
+        raise UserError(f"All {episodes} episodes of {source['simulator']} were skipped: agents leave each; cut them.")
+    return keeper.kept
+
+
+class _Keeper:
+    """What was collected so far: in a store, and since that was last kept."""
+
+    def __init__(
+        self,
+        env: Any,
+        bounds: _Bounds,
+        source: dict[str, Any],
+        card: dict | None,
+        file: Path | None,
+        kept: EpisodeStore | None,
+    ):
+        self.env = env
+        self.bounds = bounds
+        self.source = source
+        self.card = card
+        self.file = file
+        self.kept = kept
+        self.skipped = 0 if kept is None else _skipped(kept)
+        self.fresh: list[_Played] = []
+
+    def add(self, played: _Played | None) -> None:
+        """An episode, None of one that was skipped; every hundredth time all is written."""
+        if played is None:
+            self.skipped += 1
+        else:
+            self.fresh.append(played)
+        if self.file is not None and len(self.fresh) == EACH:
+            self.keep()
+
+    def keep(self) -> None:
+        """Join and write what is fresh."""
+        if self.fresh:
+            by_agent = self.kept is not None and self.kept.costs.ndim == 2
+            made = _store(self.fresh, self.env, self.bounds, self.source, self.card, by_agent)
+            self.kept = made if self.kept is None else self.kept.followed_by(made)
+            self.fresh = []
+        if self.kept is not None and self.skipped != _skipped(self.kept):
+            self.kept = replace(self.kept, card=self.kept.card.updated(skipped_episodes=self.skipped))
+        if self.kept is not None and self.file is not None:
+            self.kept.save(self.file)
+
+
+def _skipped(store: EpisodeStore) -> int:
+    """Episodes that a collection left out."""
+    return int(store.card.extra.get("skipped_episodes", 0))
 
 
 def record(
@@ -137,6 +186,7 @@ class _Rules:
     shape: Shape
     cost: Cost | None
     max_steps: int
+    early_ends: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +213,11 @@ class _Played:
         return all(bool((x == x[:, :1]).all()) for x in (self.costs, *self.constraints.values()))
 
 
-def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -> _Played:
-    """Episode k."""
+def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -> _Played | None:
+    """Episode k; None where it is skipped."""
     player.reset()
     chance = np.random.default_rng((first_seed, k))
-    episode = Episode(env, rules.shape, first_seed + k, rules.max_steps)
+    episode = Episode(env, rules.shape, first_seed + k, rules.max_steps, rules.early_ends)
     bounds = rules.bounds
     shape = (len(episode.agents), bounds.entries)
     seen = [episode.seen]
@@ -181,6 +231,11 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
             action = player.act(episode.seen.copy(), None if state is None else state.copy())  # it may write there
         actions.append(bounds.clipped(given_as("actions", action, shape)))
         episode.step(actions[-1], rules.cost)
+        if episode.skipped:
+            return None
+        if len(episode.rewards) < len(actions):  # nobody shows where the last action led
+            actions.pop()
+            break
         episode.charge(0.0)
         if not episode.showed_end:
             raise UserError(

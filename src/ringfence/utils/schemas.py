@@ -163,6 +163,8 @@ class Result(Before, total=False):
     violation_upper: Share
     agent_violation_rate: Share
     unsafe_starts: Count
+    cut_episodes: Count  # that one agent left before the others
+    skipped_episodes: Count
     cost_safe_start: float
     cost_safe_start_interval: Interval
     violation_upper_safe_start: Share
