@@ -127,3 +127,23 @@ def store_view(store):
     from ringfence.datasets import registry
 
     return registry.from_store(store).feature_map("decentralized", store)
+
+
+@pytest.mark.parametrize("unsafe", [1, 2])
+def test_scarce_danger_is_said_and_not_calibrated(unsafe):
+    """One held-out unsafe step ended in an IndexError; of three the largest score was the margin."""
+    g = np.random.default_rng(0)
+    x = g.normal(size=(10, 13, 2, 3)).astype(np.float32)
+    a = np.tanh(g.normal(size=(10, 12, 2, 2)))
+    costs = np.zeros((10, 12))
+    costs[:, :unsafe] = 1
+    world = worlds.fit(EpisodeStore.from_episodes(x, a, a.sum(-1), costs, card={"task": "toy"}), **QUICK_WORLD)
+    assert "to say how well danger is told, or to set a margin" in world.card.barrier.warning
+    assert "e+0" not in str(world.card)
+
+
+def test_usual_numbers_have_no_exponent():
+    from ringfence.utils.numbers import percent, significant
+
+    assert [percent(1.0), percent(0.9999), percent(0.0), percent(0.00123)] == ["100 %", "100 %", "0 %", "0.12 %"]
+    assert [significant(1500.0), significant(1234.5, 3)] == ["1500", "1230"]

@@ -10,6 +10,7 @@ import msgspec
 
 from ringfence.utils import stored as named
 from ringfence.utils.config import build_config
+from ringfence.utils.numbers import percent, significant
 from ringfence.utils.renamed import deprecated
 from ringfence.world.settings import Settings, settings_named
 
@@ -192,12 +193,12 @@ def _of_prediction(card: Card) -> Iterator[str]:
     if card.prediction_error is not None:
         errors = card.prediction_error.error_of_change
         shown = sorted({0, min(2, len(errors) - 1), len(errors) - 1})
-        far = ", ".join(f"{100 * errors[k]:.2g} % at {k + 1}" for k in shown)
+        far = ", ".join(f"{percent(errors[k])} at {k + 1}" for k in shown)
         yield f"Predictions err by this share of what changes, steps ahead: {far}."
     if card.values is not None:
         yield (
-            f"Rewards of steps are explained to {100 * card.values.reward_r2:.3g} %, returns-to-go to "
-            f"{100 * card.values.value_r2:.3g} % of their variance."
+            f"Rewards of steps are explained to {percent(card.values.reward_r2, 3)}, returns-to-go to "
+            f"{percent(card.values.value_r2, 3)} of their variance."
         )
     if card.ood is not None:
         yield (
@@ -214,23 +215,23 @@ def _of_barrier(card: Card) -> Iterator[str]:
     if scores.warning:
         yield f"Barrier ({card.shape}): {scores.warning}."
         return
-    yield f"Barrier: {card.shape}. {100 * scores.unsafe_share:.3g} % of held-out steps are unsafe."
+    yield f"Barrier: {card.shape}. {percent(scores.unsafe_share, 3)} of held-out steps are unsafe."
     yield (
         f"With 1 false alarm in 100 safe steps it finds {100 * scores.recall:.1f} % of the unsafe ones (AUROC "
-        f"{scores.auroc:.4f}); at 0 it calls {100 * scores.false_safe:.2g} % of unsafe steps safe and "
-        f"{100 * scores.false_unsafe:.2g} % of safe ones unsafe."
+        f"{scores.auroc:.4f}); at 0 it calls {percent(scores.false_safe)} of unsafe steps safe and "
+        f"{percent(scores.false_unsafe)} of safe ones unsafe."
     )
     for row in scores.calibration:
         yield (
-            f"  of 1000 held-out steps with a margin of {row.margin:g} or more, {row.unsafe_in_1000:.2g} are "
-            f"unsafe; {100 * row.safe_kept:.3g} % of the safe steps have it"
+            f"  of 1000 held-out steps with a margin of {row.margin:g} or more, {significant(row.unsafe_in_1000)} are "
+            f"unsafe; {percent(row.safe_kept, 3)} of the safe steps have it"
         )
     if scores.avoidable is not None:
         yield _of_horizon(scores.avoidable, scores.ahead_kept)
     if card.constraints is None:
         yield (
             f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, predicted from up to {JUDGED} "
-            f"steps before, {1000 * scores.miscoverage:.2g} looked as safe as that."
+            f"steps before, {significant(1000 * scores.miscoverage)} looked as safe as that."
         )
         return
     for name, found in card.constraints.items():
@@ -238,14 +239,14 @@ def _of_barrier(card: Card) -> Iterator[str]:
 
 
 def _of_horizon(avoidable: Avoidable, kept: float) -> str:
-    shares = ", ".join(f"{100 * s:.3g} % at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
+    shares = ", ".join(f"{percent(s, 3)} at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
     line = (
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
         f"{avoidable.rows} ahead (horizon={avoidable.rows}), where predictions reach that far"
     )
     if math.isnan(kept):
         return line + "."
-    return f"{line}, or V, which leaves {100 * kept:.3g} % of the safe steps their margin."
+    return f"{line}, or V, which leaves {percent(kept, 3)} of the safe steps their margin."
 
 
 def _of_constraint(name: str, limit: float, scores: BarrierScores) -> str:
@@ -253,7 +254,7 @@ def _of_constraint(name: str, limit: float, scores: BarrierScores) -> str:
     if scores.warning:
         return f"{line}: {scores.warning}."
     return (
-        f"{line}: {100 * scores.unsafe_share:.3g} % of held-out steps are unsafe, of which it finds "
+        f"{line}: {percent(scores.unsafe_share, 3)} of held-out steps are unsafe, of which it finds "
         f"{100 * scores.recall:.1f} % with 1 false alarm in 100 (AUROC {scores.auroc:.4f}); its margin is "
         f"{scores.margin:.2g}, the unit of the lines above."
     )

@@ -28,7 +28,7 @@ from ringfence.world.logged import Logged
 from ringfence.world.model import World
 from ringfence.world.values import Values
 
-VERSION = 7  # of the validation: cached cards of another are made again
+VERSION = 8  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
@@ -218,6 +218,9 @@ def _barrier_scores(
     ends = _entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
     predicted = _predicted_scores(dynamics, barrier, logged, ends)
+    if len(predicted) < 2 * OUTLIERS:
+        warning = f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is told, or to set a margin"
+        return BarrierScores(warning=warning), UNJUDGED
     miscoverage = max(miscoverage, OUTLIERS / len(predicted))
     if unit is None:
         unit = max(least, conformal(predicted, 1 - miscoverage))

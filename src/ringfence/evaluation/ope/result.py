@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import t as student
 
+from ringfence.utils.numbers import percent
+
 
 @dataclass(frozen=True)
 class Mean:
@@ -167,4 +169,4 @@ def _of_safety(safety: Safety, ahead: int) -> str:
 
 
 def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.2g} %"
+    return "–" if share is None else percent(share)
