@@ -9,12 +9,15 @@ import pytest
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
+from ringfence.datasets.recipes.proving import Naive
 from ringfence.envs.base import Filmed, Measured
 from ringfence.envs.film import RED
 from ringfence.envs.proving import System, drivers, observations
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
 from ringfence.errors import UserError
 from ringfence.evaluation.protocol import unsafe_starts
+from ringfence.loading import oracle
+from ringfence.loading.spec import PolicySpec
 
 SYSTEMS = TEST | {f"dev-{name}": system for name, system in DEVELOPMENT.items()}
 FEW = ("posts", "crowd", "drones", "dev-swing", "train")  # of every kind of state and observation
@@ -103,6 +106,18 @@ def test_slopes_that_drivers_brake_by_are_those_of_the_distances():
     np.testing.assert_allclose(change[:, 1:-1], slope[:, 0, 1:-1, 1], atol=2e-2)  # but for itself, and what is far
 
 
+@pytest.mark.parametrize("name", ["posts", "pillar"])
+def test_logs_are_unsafe_now_and_then_and_an_expert_is_not(name):
+    system = SYSTEMS[name]
+    play = jax.jit(lambda key, habit: system.played(key, 200, habit)[2:])
+    shape = (200, system.n_agents)
+    logged = drivers.habits(system.drivers, jax.random.key(0), shape)
+    expert = drivers.Habit(*(jnp.full(shape, x) for x in drivers.EXPERT))
+    (earned, costs), (most, none) = (play(jax.random.key(1), habit) for habit in (logged, expert))
+    assert 0.01 < float((costs > 0).mean()) < 0.1 and float((none > 0).mean()) < 1e-3
+    assert float(earned.sum(0).mean()) > 0.6 * float(most.sum(0).mean()) > 0.5
+
+
 @pytest.mark.parametrize(
     "changes, message",
     [
@@ -140,3 +155,34 @@ def test_a_film_shows_in_red_who_pays():
     fine, touching = (np.asarray(p) for p in system.frames(states, [(0, False), (1, True)]))
     red = [(np.abs(p.astype(int) - RED).max(-1) < 12).sum() for p in (fine, touching)]
     assert red[0] == 0 and red[1] > 100
+
+
+def test_an_oracle_keeps_a_naive_driver_from_what_it_would_touch():
+    task = registry.get("proving-pillar")
+    system = replace(task.env, episode_length=30)
+    task = replace(task, env=system)
+    naive = Naive(system)
+    guarded = oracle.guarded(naive, task, "shield", {"horizon": 10})
+    first = system.reset(jax.random.key(0), 8)
+    inward = jnp.sign(-first.config) * 2.0  # goals beyond the post
+    first = first._replace(goal=first.config + inward)
+
+    def unsafe(policy) -> float:
+        def step(carry, key):
+            memory, state = carry
+            memory, decided = policy.act(memory, system.observe(state), system.global_state(state), key)
+            state, out = system.step(state, decided.action)
+            return (memory, state), out.cost
+
+        keys = jax.random.split(jax.random.key(1), 40)
+        _, costs = jax.jit(lambda: jax.lax.scan(step, (policy.start(8), first), keys))()
+        return float(costs.sum())
+
+    assert unsafe(guarded) < 0.2 * unsafe(naive)
+
+
+def test_the_oracle_is_refused_where_a_simulator_knows_no_distances():
+    task = registry.get("simple_spread-random")
+    with pytest.raises(UserError, match="needs a simulator that knows"):
+        oracle.known(task)
+    assert PolicySpec.parse("shield-oracle").name == "shield-oracle"

@@ -9,6 +9,7 @@ from ringfence.algos.bc import BC, BC_SAFE
 from ringfence.algos.fisor import FISOR
 from ringfence.algos.icbf import ICBF, MADIFF
 from ringfence.algos.mpc import MPC
+from ringfence.algos.naive import NAIVE
 from ringfence.algos.omar import MA_CQL, OMAR
 from ringfence.algos.returns import BC_BEST, BC_RETURN
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
@@ -19,7 +20,7 @@ from ringfence.utils.config import build_config, fields_of
 from ringfence.utils.renamed import renamed
 
 _BC, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
-ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, *_BC, *_CRITICS)}
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, NAIVE, *_BC, *_CRITICS)}
 
 
 def get(name: str) -> Algorithm:

@@ -33,6 +33,7 @@ from ringfence.errors import RunConflict, UserError, unknown, whole_number
 from ringfence.evaluation import protocol, reference
 from ringfence.evaluation.evaluate import evaluate_spec
 from ringfence.guards import GuardOptions, options_of
+from ringfence.loading import oracle
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.provenance import other_data
 from ringfence.logs.store import EpisodeStore
@@ -140,10 +141,15 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     guard = stored.get("guard_options") or {}
     if not spec.guarded:
         return not guard
-    options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **dict(spec.guard_options)))
-    wanted = names.guard_options(dataclasses.asdict(options))
     usual = names.guard_options(dataclasses.asdict(GuardOptions()))
     played = {**usual, **guard}  # an option newer than the result had its default then
+    if spec.barrier == oracle.ORACLE:
+        return bool(guard) and played == dataclasses.asdict(oracle.options(spec.guard, task, dict(spec.guard_options)))
+    options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **dict(spec.guard_options)))
+    wanted = names.guard_options(dataclasses.asdict(options))
+    if task.guard_by_card:  # how far the guard looked was the World's affair
+        looked = {"horizon", "terminal_value"} - set(dict(spec.guard_options))
+        wanted |= {name: played[name] for name in looked}
     world = Settings(**worlds.usual(task, worlds.execution_of(task, spec.execution)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
     known = names.world_settings(dataclasses.asdict(world))

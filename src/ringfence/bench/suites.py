@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from ringfence import algos
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
+from ringfence.envs.proving.suite import TEST
 from ringfence.loading.spec import PolicySpec
 from ringfence.proposals.options import DEFAULT
 
@@ -59,6 +60,7 @@ _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.val
 _ALONE, _ADAPTED = (DEFAULT, "shield-learned"), (DEFAULT, "adapt-learned")
 _COOL = "low_temperature"
 _ICBF_GUARDS = ("adapt-learned", "adapt-analytic", "full-learned")
+_PROVEN = (DEFAULT, *(f"{guard}-{source}" for source in ("learned", "oracle") for guard in ("shield", "adapt", "full")))
 _RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 
 SUITES = {
@@ -172,6 +174,12 @@ SUITES = {
                 ),
             ),
         ),
+    ),
+    # Systems that no setting was chosen on; the oracle knows their dynamics and their distances from danger.
+    "proving-ground": Suite(
+        tuple(f"proving-{name}" for name in TEST),
+        (Entry("bc", evaluations=_PROVEN), Entry("naive", evaluations=_PROVEN)),
+        episodes=500,
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
     "own-sight": Suite(

@@ -46,7 +46,7 @@ def bench(
     Args:
         suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites. Under
             guard: guards, guards-mujoco, crossing, crossing-guards, all four of them as attribution; own-sight,
-            own-sight-mujoco, crossing-teams, spread-teams.
+            own-sight-mujoco, crossing-teams, spread-teams, proving-ground.
         seeds: per algorithm and task.
         episodes: test episodes per run; the suite's number by default.
         out_dir: folder of results, results/SUITE by default; of paper and attribution, the folder that holds theirs.

@@ -87,6 +87,12 @@ class Task:
         """Options of named guards that its simulator asks for."""
         return {} if self.env is None else dict(self.env.guard)
 
+    @property
+    def guard_by_card(self) -> bool:
+        """Whether guards look as far as the World's card says, as they do in anybody's logs: nobody here knows better
+        where costs alone say what is dangerous."""
+        return self.env is None or isinstance(self.hazard, constraints.CostColumn)
+
     def normalised_return(self, value):
         """Of a return or of an array of them."""
         return (value - self.return_min) / (self.return_max - self.return_min)

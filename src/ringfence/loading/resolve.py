@@ -14,7 +14,7 @@ from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
 from ringfence.guards import Guard, Guarded
 from ringfence.guards.policy import build
-from ringfence.loading import run_worlds
+from ringfence.loading import oracle, run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
@@ -47,6 +47,8 @@ class Resolved:
     @property
     def team(self) -> Policy:
         """The policy as the whole team plays it."""
+        if self.spec.guarded and self.spec.barrier == oracle.ORACLE:
+            return self.policy  # the whole team's already: an oracle knows everybody
         return team_policy(self.policy, self.job.team, self.job.task.homogeneous)
 
     @property
@@ -94,11 +96,14 @@ def resolve(spec: PolicySpec) -> Resolved:
     world = run_worlds.of_run(run) if job.reads_world else None
     step, policy = _trained(run, job, world, spec)
     plans = isinstance(policy, Planner)
-    if spec.guarded:
+    if spec.guarded and spec.barrier == oracle.ORACLE:
+        team = team_policy(policy, job.team, job.task.homogeneous)
+        policy = oracle.guarded(team, job.task, spec.guard, dict(spec.guard_options))
+    elif spec.guarded:
         execution = worlds.execution_of(job.task, spec.execution)
         world = run_worlds.for_guard(run, execution, spec.world, read=world, quiet=False)
         _check_width(job, world.map, "The World")
-        usual = None if job.task.env is None else job.task.guard  # own data is judged by what its card says
+        usual = None if job.task.guard_by_card else job.task.guard
         options = dict(spec.guard_options)
         policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, **options)
     spec = spec if plans else spec.without_plans()

@@ -13,6 +13,7 @@ import numpy as np
 
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.guards import BARRIERS, GUARDS, GuardOptions
+from ringfence.loading.oracle import ORACLE
 from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
 from ringfence.utils import stored
@@ -21,6 +22,7 @@ from ringfence.utils.renamed import deprecated, renamed, renamed_values
 from ringfence.world import World
 
 EXECUTIONS = ("centralized", "decentralized")
+SOURCES = (*BARRIERS, ORACLE)  # of what a guard knows danger by
 Options = tuple[tuple[str, Any], ...]
 
 
@@ -76,7 +78,7 @@ class PolicySpec:
         _known("guard", guard, GUARDS)
         _known("execution", execution or "centralized", EXECUTIONS)
         if barrier is not None:
-            _known("barrier", barrier, BARRIERS)
+            _known("barrier", barrier, SOURCES)
         guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
         plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
         for name in options:
@@ -176,7 +178,7 @@ def _typed(kind: type, name: str, value: Any, default: Any) -> Any:
     return int(value) if whole and not isinstance(default, bool) else value
 
 
-_GUARD = re.compile(rf"({'|'.join(GUARDS)})-({'|'.join(BARRIERS)})(-decentralized)?")
+_GUARD = re.compile(rf"({'|'.join(GUARDS)})-({'|'.join(SOURCES)})(-decentralized)?")
 _AGENTS = re.compile(r"agents(\d+)")
 
 

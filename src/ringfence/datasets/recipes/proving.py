@@ -63,9 +63,9 @@ class Naive(eqx.Module):
 
 
 def references(task: Task) -> dict[str, Policy]:
-    """Who shows that the task can be solved, and who does not look."""
+    """Who shows that the task can be solved."""
     system = _system(task)
-    return {"expert driver": Driven(system, drivers.EXPERT), "naive driver": Naive(system)}
+    return {"expert driver": Driven(system, drivers.EXPERT)}
 
 
 def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:

@@ -286,7 +286,7 @@ class Arm:
     top: float = 1.6
     brake: float = 1.2
     links: tuple[float, float] = (0.5, 0.4)  # m
-    spacing: float = 1.1  # m from arm to arm
+    spacing: float = 0.8  # m from arm to arm
     inertia: tuple[float, float, float] = (0.32, 0.08, 0.09)  # kg m²: of both links, of their coupling, of the second
 
     def _inertia(self, config: Array) -> tuple[Array, Array, float]:

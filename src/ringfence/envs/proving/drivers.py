@@ -24,6 +24,7 @@ from ringfence.types import Array, Key
 
 ROUNDS = 6  # in each of which the barrier that is missed most is met
 NEAR = 0.6  # m or rad at which a driver begins to give way to the right
+STEERING = {"car": 0.6}  # s until a body heads elsewhere
 GIVE_WAY = 0.35  # of the top rate
 BURST = 8  # steps that a driver who does not look does not look
 
@@ -39,9 +40,9 @@ class Habit(NamedTuple):
     unsteady: Array | float  # deviation of its hand, in actions of [−1, 1]
 
 
-CAREFUL = Habit(0.85, 0.6, 0.12, 0.85, 0.0, 0.03)
-CARELESS = Habit(1.0, 1.5, -0.01, 1.06, 0.12, 0.12)
-EXPERT = Habit(1.0, 0.65, 0.08, 0.93, 0.0, 0.0)
+CAREFUL = Habit(0.85, 0.7, 0.1, 0.85, 0.0, 0.03)
+CARELESS = Habit(1.0, 2.2, -0.02, 1.06, 0.1, 0.12)
+EXPERT = Habit(1.0, 0.85, 0.06, 0.87, 0.0, 0.0)
 FEW = 0.15  # of mostly careful drivers, who are careless
 
 
@@ -86,7 +87,9 @@ def naive(system: Layout, observation: Array) -> Array:
     motion, ahead = observations.read(system, observation)
     want = towards(system, ahead, 1.0)
     free = jnp.full(want.shape[:-1], jnp.inf)
-    return system.given(system.made_of.steer(Motion(*motion), want, free, system.plant))
+    n = observation.shape[-2]  # one, of homogeneous agents who are each by themselves
+    plant = system.plant._replace(mass=system.plant.mass[:n], pace=system.plant.pace[:n])
+    return system.given(system.made_of.steer(Motion(*motion), want, free, plant))
 
 
 def towards(system: Layout, ahead: Array, pace: Array | float) -> Array:
@@ -102,7 +105,8 @@ def brake_rate(system: Layout) -> float:
     """γ, 1/s: how fast a distance may shrink, as a share of it, that brakes can keep up with."""
     body = system.made_of
     heaviest = float(system.plant.mass.max())
-    return 1.0 / (body.top * heaviest / body.brake + system.lag + 2 * system.dt)
+    delay = system.lag + 2 * system.dt + STEERING.get(system.body, 0.0)
+    return 1.0 / (body.top * heaviest / body.brake + delay)
 
 
 def looks(habit: Habit, key: Key, step: Array, shape: tuple[int, ...]) -> Array:

@@ -131,6 +131,6 @@ def frames(scene: Scene, moments: list[tuple[int, bool]]) -> Iterator[Image]:
         before = step
         draw.rectangle((0, 0, SIZE * FINE, LABEL * FINE), fill=PAPER)
         costs = f"{steps} unsafe steps" if steps else "safe"
-        text = f"{step * system.dt:4.1f} s    {system.n_agents} × {system.body}, {', '.join(system.danger)}    {costs}"
+        text = f"{step * system.dt:4.1f} s    {system.n_agents} x {system.body}, {', '.join(system.danger)}    {costs}"
         draw.text((10 * FINE, 3 * FINE), text, fill=RED if steps else BLUE, font=font)
         yield picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)

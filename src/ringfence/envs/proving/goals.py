@@ -24,7 +24,7 @@ GAP = 1.2  # m between cars of a platoon
 AHEAD = (2.0, 6.0)  # m to the next goal of a platoon
 ARMS = ((0.4, -1.8), (2.7, 1.8))  # rad, goals
 RAISED = ((1.3, -0.4), (1.8, 0.4))  # rad, where arms begin
-SHAFTS = 3.0  # rad to either side, goals of motors
+SHAFTS = 5.0  # rad to either side, goals of motors
 
 
 def reach(system: Layout) -> float:
@@ -79,7 +79,7 @@ def starts(system: Layout, key: Key, batch: int) -> Array:
     if system.body == "arm":
         low, high = np.array(RAISED[0]), np.array(RAISED[1])
         if "joints" in system.danger:
-            low, high = np.full(2, -0.4), np.full(2, 0.4)
+            low, high = np.full(2, -0.15), np.full(2, 0.15)
         return (jitter + 1) / 2 * (high - low) + low
     if system.body == "motor":
         return 0.1 * jitter if system.goals == "team" else 0.5 * jitter
