@@ -16,10 +16,12 @@ from ringfence.problem import constraints
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
+from ringfence.utils.precision import in_float32
 
 SIMULATED_BY = ("simulator", "episode_length", "integrator", "reward")  # of the card: who else simulated other steps
 
 
+@in_float32
 def make(
     task: Task,
     transitions: int | None = None,

@@ -42,6 +42,7 @@ from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key, Policy
 from ringfence.utils.files import whole, writable
+from ringfence.utils.precision import in_float32
 from ringfence.utils.pytrees import digest_of, named_arrays, named_leaves
 from ringfence.utils.renamed import renamed
 
@@ -74,6 +75,7 @@ class Step:
         return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.inputs]
 
 
+@in_float32
 def export(
     run: Run | str | Path,
     out: str | Path,

@@ -19,6 +19,7 @@ from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
+from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import renamed
 
 _log = logging.getLogger(__name__)
@@ -27,6 +28,7 @@ Split = Literal["test", "validation"]
 OLD_ARGUMENTS = {"record": "num_recorded", "step": "checkpoint"}
 
 
+@in_float32
 def evaluate(
     run: Run | str,
     *,

@@ -21,6 +21,7 @@ from ringfence.training.runs import Run
 from ringfence.types import Array, Key
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
+from ringfence.utils.precision import float32
 from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import renamed
 
@@ -157,7 +158,8 @@ class Table:
     def play(self, cost: Cost | None, key: Key) -> Key:
         """Play until all have ended; the key that is left over."""
         policy = self.player.policy
-        memory = policy.start(len(self.episodes))
+        with float32():
+            memory = policy.start(len(self.episodes))
         while any(e.running for e in self.episodes):
             key, now = jax.random.split(key)
             memory, decided = self.player.act(policy, memory, *self._seen(), now)
@@ -167,7 +169,8 @@ class Table:
                     episode.step(action, cost)
             if any(e.lacks_cost for e in self.episodes if not e.skipped):
                 self._charge_by_formula()
-            memory = heard(policy, memory, self._last_costs())
+            with float32():
+                memory = heard(policy, memory, self._last_costs())
         return key
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray | None]:

@@ -24,6 +24,7 @@ from ringfence.proposals.options import DEFAULT
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
+from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
 Unsafe = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
@@ -65,7 +66,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
     return RunPlayer(
         name=job.algorithm.name,
         policy=resolved.team,
-        act=jax.jit(act_with),
+        act=in_float32(jax.jit(act_with)),
         task=job.task,
         shape=Shape(job.team, observation, state or 0, job.task.homogeneous),
         episode_length=job.spec.episode_length,
@@ -83,7 +84,7 @@ def _unsafe_by_formula(job: Job) -> Unsafe:
         found, _ = job.hazard.labels(local_features(job.feature_map, job.task.homogeneous, observations, state))
         return found.reshape(len(observations), -1).any(-1)
 
-    return lambda observations, state: np.asarray(unsafe(observations, state))
+    return in_float32(lambda observations, state: np.asarray(unsafe(observations, state)))
 
 
 def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:

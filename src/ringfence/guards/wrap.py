@@ -18,6 +18,7 @@ from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
 from ringfence.utils.given import NUMBERS, given_as
+from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import renamed, renamed_values
 from ringfence.world import World
 
@@ -40,9 +41,11 @@ class Callback:
         """Who hears of costs: one guard, or that of each agent."""
         return team_policy(self.guarded, self.agents, self.guarded.guard.world.spec.homogeneous)
 
+    @in_float32
     def start(self, batch: int) -> PyTree:
         return self._team.start(batch)
 
+    @in_float32
     def hear(self, memory: PyTree, cost) -> PyTree:
         return self._team.hear(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
 
@@ -91,6 +94,7 @@ class Callback:
             raise UserError("The policy under guard returned actions that are not finite; it has diverged.")
         return wanted
 
+    @in_float32
     def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
         """What becomes of the function's actions (B, N, A)."""
         world = self.guarded.guard.world
@@ -152,6 +156,7 @@ class Nothing(eqx.Module):
         return {}
 
 
+@in_float32
 def guard(
     policy: Any,
     world: World,

@@ -12,6 +12,7 @@ from ringfence.proposals.base import act_with, heard
 from ringfence.training.runs import Run
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as
+from ringfence.utils.precision import in_float32
 
 
 class Controller:
@@ -25,6 +26,7 @@ class Controller:
     several threads at once.
     """
 
+    @in_float32
     def __init__(self, run: Run | str, planner: str = "default", seed: int = 0, **options):
         keep_programs()
         self.job, self.policy = load(run, planner=planner, **options)
@@ -34,10 +36,12 @@ class Controller:
         self.last_action: np.ndarray | None = None
         self.reset()
 
+    @in_float32
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._memory = self.policy.start(1)
 
+    @in_float32
     def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
         """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
         constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so

@@ -25,6 +25,7 @@ from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
 from ringfence.types import Policy, PyTree, Spec
 from ringfence.utils.config import build_config
+from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import renamed
 from ringfence.world import World
 
@@ -70,6 +71,7 @@ class Resolved:
         return self.spec.variant(self.job.preset, split)
 
 
+@in_float32
 def load(run: Run | str, checkpoint: int | None = None, planner: str = "default", **options: Any) -> tuple[Job, Policy]:
     """(job, policy) of a finished run.
 
@@ -87,6 +89,7 @@ def load(run: Run | str, checkpoint: int | None = None, planner: str = "default"
     return found.job, found.team
 
 
+@in_float32
 def resolve(spec: PolicySpec) -> Resolved:
     """The policy that a spec names. Only this may read a World, or make one again from regenerated data."""
     if spec.run is None:

@@ -33,6 +33,7 @@ from ringfence.types import Array, Key, Metrics, PyTree
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
+from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import renamed
 from ringfence.world import World
@@ -42,6 +43,7 @@ Arrays = dict[str, Array]
 OLD_ARGUMENTS = {"together": "vmap_seeds"}
 
 
+@in_float32
 def train(
     algorithm: str,
     data: EpisodeStore,

@@ -11,6 +11,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import build_config
+from ringfence.utils.precision import in_float32
 from ringfence.world import Settings, World
 from ringfence.world import load as load_world
 from ringfence.world.fit import fit_view
@@ -54,6 +55,7 @@ def usual(task: Task, execution: str) -> dict:
     }
 
 
+@in_float32
 def fit(
     store: EpisodeStore,
     *,
@@ -82,6 +84,7 @@ def fit(
     return fit_view(store, map, spec, settings, hazard=hazard, seed=seed, cached=cached, quiet=quiet)
 
 
+@in_float32
 def load(path: str | Path) -> World:
     """The World in a file that `save` or `ringfence fit --out` wrote, or in a run folder."""
 

@@ -18,6 +18,7 @@ from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas, stored
 from ringfence.utils.files import regular, whole
+from ringfence.utils.precision import in_float32
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
@@ -52,6 +53,7 @@ def blank_barrier(map: features.FeatureMap, settings: Settings) -> cbf.Barrier:
     return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances)
 
 
+@in_float32
 def save(
     world: World, path: str | Path, kept: Callable[[np.ndarray, str], np.ndarray] = lambda array, name: array
 ) -> Path:
@@ -75,6 +77,7 @@ def _digest(arrays: dict[str, np.ndarray], about: Mapping[str, Any]) -> str:
     return digest_of([*sorted(arrays.items()), ("about", np.frombuffer(words.encode(), np.uint8))])
 
 
+@in_float32
 def load(path: str | Path, map_of: MapOf = lambda task, view, hazard: None) -> World:
     """The World in a file."""
     path = Path(path)

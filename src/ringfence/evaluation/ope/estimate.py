@@ -24,11 +24,13 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import worlds
 from ringfence.training.runs import Run
+from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
 STARTS = 2000  # logged starts that values are means over, at most
 
 
+@in_float32
 def ope(
     run: Run | str,
     store: EpisodeStore,

@@ -1,0 +1,74 @@
+"""A program that computes in 64 bits gets the same policies, Worlds and actions as any other."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ringfence
+from ringfence.logs.store import EpisodeStore
+from ringfence.training import loop, worlds
+from ringfence.training.runs import sound_arrays
+from tests.quick import QUICK_WORLD
+
+
+@pytest.fixture
+def wide():
+    """As if JAX_ENABLE_X64 were set."""
+    before = jax.config.jax_enable_x64
+    jax.config.update("jax_enable_x64", True)
+    yield
+    jax.config.update("jax_enable_x64", before)
+
+
+@pytest.fixture(scope="module")
+def store() -> EpisodeStore:
+    g = np.random.default_rng(0)
+    x = g.normal(size=(20, 11, 2, 3)).astype(np.float32)
+    a = np.tanh(g.normal(size=(20, 10, 2, 2)))
+    return EpisodeStore.from_episodes(x, a, a.sum(-1), (g.random((20, 10)) < 0.2) * 1.0, card={"task": "toy"})
+
+
+def trained(algorithm, store, out, updates=4):
+    changes = {"num_updates": updates, "batch": 8} | ({"width": 8} if algorithm != "fisor" else {})
+    return loop.train(algorithm, store, changes=changes, quiet=True, out=out)[0]
+
+
+@pytest.fixture(scope="module")
+def usual(store, tmp_path_factory):
+    """Runs and a World made in 32 bits."""
+    out = tmp_path_factory.mktemp("usual")
+    return {name: trained(name, store, out) for name in ("bc", "fisor", "ma-td3bc-lag")} | {
+        "world": worlds.fit(store, cached=False, **QUICK_WORLD)
+    }
+
+
+@pytest.mark.parametrize("algorithm", ["bc", "fisor", "ma-td3bc-lag"])
+def test_training_in_a_program_of_64_bits(algorithm, store, usual, tmp_path, wide):
+    """11 of 12 algorithms ended in a TypeError."""
+    run = trained(algorithm, store, tmp_path)
+    for (step, file), (_, same) in zip(run.checkpoints(), usual[algorithm].checkpoints(), strict=True):
+        mine, theirs = sound_arrays(file, step), sound_arrays(same, step)
+        for name, array in theirs.items():
+            np.testing.assert_array_equal(mine[name], array, err_msg=name)
+            assert mine[name].dtype == array.dtype
+    action = ringfence.Controller(run).act(store.observations[0])
+    assert action.dtype == np.float32
+
+
+def test_a_world_and_its_guard_in_a_program_of_64_bits(store, usual, wide):
+    world = worlds.fit(store, cached=False, **QUICK_WORLD)
+    for mine, theirs in zip(jax.tree.leaves(world), jax.tree.leaves(usual["world"]), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    seen = []
+
+    def policy(observations, state):
+        seen.append(jnp.ones(2, float).dtype)
+        return np.zeros((2, 2))
+
+    pilot = ringfence.guard(policy, world, guard="adapt")
+    actions = [pilot.act(store.observations[t], cost=1.0) for t in range(3)]
+    assert {a.dtype for a in actions} == {np.dtype(np.float32)}
+    assert seen == [jnp.float64] * 3, "somebody's own function keeps its precision"
