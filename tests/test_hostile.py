@@ -534,3 +534,103 @@ def test_teams_on_a_card_are_counts(team):
             *[np.zeros((2, 3, 1, 1)), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1)), np.zeros((2, 2))],
             card={"team": team},
         )
+
+
+def row_table(**columns) -> dict:
+    """A table of one agent, with some columns in place of its own."""
+    times = np.arange(20) * 0.1
+    return {"t": times, "id": np.zeros(20, int), "x": np.sin(times), "y": times, "hit": np.zeros(20)} | columns
+
+
+def tabled(table, **options) -> EpisodeStore:
+    return EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], cost="hit", **options)
+
+
+KINDS = {
+    "masked": np.ma.masked_array(np.full(20, 7777.0), np.arange(20) == 3),
+    "complex": np.zeros(20, complex),
+    "text": np.full(20, "1.5"),
+    "text objects": np.full(20, "1.5", object),
+    "dates": np.datetime64("2024-01-01") + np.arange(20),
+    "NaT": np.full(20, np.datetime64("NaT")),
+    "durations": np.arange(20).astype("timedelta64[s]"),
+    "400 digits": np.array([10**400] * 20, object),
+    "complex objects": np.array([1j] * 20, object),
+    "lists": np.array([[1.0]] * 20 + [None], object)[:20],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["hit", "x"])
+def test_kinds_that_are_no_numbers_become_none(kind, name):
+    """A masked cost was 7777, NaT a cost in every step."""
+    with pytest.raises(UserError):
+        tabled(row_table(**{name: KINDS[kind]}))
+
+
+def test_times_of_a_table_may_be_dates():
+    dates = np.datetime64("2024-01-01T00:00:00.000") + (np.arange(20) * 100).astype("timedelta64[ms]")
+    assert tabled(row_table(t=dates)).steps == tabled(row_table()).steps
+    dates[3] = np.datetime64("NaT")
+    with pytest.raises(UserError, match="row 3: t is missing"):
+        tabled(row_table(t=dates))
+
+
+def test_data_frames_of_strangers():
+    import pandas as pd
+
+    frame = pd.DataFrame(row_table())
+    for spoiled in (
+        frame.assign(hit=pd.array([pd.NA] * 20, dtype="object")),
+        frame.assign(id=pd.array([pd.NA] * 20, dtype="object")),
+        frame.rename(columns={"y": "x"}),
+        frame.rename(columns={"y": 3}),
+        frame.rename(columns={"y": None}),
+    ):
+        with pytest.raises(UserError):
+            tabled(spoiled)
+
+
+def test_files_of_strangers(tmp_path, in_time):
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    file = tmp_path / "a.csv"
+    file.write_bytes(b"t,id,x,\xff\xfe,hit\n" + b"0,0,0,0,0\n" * 3)
+    with pytest.raises(UserError):
+        tabled(file)
+    file.write_text(",".join(["same"] * 20_000) + "\n")
+    with pytest.raises(UserError, match="'same' twice"):
+        tabled(file)
+    times = pa.array([k for k in range(20)], pa.time64("us"))
+    parquet.write_table(pa.table(row_table(hit=times)), tmp_path / "a.parquet")
+    with pytest.raises(UserError):
+        tabled(tmp_path / "a.parquet")
+    runs = pa.table({name: np.zeros(20_000_000, np.float32) for name in ("t", "id", "x", "y", "hit")})
+    parquet.write_table(runs, tmp_path / "runs.parquet")
+    del runs
+    with pytest.raises(UserError, match="unpacks to .* MiB and holds far less"):
+        tabled(tmp_path / "runs.parquet")
+
+
+@pytest.mark.parametrize("options", [{"dt": 1e-9}, {"neighbours": 10**6}, {"dt": 1e-300}])
+def test_sizes_that_no_machine_has_are_refused_first(options, in_time):
+    with pytest.raises(UserError):
+        tabled(row_table(), **options)
+
+
+def test_flags_and_sizes_of_strangers():
+    arrays = [np.zeros((2, 3, 1, 1)), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1)), np.zeros((2, 2))]
+    for flags in (["False", "False"], [0.5, 1.0], [None, None]):
+        with pytest.raises(UserError, match="terminated"):
+            EpisodeStore.from_episodes(*arrays, terminated=flags)
+    store = EpisodeStore.from_episodes(*arrays)
+    names = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
+    plain = {name: getattr(store, name) for name in names}
+    with pytest.raises(UserError, match="rewards reaches 1e.300, beyond 1e.15"):
+        EpisodeStore(**plain | {"rewards": np.full((4, 1), 1e300)}, card=store.card)
+    with pytest.raises(UserError, match="costs hides entries behind a mask"):
+        EpisodeStore(**plain | {"costs": np.ma.masked_array(np.zeros(4), [True, False, False, False])}, card=store.card)
+    for field in ("dt", "cost_limit", "action_high"):
+        with pytest.raises(UserError, match=field):
+            EpisodeStore.from_episodes(*arrays, card={field: 10**400})

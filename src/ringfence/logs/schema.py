@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
@@ -16,6 +17,7 @@ from ringfence.utils import schemas, stored
 from ringfence.utils.renamed import deprecated
 
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
+LARGEST = 1e15  # entry of an array: its square, and sums of that, are still numbers of 32 bits
 OPTIONAL = ("state", "speed", "constraints")
 LISTS_OF_NAMES = ("observation_names", "state_names")
 ALWAYS = (
@@ -278,7 +280,10 @@ CARD_RULES: tuple[Callable[[dict], None], ...] = (
 
 
 def _is_number(x) -> bool:
-    return isinstance(x, int | float | np.number) and not isinstance(x, bool) and bool(np.isfinite(x))
+    try:
+        return isinstance(x, int | float | np.number) and not isinstance(x, bool) and math.isfinite(x)
+    except (OverflowError, TypeError):  # an integer of hundreds of digits; a complex number
+        return False
 
 
 def _plain(x):
@@ -323,6 +328,9 @@ def _kinds(store: Arrays) -> None:
     }
     for name, array in _arrays(store):
         _demand(isinstance(array, np.ndarray), f"{name} is a {type(array).__name__}; give a NumPy array.")
+        _demand(
+            not np.ma.is_masked(array), f"{name} hides entries behind a mask; fill them in, or drop their episodes."
+        )
         kinds, what = expected.get(name, ("biuf", "real numbers"))
         _demand(array.dtype.kind in kinds, f"{name} holds entries of type {array.dtype}; it must hold {what}.")
 
@@ -401,7 +409,14 @@ def _speed(store: Arrays) -> None:
 
 def _finite(store: Arrays) -> None:
     for name, array in _arrays(store):
-        if name in ("terminated", "truncated", "episode_ends") or np.isfinite(array).all():
+        if name in ("terminated", "truncated", "episode_ends"):
+            continue
+        if np.isfinite(array).all():
+            most = float(np.abs(array).max(initial=0))
+            _demand(
+                most <= LARGEST,
+                f"{name} reaches {most:.3g}, beyond {LARGEST:g}, what 32 bits can be learned from; scale it.",
+            )
             continue
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")

@@ -278,7 +278,7 @@ class EpisodeStore:
             rewards = np.repeat(rewards[..., None], n, -1)
         last = np.zeros((e, length), bool)
         last[:, -1] = True
-        ended = np.zeros(e, bool) if terminated is None else np.asarray(terminated, bool)
+        ended = np.zeros(e, bool) if terminated is None else _truths("terminated", terminated)
         steps = e * length
         return cls(
             _flat(observations, e * (length + 1)),
@@ -332,7 +332,7 @@ class EpisodeStore:
             _check_last("final_state", final_state, (len(ends), *state.shape[1:]))
         if rewards.ndim == 1:
             rewards = np.repeat(rewards[:, None], n_agents, 1)
-        ended = np.zeros(len(ends), bool) if terminated is None else np.asarray(terminated, bool)
+        ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
         states = None
         if state is not None:
             if final_state is None:
@@ -517,6 +517,14 @@ def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
     if axes is not None and array.ndim != axes:
         raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
     return array
+
+
+def _truths(name: str, value: Any) -> np.ndarray:
+    """Flags; numbers but 0 and 1, and words, are none: "False" is true to Python."""
+    array = _numbers(name, value)
+    if not np.isin(array, (0, 1)).all():
+        raise StoreError(f"{name} holds entries other than true and false; give flags.")
+    return array.astype(bool)
 
 
 def _floats(name: str, value, axes: int | None = None) -> np.ndarray:

@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 def float32() -> AbstractContextManager[object]:
     """While it is open, JAX makes numbers of 32 bits."""
-    if not jax.config.jax_enable_x64:
+    if not getattr(jax.config, "jax_enable_x64"):  # noqa: B009 (a name that its type does not tell)
         return nullcontext()
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(False)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+from collections import Counter
 from collections.abc import Iterable, Mapping
+from numbers import Number
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -22,7 +24,7 @@ def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
     if isinstance(table, str | Path):
         table = _read_file(Path(table), wanted)
     if isinstance(table, Mapping):
-        found = {name: np.asarray(table[name]) for name in _known(wanted, list(table))}
+        found = {name: _array(name, table[name]) for name in _known(wanted, list(table))}
     else:
         frame = _frame(table)
         found = {name: frame[name].to_numpy() for name in _known(wanted, frame.columns)}
@@ -33,19 +35,29 @@ def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
     return found
 
 
-def numbers(columns: Columns, name: str) -> np.ndarray:
-    """A column as float64; the first entry that is no finite number is refused by its row. Dates become seconds since
-    the first of them."""
+def seconds(columns: Columns, name: str) -> np.ndarray:
+    """A column of times as float64 s; dates are counted from the first of them."""
     column = columns[name]
-    if column.dtype.kind == "M":
-        return (column - column.min()) / np.timedelta64(1, "s")
-    if column.dtype.kind == "m":
-        return column / np.timedelta64(1, "s")
-    try:
-        found = column.astype(np.float64)
-    except (TypeError, ValueError):
-        row = next((k for k, entry in enumerate(column) if not _is_number(entry)), 0)
-        raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; repair or drop it.") from None
+    if column.dtype.kind not in "Mm":
+        return numbers(columns, name)
+    missing = np.isnat(column)
+    if missing.any():
+        raise StoreError(f"row {int(np.flatnonzero(missing)[0])}: {name} is missing; fill or drop it.")
+    return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
+
+
+def numbers(columns: Columns, name: str) -> np.ndarray:
+    """A column as float64; the first entry that is no finite real number is refused by its row. Text, dates, complex
+    numbers and missing entries are none: what they would become is a guess."""
+    column = columns[name]
+    if column.dtype.kind not in "biufO":
+        raise StoreError(f"row 0: {name} is {str(column[0])[:40]!r}, no number; convert the column, or leave it out.")
+    row = None
+    if column.dtype.kind == "O":
+        row = next((k for k, entry in enumerate(column) if not _is_number(entry)), None)
+    if row is not None:
+        raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; repair or drop it.")
+    found = column.astype(np.float64)
     wrong = ~np.isfinite(found)
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
@@ -64,7 +76,7 @@ def words(columns: Columns, name: str) -> np.ndarray:
         raise StoreError(f"row {row}: {name} is missing; fill or drop it.")
     if column.dtype.kind != "O":
         return column
-    missing = [row for row, entry in enumerate(column) if entry is None or entry != entry]
+    missing = [row for row, entry in enumerate(column) if _is_missing(entry)]
     if missing:
         raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
     return np.array([_text(name, row, entry) for row, entry in enumerate(column)])
@@ -79,11 +91,30 @@ def _text(name: str, row: int, entry: Any) -> str:
         raise StoreError(f"row {row}: {name} is {entry[:40]!r}, no text in UTF-8; write it anew in that.") from None
 
 
-def _known(wanted: list[str], names: list[str]) -> list[str]:
+def _known(wanted: list[str], names: list[Any]) -> list[str]:
+    there = set(names)
     for name in wanted:
-        if name not in names:
-            raise unknown("column of the table", name, names)
+        if name not in there:
+            raise unknown("column of the table", name, map(str, names))
     return wanted
+
+
+def _array(name: str, column: Any) -> np.ndarray:
+    """A column of a dictionary; what a mask hides is refused, and so is what is no column."""
+    if np.ma.is_masked(column):
+        raise StoreError(f"{name} hides entries behind a mask; fill them in, or drop the rows that hold them.")
+    try:
+        return np.asarray(column)
+    except (TypeError, ValueError) as error:
+        raise StoreError(f"{name} is no column ({str(error).split('. ')[0]}); give one entry per row.") from None
+
+
+def _is_missing(entry: Any) -> bool:
+    """None, NaN, NaT and pandas' NA, which will not say whether it is itself."""
+    try:
+        return entry is None or bool(entry != entry)
+    except TypeError:
+        return True
 
 
 def _frame(table: Any) -> Any:
@@ -91,7 +122,10 @@ def _frame(table: Any) -> Any:
     narwhals = _needs("narwhals")
     try:
         return narwhals.from_native(table, eager_only=True)
-    except TypeError:
+    except Exception as error:  # names of columns that are no words, or there twice: each library has its own refusal
+        if not isinstance(error, TypeError):
+            said = (str(error).splitlines() or [type(error).__name__])[0]
+            raise StoreError(f"The table cannot be read ({said}); give every column its own name, in words.") from error
         raise StoreError(
             f"The table is a {type(table).__name__}; give a data frame (pandas, polars, pyarrow), a dictionary of "
             "columns, or a .csv or .parquet file."
@@ -117,13 +151,18 @@ def _read_file(path: Path, wanted: list[str]) -> Columns:
     pyarrow = _needs("pyarrow")
     try:
         table = _read_csv(path) if kind == ".csv" else _read_parquet(path, wanted)
-    except (pyarrow.ArrowException, OSError) as error:
-        raise StoreError(f"'{path}' is no table that can be read ({str(error).splitlines()[0]}).") from None
-    names = table.column_names
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise StoreError(f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name.")
-    return {name: table.column(name).to_numpy() for name in names}
+        names = table.column_names
+        twice = [name for name, times in Counter(names).items() if times > 1]
+        if twice:
+            raise StoreError(
+                f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name."
+            )
+        return {name: table.column(name).to_numpy() for name in _known(wanted, names)}
+    except UserError:
+        raise
+    except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:  # a header that is no UTF-8 among them
+        said = (str(error).splitlines() or [type(error).__name__])[0]
+        raise StoreError(f"'{path}' is no table that can be read ({said}).") from None
 
 
 def _read_csv(path: Path) -> Any:
@@ -146,12 +185,22 @@ def _read_parquet(path: Path, wanted: list[str]) -> Any:
         if size > 100 * path.stat().st_size + 2**28:
             raise StoreError(f"'{path}' claims {size / 2**20:.0f} MiB and holds far less; write it again.")
         there = set(file.schema_arrow.names)
+        _affordable(path, file.metadata.num_rows, len(set(wanted) & there))
         return file.read(wanted) if set(wanted) <= there else file.read()
 
 
+def _affordable(path: Path, rows: int, columns: int) -> None:
+    """Refuse what unpacks to far more than a file of its size holds: runs of one value are stored as one."""
+    size = 8 * rows * columns
+    if size > 100 * path.stat().st_size + 2**28:
+        raise StoreError(f"'{path}' unpacks to {size / 2**20:.0f} MiB and holds far less; write it in parts.")
+
+
 def _is_number(entry: Any) -> bool:
+    if not isinstance(entry, Number) or isinstance(entry, complex | np.complexfloating):
+        return False
     try:
-        float(entry)
-    except (TypeError, ValueError):
+        float(entry)  # pyright: ignore[reportArgumentType]
+    except (OverflowError, TypeError, ValueError):
         return False
     return True

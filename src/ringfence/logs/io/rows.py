@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.io.columns import Columns, numbers, words
+from ringfence.logs.io.columns import Columns, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
 
 GAP = 5.0  # steps without a row that end an episode
@@ -61,7 +61,7 @@ class Clock:
 
 def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     """The rows in order; an agent's times must increase."""
-    clock = numbers(columns, schema.time)
+    clock = seconds(columns, schema.time)
     agents, owner = np.unique(words(columns, schema.agent), return_inverse=True)
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.logs.io.columns import Table, numbers, read_columns
+from ringfence.logs.io.columns import Table, numbers, read_columns, seconds
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.rows import Clock, Rows, Values, clock_of, doubts, refuse_jumps, sorted_rows, values_of
 from ringfence.logs.io.table_schema import TableSchema
@@ -91,7 +91,7 @@ def read_layout(
     others = [name for name in schema.columns if name not in theirs]
     read = read_columns(table, [*theirs.values(), *sides, *others])
     columns = read | {ours: read[name] for ours, name in theirs.items()}
-    columns["time"] = numbers(read, theirs["time"]) * known.time_unit
+    columns["time"] = seconds(read, theirs["time"]) * known.time_unit
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
     return read_table(columns, schema, notes=notes, card=card)

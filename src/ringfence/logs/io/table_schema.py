@@ -129,7 +129,7 @@ def _whole_numbers(schema: TableSchema) -> None:
     for name in ("team", "neighbours", "max_episode_steps"):
         value = getattr(schema, name)
         if value is not None:
-            whole_number(name, value, 1, 10**6)
+            whole_number(name, value, 1, 1000 if name == "neighbours" else 10**6)
     whole_number("min_episode_steps", schema.min_episode_steps, 1)
 
 

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ringfence.errors import StoreError
+
+FINEST = 1000  # steps between two rows: more are another unit of time
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
 
@@ -52,6 +55,11 @@ def resample(
     zero = np.full(recording.max() + 1, np.inf)
     np.minimum.at(zero, recording, time)
     origin = zero[recording[first]]
+    wanted = float(((time[last] - time[first]) / dt + 1).sum())
+    if not wanted <= FINEST * (len(time) + FINEST):
+        raise StoreError(
+            f"Steps of {dt:g} s would be {wanted:.3g} for {len(time):,} rows; give a larger dt (times are in seconds)."
+        )
     low = np.ceil((time[first] - origin) / dt - EARLY).astype(np.int64)
     high = np.floor((time[last] - origin) / dt + EARLY).astype(np.int64)
     count = np.maximum(high - low + 1, 0)
