@@ -115,3 +115,101 @@ def test_pages_of_logs_and_of_policies_open_anywhere(run, logs, world, tmp_path,
         page = (tmp_path / f"{name}.html").read_text()
         assert "What a margin means" in page and "http" not in page and "mathdefault" not in page
         assert ("fitted Q evaluation" in page) == (name == "ope")
+
+
+def shaped(lengths, agents=2, entries=2, low=-1.0, high=1.0, **card) -> EpisodeStore:
+    """Logs of episodes of several lengths, with a reward of 1 at every step."""
+    rng = np.random.default_rng(1)
+    steps, episodes = sum(lengths), len(lengths)
+    x = rng.uniform(-1, 1, (steps, agents, entries)).astype(np.float32)
+    return EpisodeStore.from_steps(
+        x,
+        np.clip(rng.uniform(-1, 1, (steps, agents, 1)), low, high),
+        np.ones((steps, agents)),
+        episode_ends=np.cumsum(lengths),
+        final_observations=x[:episodes],
+        costs=(x[:, 0, 0] > 0.7) * 1.0,
+        card={"task": "line", "action_low": low, "action_high": high, **card},
+    )
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """(logs of several lengths, a run of them, their World)."""
+    store = shaped([5, 30] * 20)
+    out = tmp_path_factory.mktemp("uneven")
+    changes = {"num_updates": 4, "width": 8, "view": "pruned"}
+    (run,) = loop.train("bc", store, out=out, changes=changes, quiet=True)
+    return store, run, worlds.fit(store, seed=1, **QUICK_WORLD)
+
+
+def test_a_policy_is_played_as_long_as_the_logs(uneven):
+    """A reward of 1 a step was 'return 100, the logs 55'."""
+    store, run, world = uneven
+    found = ringfence.ope(run, store, evaluation_world=world, **QUICK | {"rollout_steps": 30, "rollout_episodes": 40})
+    assert found.rollout.returns_of_logs == 17.5
+    assert abs(found.rollout.returns.mean - 17.5) < 4
+
+
+def test_returns_that_do_not_vary_are_not_explained(uneven):
+    _, _, world = uneven
+    assert np.isnan(world.card.values.reward_r2) and "Rewards of steps do not vary" in str(world.card)
+
+
+@pytest.mark.parametrize(
+    "other, message",
+    [
+        (dict(agents=3), "of 2 agents, the logs of 3"),
+        (dict(entries=4), "of 2 entries of an observation, the logs of 4"),
+        (dict(dt=0.5), "steps of 0.1 s, the logs of 0.5 s"),
+        (dict(observation_names=["own.y", "own.x"]), "Entry 0 of observation_names is 'own.x' in the run's data"),
+        (dict(agents=2, card_agents=["b", "a"]), "Entry 0 of agents is 'a' in the run's data and 'b' in the logs"),
+    ],
+)
+def test_logs_of_another_task_are_refused_whatever_they_are_called(uneven, other, message, tmp_path):
+    """Every table was called 'table'; reversed entries were judged in silence."""
+    import json
+    import shutil
+
+    from ringfence.evaluation.ope import check
+    from ringfence.training.runs import Run
+
+    _, run, _ = uneven
+    run = Run(shutil.copytree(run.path, tmp_path / "run"))
+    config = json.loads((run.path / "config.json").read_text())
+    config["data"] |= {"dt": 0.1, "observation_names": ["own.x", "own.y"], "agents": ["a", "b"]}
+    (run.path / "config.json").write_text(json.dumps(config))
+    card = {"dt": 0.1, "agents": other.pop("card_agents", None)} | {k: v for k, v in other.items() if k == "dt"}
+    names = {k: v for k, v in other.items() if k == "observation_names"}
+    sizes = {k: v for k, v in other.items() if k in ("agents", "entries")}
+    with pytest.raises(UserError, match=message):
+        agents = card.pop("agents")
+        check(run, shaped([5] * 6, **sizes, **names, **card) if agents is None else renamed_agents(agents, **card))
+
+
+def renamed_agents(names, **card) -> EpisodeStore:
+    store = shaped([5] * 6, **card)
+    return dataclasses.replace(store, card=store.card.updated(agents=names))
+
+
+def test_an_estimate_that_diverges_is_not_told():
+    """A cost of −2971 was printed."""
+    from ringfence.evaluation.ope.fqe import _told
+
+    always = np.array([0.0, 20.0])
+    assert not _told(np.full(5, -2971.0), always).known and not _told(np.array([np.nan, 1.0]), always).known
+    assert _told(np.linspace(1, 5, 5), always).known
+    assert "not known" in str(_told(np.full(5, -2971.0), always))
+
+
+def test_actions_are_compared_in_one_unit(uneven):
+    """A guard's proposals are in the run's bounds, actions in those of the logs."""
+    import jax.numpy as jnp
+
+    from ringfence.evaluation.ope.responses import _in_units_of
+
+    _, _, world = uneven
+    wide = dataclasses.replace(world.spec, action_low=-2.0, action_high=2.0)
+    np.testing.assert_allclose(_in_units_of(world, wide, jnp.array([0.25, -0.5])), [0.5, -1.0])
+    same = jnp.array([0.25])
+    assert _in_units_of(world, world.spec, same) is same

@@ -53,8 +53,8 @@ class PredictionError(Part, frozen=True):
 class ValueScores(Part, frozen=True):
     """Shares of variance that the values explain."""
 
-    reward_r2: float
-    value_r2: float
+    reward_r2: float = UNKNOWN
+    value_r2: float = UNKNOWN
 
 
 class Threshold(Part, frozen=True):
@@ -197,14 +197,17 @@ def _of_prediction(card: Card) -> Iterator[str]:
         yield f"Predictions err by this share of what changes, steps ahead: {far}."
     if card.values is not None:
         yield (
-            f"Rewards of steps are explained to {percent(card.values.reward_r2, 3)}, returns-to-go to "
-            f"{percent(card.values.value_r2, 3)} of their variance."
+            f"Rewards of steps {_explained(card.values.reward_r2)}, returns-to-go {_explained(card.values.value_r2)}."
         )
     if card.ood is not None:
         yield (
             f"Out of distribution is where its forward models are more than {card.ood.threshold:.2g} usual steps "
             f"apart: {100 * card.ood.level:g} % of held-out episodes never are."
         )
+
+
+def _explained(share: float) -> str:
+    return "do not vary" if math.isnan(share) else f"are explained to {percent(share, 3)} of their variance"
 
 
 def _of_barrier(card: Card) -> Iterator[str]:

@@ -15,6 +15,7 @@ from ringfence.types import Array
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (
     JUDGED,
+    UNKNOWN,
     Avoidable,
     BarrierScores,
     HeldOut,
@@ -188,6 +189,9 @@ def _valued(values: Values, before: Array, action: Array, after: Array, alone: b
 
 
 def _r2(truth: np.ndarray, found: np.ndarray) -> float:
+    """Share of the variance that is explained; of what does not vary, none is known."""
+    if truth.var() <= 1e-12 * max(float(np.square(truth).mean()), 1e-12):
+        return UNKNOWN
     return float(1 - ((truth - found) ** 2).mean() / max(truth.var(), 1e-12))
 
 

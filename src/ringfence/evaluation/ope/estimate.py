@@ -7,6 +7,7 @@ and is not the one that guards. How far to believe each number, where the truth 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -27,6 +28,7 @@ from ringfence.training.runs import Run
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
+SAME_STEP = 0.01  # share by which two time steps may differ
 STARTS = 2000  # logged starts that values are means over, at most
 
 
@@ -127,9 +129,47 @@ def check_sizes(states: int, transitions: int, updates: int, seed: int) -> None:
 
 
 def check(run: Run, store: EpisodeStore) -> None:
-    """Refuse logs of another task."""
-    task = run.config["task"]
+    """Refuse logs of another task: of another name, of other agents, entries or widths, or at another time step. All
+    tables may be called the same."""
+    config = run.config
+    task = config["task"]
     if task != store.card.task:
         raise UserError(
             f"The run is of '{task}', the logs are of '{store.card.task}'; evaluate it by logs of its own task."
+        )
+    spec = config["spec"]
+    widths = config.get("widths") or (None, None)
+    homogeneous = spec.get("homogeneous", False)  # any number of them may be there
+    team = None if homogeneous else config.get("team", spec["n_agents"])
+    state_width = None if store.state is None or not widths[1] else widths[1]
+    for what, here, there in (
+        ("agents", team, store.n_agents),
+        ("entries of an action", spec["action_dim"], store.actions.shape[2]),
+        ("entries of an observation", widths[0], store.observations.shape[2]),
+        ("entries of the state", state_width, None if store.state is None else store.state.shape[1]),
+    ):
+        if here is not None and here != there:
+            raise UserError(f"The run is of {here} {what}, the logs of {there}; evaluate it by logs of its own task.")
+    _check_names(config["data"], store)
+    here, there = config["data"].get("dt"), store.card.dt
+    if here and there and abs(here - there) > SAME_STEP * max(here, there):
+        raise UserError(
+            f"The run is of steps of {here:g} s, the logs of {there:g} s; bring the logs to the run's steps."
+        )
+
+
+def _check_names(data: Mapping[str, Any], store: EpisodeStore) -> None:
+    """Names of agents and entries that both tell must be the same, in the same order."""
+    for field, there in (
+        ("agents", store.card.agents),
+        ("observation_names", store.card.observation_names),
+        ("state_names", store.card.state_names),
+    ):
+        here = data.get(field)
+        if not here or not there or list(here) == list(there):
+            continue
+        k = next((k for k, (one, other) in enumerate(zip(here, there)) if one != other), min(len(here), len(there)))
+        mine, theirs = (names[k] if k < len(names) else "nothing" for names in (here, there))
+        raise UserError(
+            f"Entry {k} of {field} is '{mine}' in the run's data and '{theirs}' in the logs; bring them into one order."
         )

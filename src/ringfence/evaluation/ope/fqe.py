@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.evaluation.ope.logs import Logs
-from ringfence.evaluation.ope.result import Mean, Values
+from ringfence.evaluation.ope.result import UNKNOWN, Mean, Values
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
 
 WIDTH = 64  # units of each of the 2 hidden layers
+BEYOND = 0.5  # of the range that values can have: estimates further outside have diverged
 SLOW = 0.05  # rate at which the copy that targets are read from follows
 
 
@@ -99,7 +100,19 @@ def fitted_q(
     at_starts = jax.jit(lambda nets, x, action: jax.vmap(lambda q: q(x, action).mean(0))(nets))
     found = np.asarray(at_starts(fast, view(starts), jnp.asarray(first_actions)), np.float64)  # (M, 2)
     found = (found * deviation + mean) / (1 - settings.discount)
-    return Values(Mean.of_bootstrap(found[:, 0]), Mean.of_bootstrap(found[:, 1]))
+    returns, costs = (_told(found[:, k], earned[:, k] / (1 - settings.discount)) for k in range(2))
+    return Values(returns, costs)
+
+
+def _told(found: np.ndarray, always: np.ndarray) -> Mean:
+    """The estimate, or that there is none: a sum of discounted steps lies between always earning the least that was
+    logged, or nothing, and always the most; an ensemble that leaves that by far has diverged."""
+    low = min(float(always.min()), 0.0)
+    high = max(float(always.max()), 0.0)
+    slack = BEYOND * (high - low)
+    if not (np.isfinite(found).all() and low - slack <= found.mean() <= high + slack):
+        return UNKNOWN
+    return Mean.of_bootstrap(found)
 
 
 def _bootstrap(episode_of_step: np.ndarray, num_ensemble: int, key: Key) -> np.ndarray:

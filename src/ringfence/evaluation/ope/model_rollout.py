@@ -78,8 +78,8 @@ def _linear(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:
 def rollout(
     policy: Any, logs: Logs, world: World, reads_state: bool, key: Key, episodes: int, steps: int
 ) -> ModelRollout | None:
-    """`episodes` episodes in the World, of `steps` steps or as many as the longest logged one has, by every member of
-    the ensemble; None where features do not tell what the policy reads."""
+    """`episodes` episodes in the World, of `steps` steps or as many as the logged one that begins there has, by
+    every member of the ensemble; None where features do not tell what the policy reads."""
     rng = np.random.default_rng(int(jax.random.bits(key)))
     observe = observer(logs, reads_state, rng)
     if observe is None:
@@ -94,6 +94,11 @@ def rollout(
         member_key = jax.random.fold_in(key, member)
         played.append(play(policy, observe, world, barrier, starts, jnp.asarray(member), member_key, steps=steps))
     earned, unsafe, ood = (np.stack([np.asarray(of_member[k]) for of_member in played]) for k in range(3))
+    # As long as the episode that began there was logged: who goes on for longer would earn more by that alone.
+    there = np.arange(steps)[:, None] < logs.store.lengths[which]
+    earned = earned * there
+    unsafe = unsafe & there
+    ood = ood & there
     returns_of_logs, unsafe_of_logs = _of_logs(logs, which, steps, barrier)
     return ModelRollout(
         episodes=len(which),
@@ -103,7 +108,7 @@ def rollout(
         unsafe_steps=None if barrier is None else Mean.of_samples(unsafe.sum(1).mean(-1)),
         unsafe_steps_of_logs=unsafe_of_logs,
         violation_rate=None if barrier is None else float(unsafe.any(1).mean()),
-        ood_rate=float(ood.mean()),
+        ood_rate=float(ood.sum() / (len(played) * there.sum())),
     )
 
 

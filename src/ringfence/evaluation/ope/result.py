@@ -35,8 +35,17 @@ class Mean:
         middle = float(values.mean())
         return cls(middle, middle - half, middle + half)
 
+    @property
+    def known(self) -> bool:
+        return bool(np.isfinite(self.mean))
+
     def __str__(self) -> str:
+        if not self.known:
+            return "not known, since fitted Q evaluation diverged"
         return f"{self.mean:.4g} ({self.low:.4g} to {self.high:.4g})"
+
+
+UNKNOWN = Mean(float("nan"), float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
