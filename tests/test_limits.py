@@ -9,6 +9,7 @@ import pytest
 
 import ringfence
 from ringfence.algos import td3bc
+from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import build_report
 from ringfence.report.pooling import pool
@@ -147,3 +148,43 @@ def test_usual_numbers_have_no_exponent():
 
     assert [percent(1.0), percent(0.9999), percent(0.0), percent(0.00123)] == ["100 %", "100 %", "0 %", "0.12 %"]
     assert [significant(1500.0), significant(1234.5, 3)] == ["1500", "1230"]
+
+
+def test_numbers_far_from_0_are_said():
+    """UTM coordinates: names fail and errors grow, without a word."""
+    from ringfence.datasets.audit import audit
+
+    t = np.arange(60) * 0.1
+    tables = {"id": np.zeros(60, int), "t": t, "x": 4.6e6 + np.sin(t), "y": np.cos(t)}
+    store = EpisodeStore.from_table(tables, time="t", agent="id", state=["x", "y"])
+    assert any(note.startswith("x reaches 4.6e+06") and "subtract an origin" in note for note in store.card.warnings)
+    assert not any(note.startswith("y reaches") for note in store.card.warnings)
+    far = charged(1.0)
+    state = np.concatenate([4.6e6 + 0.1 * np.arange(len(far.observations))[:, None] % 1, np.zeros((420, 1))], 1)
+    found = audit(EpisodeStore(**{name: getattr(far, name) for name in NAMES}, state=state.astype(np.float32)))
+    assert any("State entries 0 are so far from 0" in warning for warning in found.warnings)
+
+
+NAMES = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
+
+
+class Narrow:
+    """A simulator whose actions go to 0.5."""
+
+    possible_agents = ["a", "b"]
+
+    def action_space(self, agent):
+        from gymnasium.spaces import Box
+
+        return Box(-0.5, 0.5, (2,))
+
+    def reset(self, seed=None):
+        raise AssertionError("it is refused before")
+
+    step = reset
+
+
+def test_a_simulator_that_does_not_take_what_a_policy_does_is_refused():
+    pilot = ringfence.guard(lambda o, s: np.zeros((2, 2)), worlds.fit(charged(1.0), **QUICK_WORLD))
+    with pytest.raises(UserError, match="action space of a in Narrow is from -0.5 to 0.5, the policy acts"):
+        ringfence.play(pilot, Narrow, episodes=1)

@@ -37,7 +37,7 @@ def audit(store: EpisodeStore) -> Audit:
     else:
         danger, warnings = _danger(store, task)
         facts |= danger
-    warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *_odd_ends(store)]
+    warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *_coarse(store), *_odd_ends(store)]
     return Audit(facts, warnings, list(store.card.warnings))
 
 
@@ -126,21 +126,30 @@ def _rare_or_common_costs(store: EpisodeStore) -> list[str]:
 
 
 def _odd_observations(store: EpisodeStore) -> list[str]:
-    """Entries that never vary, and those that single precision is too coarse for."""
+    """Entries that never vary."""
     warnings = []
     some = store.observations[:: max(1, len(store.observations) // 100_000)]
     constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
     if len(constant):
         warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
-    flat = store.observations.reshape(-1, store.observations.shape[2])
-    spread = flat.std(0, dtype=np.float64)
-    gap = np.spacing(np.abs(flat).max(0).astype(np.float32))
-    coarse = np.flatnonzero((spread > 0) & (gap > COARSE * spread))
-    if len(coarse):
-        warnings.append(
-            f"Observation entries {', '.join(map(str, coarse))} are so far from 0 that single precision tells their "
-            "values apart poorly; subtract an origin before making the store."
-        )
+    return warnings
+
+
+def _coarse(store: EpisodeStore) -> list[str]:
+    """Entries of observations and state that single precision is too coarse for, such as coordinates of a map."""
+    warnings = []
+    for what, array in (("Observation", store.observations), ("State", store.state)):
+        if array is None:
+            continue
+        flat = array.reshape(-1, array.shape[-1])
+        spread = flat.std(0, dtype=np.float64)
+        gap = np.spacing(np.abs(flat).max(0).astype(np.float32))
+        coarse = np.flatnonzero((spread > 0) & (gap > COARSE * spread))
+        if len(coarse):
+            warnings.append(
+                f"{what} entries {', '.join(map(str, coarse))} are so far from 0 that single precision tells their "
+                "values apart poorly; subtract an origin before making the store."
+            )
     return warnings
 
 

@@ -26,6 +26,7 @@ from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import renamed
 
 OLD_ARGUMENTS = {"longest": "max_episode_steps", "at_once": "num_envs"}
+BOUNDS_SLACK = 1e-4  # share of the range by which bounds may differ: they went through 32 bits
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
 
 
@@ -81,6 +82,7 @@ def play(
         _check_kept(player)
     max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
     envs = _made(make_env, min(num_envs, episodes))
+    _check_bounds(envs[0], player.task.action_low, player.task.action_high)
     begun = time.perf_counter()
     key = jax.random.key(seed)
     tables: list[Table] = []
@@ -131,6 +133,24 @@ def _check_kept(player: Player) -> None:
         raise UserError("keep=True adds a result to a run's folder, and a function under guard has none; leave it out.")
     _ = player.run.results
     writable(player.run.path / "results.json")
+
+
+def _check_bounds(env: Any, low: float, high: float) -> None:
+    """Refuse a simulator whose action spaces, where it tells them, do not hold what the policy does."""
+    space_of = getattr(env, "action_space", None)
+    if not callable(space_of):
+        return
+    for agent in getattr(env, "possible_agents", ()):
+        space = space_of(agent)
+        least, most = getattr(space, "low", None), getattr(space, "high", None)
+        if least is None or most is None:
+            continue
+        slack = BOUNDS_SLACK * (high - low)
+        if np.max(least) > low + slack or np.min(most) < high - slack:
+            raise UserError(
+                f"The action space of {agent} in {type(env).__name__} is from {np.max(least):g} to {np.min(most):g}, "
+                f"the policy acts from {low:g} to {high:g}; scale its actions in the simulator, or widen the space."
+            )
 
 
 def _made(make_env: Callable[[], Any], count: int) -> list[Any]:

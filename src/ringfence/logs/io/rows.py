@@ -12,6 +12,7 @@ from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import Columns, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
 
+COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
 GAP = 5.0  # steps without a row that end an episode
 LONG = 5.0  # s, a step that hardly any controller has
 FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
@@ -135,6 +136,7 @@ def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Ite
     if schema.position:
         yield from _doubtful_velocities(rows, values, schema)
         yield from _jumps(rows, values, schema)
+    yield from _far_from_zero(rows, values)
     if clock.dt >= LONG:
         yield f"a step is {clock.dt:g} s: if times are in ms or µs, scale them to seconds"
     if schema.dt is None:
@@ -153,6 +155,19 @@ def _moved(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
 
 def _speeds(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
     return np.linalg.norm(_moved(rows, values, schema), axis=1)
+
+
+def _far_from_zero(rows: Rows, values: Values) -> Iterator[str]:
+    """Columns whose numbers 32 bits tell apart by more than a part of what they usually change by, such as UTM."""
+    for name, column in values.columns.items():
+        change = np.abs(np.diff(column))[rows.follows]
+        usual = float(np.median(change[change > 0])) if (change > 0).any() else 0.0
+        gap = float(np.spacing(np.float32(np.abs(column).max())))
+        if usual and gap > COARSE * usual:
+            yield (
+                f"{name} reaches {np.abs(column).max():.4g} and changes by {usual:.2g} a row, which single precision "
+                f"tells apart by {gap:.2g}: subtract an origin from it, the same from all columns that share it"
+            )
 
 
 def _doubtful_velocities(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
