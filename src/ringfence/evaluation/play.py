@@ -138,9 +138,10 @@ def _check_kept(player: Player) -> None:
 def _check_bounds(env: Any, low: float, high: float) -> None:
     """Refuse a simulator whose action spaces, where it tells them, do not hold what the policy does."""
     space_of = getattr(env, "action_space", None)
-    if not callable(space_of):
+    agents = list(getattr(env, "possible_agents", ()))
+    if not callable(space_of) or len(set(map(str, agents))) < len(agents):  # refused when it begins
         return
-    for agent in getattr(env, "possible_agents", ()):
+    for agent in agents:
         space = space_of(agent)
         least, most = getattr(space, "low", None), getattr(space, "high", None)
         if least is None or most is None:
