@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from ringfence.utils.compilation import keep_programs
+
 # What is kept, after a program was compiled before and one afterwards.
 CODE = """
 import jax, jax.numpy as jnp
@@ -94,3 +96,12 @@ def test_an_import_sets_nothing_up():
     code += "assert jax.config.jax_compilation_cache_dir is None"
     inherited = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     subprocess.run([sys.executable, "-c", code], env=inherited, check=True)
+
+
+def test_nothing_is_kept_where_kept_programs_are_played_wrongly(monkeypatch):
+    """jax 0.5.3 left the count of a training's steps at 0 when its program came from the cache."""
+    monkeypatch.setattr("jax.__version_info__", (0, 5, 3))
+    option = lambda name: None if name == "compilation_cache_dir" else True  # noqa: E731 (nobody has chosen)
+    monkeypatch.setattr("ringfence.utils.compilation._option", option)
+    monkeypatch.setattr("ringfence.utils.compilation._folder", lambda: pytest.fail("a folder was made"))
+    assert keep_programs.__wrapped__() is None
