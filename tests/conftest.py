@@ -82,8 +82,8 @@ def small_store(played) -> EpisodeStore:
 
 @pytest.fixture(scope="session")
 def small_world(small_store):
-    """The World of the small store."""
+    """The World of the small store. So little of it is unfit to guard by, which tests of guards insist on once."""
     from ringfence.training import worlds
-    from tests.quick import QUICK_WORLD
+    from tests.quick import QUICK_WORLD, insisted
 
-    return worlds.fit(small_store, **QUICK_WORLD)
+    return insisted(worlds.fit(small_store, **QUICK_WORLD))

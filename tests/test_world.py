@@ -103,7 +103,7 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     entered = np.array([19])  # the step that ends with a gap below 0
     found = validate._avoidable(Head(), Head(), arrays, entered)
     assert found.before == validate.BEFORE and found.rows == 7
-    assert found.avoided == (0, 0, 0, 0, 1, 1, 1)
+    assert found.avoided == (0, 0, 0, 0, 1, 1, 1, 1)
 
 
 def test_held_out_episodes_are_whole_and_differ_between_seeds(small_store):

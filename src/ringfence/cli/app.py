@@ -95,6 +95,9 @@ def train(
         print(run.path)
 
 
+UNFIT = 3  # exit status of a fit whose World is unfit to guard by
+
+
 def fit(
     data: Positional[str],
     seed: int = 0,
@@ -103,7 +106,8 @@ def fit(
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
 ) -> None:
-    """Fit the World of a task's data or of a store, and print its card: what can be foreseen, how well, where not.
+    """Fit the World of a task's data or of a store, and print its card: what can be foreseen, how well, where not. The
+    last line is the verdict; exit status 3 says that it is unfit to guard by.
 
     Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on.
 
@@ -131,6 +135,8 @@ def fit(
         from ringfence.report.ope_page import build_ope
 
         print(build_ope(report, made.card, audit(store)))
+    if made.card.verdict is not None and made.card.verdict.word == "unfit":
+        raise SystemExit(UNFIT)
 
 
 def evaluate(

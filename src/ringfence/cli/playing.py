@@ -33,6 +33,8 @@ class Playing:
     """who play, where they are homogeneous (Crossing); as many as in the logs by default."""
     world: Path | None = None
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
+    anyway: bool = False
+    """guard by a World whose verdict is unfit, too."""
     planner: Literal["default", "value_guided", "low_temperature"] = "default"
     """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots."""
     num_samples: int | None = None
@@ -62,7 +64,7 @@ class Playing:
         from ringfence.loading.spec import PolicySpec
 
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
-        given = {name: value for name, value in given.items() if value is not None}
+        given = {name: value for name, value in given.items() if value is not None and value is not False}
         assigned = renamed(assignments(self.set), stored.OPTIONS, "--set")
         flags = {"episodes", "split", "num_recorded", "checkpoint", *_FLAGS_ALONE}
         for name, value in assigned.items():
@@ -76,7 +78,7 @@ class Playing:
         return given | assigned
 
 
-_FLAGS_ALONE = ("planner", "guard", "barrier", "execution", "world", "agents")
+_FLAGS_ALONE = ("planner", "guard", "barrier", "execution", "world", "agents", "anyway")
 AS_IT_IS = Playing()
 How = tyro.conf.OmitArgPrefixes[Playing]
 

@@ -24,8 +24,11 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.world import World
 from ringfence.world.card import Avoidable
+from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
+BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
+FARTHEST = 15  # rows: a correction of more is seldom found (docs/guard.md)
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps
 
@@ -191,14 +194,24 @@ def options_of(name: str, barrier: str, usual: Named = MappingProxyType({}), **c
 
 
 def far_sighted(world: World) -> Named:
-    """Options of named guards that judge the last row by the value of danger, too: where the World's card says that
-    the predicted rows come too late, and that V leaves nearly all safe steps their margin."""
+    """Options of named guards that look farther ahead, where the World's card says that the usual rows come too late:
+    as many rows as avoiding takes, where they are predicted well, or the value of danger after the last row, where
+    that leaves nearly all safe steps their margin."""
     scores = world.card.barrier
-    if scores is None or scores.avoidable is None:
+    if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
         return {}
-    if not scores.ahead_kept >= KEPT or not _too_late(scores.avoidable):
-        return {}
-    return {name: {"terminal_value": True} for name in FAR_SIGHTED}
+    error = world.card.prediction_error
+    if error is not None and error.error_of_change[-1] <= BEARABLE:
+        rows = min(scores.avoidable.rows, FARTHEST)
+        return {name: {"horizon": max(rows, _rows_of(name))} for name in FAR_SIGHTED}
+    if scores.ahead_kept >= KEPT:
+        return {name: {"terminal_value": True} for name in FAR_SIGHTED}
+    return {}
+
+
+def _rows_of(name: str) -> int:
+    """The horizon that a named guard has by itself."""
+    return GUARDS[name].get("horizon", GuardOptions().horizon)
 
 
 def _too_late(avoidable: Avoidable) -> bool:
@@ -216,12 +229,15 @@ def build(
     name: str,
     barrier: str,
     usual: Named | None = None,
+    anyway: bool = False,
     **changes: Any,
 ) -> Guarded:
     """A policy under the named guard with changed options; `usual` as in `options_of`, by default what the World's card
-    asks for."""
+    asks for. A World that is unfit to guard by is refused unless it is insisted on with `anyway`."""
     if name not in GUARDS:
         raise unknown("guard", name, GUARDS)
+    if barrier != "analytic":
+        require(world.card, anyway)
     if usual is None:
         looks = barrier == "learned" and not {"horizon", "terminal_value"} & set(changes)
         usual = far_sighted(world) if looks else {}

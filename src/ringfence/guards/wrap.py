@@ -166,6 +166,7 @@ def guard(
     hazard: constraints.Hazard | None = None,
     seed: int = 0,
     agents: int | None = None,
+    anyway: bool = False,
     **options,
 ):
     """Any policy under guard.
@@ -174,16 +175,16 @@ def guard(
     (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
     which gives a `Pilot`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
     GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one,
-    where that is to be used.
+    where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
     """
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
     options = renamed(options, stored.GUARD_OPTIONS | {"danger": "barrier"}, "the guard")
     barrier = renamed_values({"barrier": options.pop("barrier", barrier)}, stored.VALUES)["barrier"]
     if isinstance(policy, PerAgent):
-        return PerAgent(build(policy.one, world, hazard, guard, barrier, **options), policy.agents)
+        return PerAgent(build(policy.one, world, hazard, guard, barrier, anyway=anyway, **options), policy.agents)
     if isinstance(policy, Policy):
-        return build(policy, world, hazard, guard, barrier, **options)
+        return build(policy, world, hazard, guard, barrier, anyway=anyway, **options)
     if not callable(policy):
         raise UserError(
             f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
@@ -193,5 +194,5 @@ def guard(
         raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
     if agents not in (None, spec.n_agents) and not spec.homogeneous:
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
-    guarded = build(Nothing(), world, hazard, guard, barrier, **options)
+    guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
     return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)

@@ -108,7 +108,7 @@ def resolve(spec: PolicySpec) -> Resolved:
         _check_width(job, world.map, "The World")
         usual = None if job.task.guard_by_card else job.task.guard
         options = dict(spec.guard_options)
-        policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, **options)
+        policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, spec.anyway, **options)
     spec = spec if plans else spec.without_plans()
     # Homogeneous agents see for themselves anyway.
     spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec

@@ -42,6 +42,7 @@ class PolicySpec:
     execution: str | None = None  # decentralized: every agent guards itself; None: as the task
     world: World | Path | None = field(default=None, compare=False)  # None: that of the run's data and seed
     agents: int | None = None  # who play, where agents are homogeneous; None: as many as in the logs
+    anyway: bool = field(default=False, compare=False)  # guard by a World that is unfit to, too
 
     @classmethod
     def of(
@@ -55,6 +56,7 @@ class PolicySpec:
         execution: str | None = None,
         world: World | str | Path | None = None,
         agents: int | None = None,
+        anyway: bool = False,
         **options: Any,
     ) -> PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
@@ -97,6 +99,7 @@ class PolicySpec:
             execution=execution,
             world=world if world is None or isinstance(world, World) else Path(world),
             agents=agents,
+            anyway=anyway,
         )
         if not spec.guarded:
             unread = {"barrier": barrier is not None, "world": world is not None}

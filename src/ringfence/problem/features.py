@@ -112,10 +112,12 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     of the others it is about, -1: a thing that stands still).
 
     `other1.dx` is the second other's x less the own one, so it changes as `own.x` of the two do; `goal.dx` or
-    `landmark0.dx` as the own one alone does; `other1.dvx` goes with `own.vx`. Others are the team without oneself, in
-    order.
+    `landmark0.dx` as the own one alone does; `other1.dvx` goes with `own.vx`, or with the product of `own.v` and
+    `own.cos` (`headed`, numbered after all entries). Others are the team without oneself, in order.
     """
     at = {name: d for d, name in enumerate(names)}
+    for axis, number in zip("xy", range(len(names), len(names) + len(headed(names)))):
+        at.setdefault(f"own.v{axis}", number)
     found = {}
     for d, name in enumerate(names):
         match = re.fullmatch(r"([a-z_]+?)(\d*)\.d(v?[xyz])", name)
@@ -126,6 +128,16 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
         elif match[2] and int(match[2]) < n - 1:
             found[d] = (at[f"own.{match[3]}"], int(match[2]))
     return found
+
+
+def headed(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
+    """The velocity of an agent that tells its speed and heading: two products of entries, along x and y; none where
+    it tells no such thing."""
+    at = {name: d for d, name in enumerate(names)}
+    for speed in ("own.v", "own.speed"):
+        if {speed, "own.cos", "own.sin"} <= set(at) and "own.vx" not in at:
+            return (at[speed], at["own.cos"]), (at[speed], at["own.sin"])
+    return ()
 
 
 def translation(wanted: FeatureMap, given: FeatureMap) -> np.ndarray | None:
@@ -158,7 +170,7 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     if not how:
         return map
     own = tuple(d for d in range(len(map.names)) if d not in how)
-    return replace(map, own=own, reconcile=_relative(how, map.plus.shape[0]), follows=tuple(how))
+    return replace(map, own=own, reconcile=_relative(how, map.names, map.plus.shape[0]), follows=tuple(how))
 
 
 def constant_velocity(map: FeatureMap, dt: float) -> FeatureMap:
@@ -237,12 +249,14 @@ def alone(map: FeatureMap) -> FeatureMap:
     return following(replace(map, own=None, reconcile=None, follows=(), joint=False, models_others=models_others), how)
 
 
-def _relative(how: dict[int, tuple[int, int]], n: int) -> Callable[[Array], Array]:
-    return _reconcile_relative(tuple(how.items()), n)
+def _relative(how: dict[int, tuple[int, int]], names: Sequence[str], n: int) -> Callable[[Array], Array]:
+    return _reconcile_relative(tuple(how.items()), headed(names), n)
 
 
 @functools.cache
-def _reconcile_relative(how: tuple[tuple[int, tuple[int, int]], ...], n: int) -> Callable[[Array], Array]:
+def _reconcile_relative(
+    how: tuple[tuple[int, tuple[int, int]], ...], products: tuple[tuple[int, int], ...], n: int
+) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that makes the agents agree: what agent i plans to see of
     landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged. It is
     the same one for the same rules.
@@ -259,7 +273,7 @@ def _reconcile_relative(how: tuple[tuple[int, tuple[int, int]], ...], n: int) ->
     def agree(x: Array) -> Array:
         start = x[..., :1, :, :]
         later = x[..., 1:, :, :]
-        change = later[..., sources] - start[..., sources]
+        change = _with_products(later, products)[..., sources] - _with_products(start, products)[..., sources]
         follow = start[..., entries] - change
         if moving.any():
             theirs = change[..., whose, np.flatnonzero(moving)]
@@ -267,6 +281,13 @@ def _reconcile_relative(how: tuple[tuple[int, tuple[int, int]], ...], n: int) ->
         return jnp.concatenate([start, later.at[..., entries].set(follow)], -3)
 
     return agree
+
+
+def _with_products(x: Array, products: tuple[tuple[int, int], ...]) -> Array:
+    """Features (..., D) with products of entries after them."""
+    if not products:
+        return x
+    return jnp.concatenate([x, *(x[..., one, None] * x[..., two, None] for one, two in products)], -1)
 
 
 def from_data(
@@ -375,7 +396,7 @@ def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, in
     if not how or steps is None:
         return {}
     pair = jnp.asarray(np.stack([steps.before, steps.after], 1), jnp.float32)
-    predicted = np.asarray(_relative(how, map.plus.shape[0])(pair))[:, 1]
+    predicted = np.asarray(_relative(how, map.names, map.plus.shape[0])(pair))[:, 1]
     error = predicted - steps.after
     change = steps.after - steps.before
     return {d: rule for d, rule in how.items() if _follows(error[..., d], change[..., d])}

@@ -18,6 +18,7 @@ Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample b
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -32,6 +33,8 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import least, lowest
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key
+from ringfence.world.cause_nets import CauseNet, blank, worst
+from ringfence.world.causes import Cause
 
 Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
 DANGEROUS = ("other", "obstacle", "wall")  # kinds of things that names may tell of, each with a pair network of its own
@@ -63,14 +66,18 @@ class Barrier(eqx.Module):
     step_scale: Array
     unit: Array  # () the margin that calibration asks for
     shape: Shape
+    causes: tuple[CauseNet, ...] = ()  # ℓ by causes, where they were found; `label` is empty then
 
     def of_steps(self, before: Array, after: Array) -> Array:
         """ℓ (..., N) of steps from features (..., N, D) to others."""
+        if self.causes:
+            return soft(worst(self.causes, after))
         return soft(_score(self.label, self.shape, self.standardised(before, after), after.shape[:-1]))
 
     def ahead(self, x: Array) -> Array:
         """V (..., N) of states (..., N, D)."""
-        return soft(_score(self.future, _still(self.shape), (x - self.mean) / self.scale, x.shape[:-1]))
+        value = soft(_score(self.future, _still(self.shape), (x - self.mean) / self.scale, x.shape[:-1]))
+        return jnp.minimum(value, soft(worst(self.causes, x))) if self.causes else value
 
     def apart(self, before: Array, after: Array) -> Array:
         """ℓ (..., N, 1) in units of the margin, with an axis of constraints."""
@@ -342,8 +349,8 @@ def fit_future(
     shape = _still(barrier.shape)
     few = batch // 4 if len(close) else 0
     net = barrier.label
-    if barrier.shape.use_transition:
-        width = next(iter(barrier.label.values())).weights[0].shape[-1]
+    if barrier.causes or barrier.shape.use_transition:
+        width = next(iter(barrier.future.values())).weights[0].shape[-1]
         net = networks(key_nets, shape, width)
 
     def objective(pair: tuple[dict[str, MLP], dict[str, MLP]], data: tuple[Array, ...], pick: Array) -> Array:
@@ -372,13 +379,19 @@ def fit_future(
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
-def blank_barrier(map: FeatureMap, width: int, use_transition: bool | None = None, distances: bool = True) -> Barrier:
+def blank_barrier(
+    map: FeatureMap,
+    width: int,
+    use_transition: bool | None = None,
+    distances: bool = True,
+    causes: Sequence[Cause] = (),
+) -> Barrier:
     """A barrier of the right shapes that says nothing."""
     shape = shape_of(map, use_transition, distances)
     one = jnp.ones(len(map.names))
     key = jax.random.key(0)
     return Barrier(
-        label=networks(key, shape, width),
+        label={} if causes else networks(key, shape, width),
         future=networks(key, _still(shape), width),
         mean=one,
         scale=one,
@@ -386,4 +399,5 @@ def blank_barrier(map: FeatureMap, width: int, use_transition: bool | None = Non
         step_scale=one,
         unit=jnp.ones(()),
         shape=shape,
+        causes=blank(causes, width),
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -12,6 +12,7 @@ from ringfence.utils import stored as named
 from ringfence.utils.config import build_config
 from ringfence.utils.numbers import percent, significant
 from ringfence.utils.renamed import deprecated
+from ringfence.world.causes import Edge, Found
 from ringfence.world.settings import Settings, settings_named
 
 JUDGED = 3  # steps ahead that the margin is calibrated for
@@ -48,6 +49,7 @@ class PredictionError(Part, frozen=True):
     steps_ahead: tuple[int, ...]
     error_of_change: tuple[float, ...]  # root mean square error as a share of the change, by steps ahead
     by_entry: dict[str, tuple[float, ...]]  # root mean square error in the entry's unit: 1, 3 and all steps ahead
+    coasting: tuple[float, ...] = ()  # the same share, where all goes on as it did in the last step
 
 
 class ValueScores(Part, frozen=True):
@@ -81,6 +83,23 @@ class Avoidable(Part, frozen=True):
     rows: int  # the horizon at which a guard avoids nearly all that can be avoided
 
 
+class Probe(Part, frozen=True):
+    """What a barrier answers when it is asked about one cause of danger."""
+
+    name: str  # what is varied, e.g. "length of other.dx, other.dy"
+    at: tuple[float, ...]  # values, from low to high; of a cause of several entries along the first
+    scores: tuple[float, ...]  # median score there, in margins
+    edge: float = UNKNOWN  # where danger begins, in the entry's unit
+
+
+class Verdict(Part, frozen=True):
+    """Whether a World is fit to guard by."""
+
+    word: Literal["fit", "weak", "unfit"]
+    reasons: tuple[str, ...] = ()
+    remedies: tuple[str, ...] = ()
+
+
 class BarrierScores(Part, frozen=True):
     """How well a barrier tells danger. With a `warning` the numbers are not known."""
 
@@ -97,6 +116,10 @@ class BarrierScores(Part, frozen=True):
     calibration: tuple[MarginScores, ...] = ()
     ahead_kept: float = UNKNOWN  # share of the safe steps that keep the margin by V
     avoidable: Avoidable | None = None
+    entries: float = UNKNOWN  # held-out steps that entered danger
+    margin_kept: float = UNKNOWN  # share of the safe steps that have the default margin
+    probed: float = UNKNOWN  # share of held-out states that are called unsafe with somebody put inside the radius
+    probes: tuple[Probe, ...] = ()
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True):
@@ -112,12 +135,14 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     seed: int = 0
     format: int = 0
     shape: str = ""  # of the barrier, in words
+    causes: dict[str, Found] = {}  # of danger, by constraint ("" where the logs name none)
     seconds: dict[str, float] = {}  # that fitting each part took
     held_out: HeldOut | None = None
     prediction_error: PredictionError | None = None
     values: ValueScores | None = None
     ood: Threshold | None = None
     barrier: BarrierScores | None = None
+    verdict: Verdict | None = None
     constraints: dict[str, BarrierScores] | None = None  # by name, where the logs name several
     unread: dict[str, Any] = {}  # what else a file says of it
 
@@ -177,7 +202,7 @@ def summary(card: Card) -> list[str]:
     """The card as a person reads it, line by line."""
     if not card.data.task:
         return ["an empty card"]
-    return [*_of_data(card), *_of_prediction(card), *_of_barrier(card)]
+    return [*_of_data(card), *_of_prediction(card), *_of_barrier(card), *_of_verdict(card)]
 
 
 def _of_data(card: Card) -> Iterator[str]:
@@ -194,7 +219,9 @@ def _of_prediction(card: Card) -> Iterator[str]:
         errors = card.prediction_error.error_of_change
         shown = sorted({0, min(2, len(errors) - 1), len(errors) - 1})
         far = ", ".join(f"{percent(errors[k])} at {k + 1}" for k in shown)
-        yield f"Predictions err by this share of what changes, steps ahead: {far}."
+        coasting = card.prediction_error.coasting
+        beside = f" (constant velocity: {percent(coasting[-1])} at {len(coasting)})" if coasting else ""
+        yield f"Predictions err by this share of what changes, steps ahead: {far}{beside}."
     if card.values is not None:
         yield (
             f"Rewards of steps {_explained(card.values.reward_r2)}, returns-to-go {_explained(card.values.value_r2)}."
@@ -224,6 +251,7 @@ def _of_barrier(card: Card) -> Iterator[str]:
         f"{scores.auroc:.4f}); at 0 it calls {percent(scores.false_safe)} of unsafe steps safe and "
         f"{percent(scores.false_unsafe)} of safe ones unsafe."
     )
+    yield from _of_causes(card)
     for row in scores.calibration:
         yield (
             f"  of 1000 held-out steps with a margin of {row.margin:g} or more, {significant(row.unsafe_in_1000)} are "
@@ -239,6 +267,32 @@ def _of_barrier(card: Card) -> Iterator[str]:
         return
     for name, found in card.constraints.items():
         yield _of_constraint(name, (card.data.constraints or {}).get(name, UNKNOWN), found)
+
+
+def _of_verdict(card: Card) -> Iterator[str]:
+    if card.verdict is None:
+        return
+    reasons = "; ".join(card.verdict.reasons)
+    remedies = " or ".join(card.verdict.remedies)
+    yield f"VERDICT {card.verdict.word}" + (f": {reasons}; {remedies}" if reasons else "") + "."
+
+
+def _of_causes(card: Card) -> Iterator[str]:
+    for name, found in card.causes.items():
+        of = f" of '{name}'" if name else ""
+        parts = [
+            f"{cause.name} ({percent(share, 3)}{_edge(edge)})"
+            for cause, share, edge in zip(found.causes, found.shares, found.edges)
+        ]
+        if parts:
+            yield (
+                f"Causes of danger{of}, with the share of unsafe steps that each tells: {'; '.join(parts)}; together "
+                f"{percent(found.told, 3)}, and {percent(found.mistaken)} of the safe ones."
+            )
+
+
+def _edge(edge: Edge) -> str:
+    return "" if edge.at is None else f", {'below' if edge.below else 'above'} {edge.at:.3g}"
 
 
 def _of_horizon(avoidable: Avoidable, kept: float) -> str:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import save_file
@@ -29,14 +30,18 @@ from ringfence.utils.cache import cache_dir
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
-from ringfence.world import dynamics, validate, values
+from ringfence.world import causes, dynamics, validate, values
 from ringfence.world.card import Card, Data
+from ringfence.world.cause_nets import fit_causes
+from ringfence.world.causes import Found
 from ringfence.world.logged import Logged, held_out, labels_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
+from ringfence.world.verdict import judge
 
-FORMAT = 4  # of what is fitted: what is cached of another is made again
+FORMAT = 5  # of what is fitted: what is cached of another is made again
+TOLD = 0.7  # share of the unsafe steps that causes have to tell, or networks read all entries
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -45,6 +50,7 @@ PARTS = {
     "values": ("discount", "value_updates"),
     "label": (
         "labels",
+        "causes",
         "loss",
         "penalty",
         "predicted_share",
@@ -82,7 +88,8 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
-    content = [validate.VERSION, store.content, features.to_dict(map), settings.miscoverage, settings.barrier]
+    content = [validate.VERSION, causes.VERSION, store.content, features.to_dict(map)]
+    content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
@@ -106,19 +113,21 @@ def _fitted(
     if settings.execution == "decentralized":
         map = features.alone(map)
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
-    logged = Logged.of(store, map, held_out(store, parts.seed), labels)
-    moved = store.digest("observations", "state", "actions", "episode_ends", "terminated")
+    out = held_out(store, parts.seed, _unsafe_steps(labels))
+    logged = Logged.of(store, map, out, labels)
+    moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
 
     world = blank_world(map, spec, settings)
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
-    each = [_barrier(logged.by(name), moved, acts, parts, quiet) for name in labels]
+    found_by = {name: _causes(logged.by(name), moved, parts) for name in labels}
+    each = [_barrier(logged.by(name), moved, acts, found, parts, quiet) for name, found in found_by.items()]
     barrier = None
     if each:
         barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, settings.miscoverage, settings.loss)
+    found = validate.validate(world, logged, settings.miscoverage, settings.loss, found_by)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
@@ -126,6 +135,7 @@ def _fitted(
         settings=settings,
         seed=parts.seed,
         shape=_shape_in_words(barrier),
+        causes=found_by,
         seconds={name: round(took, 1) for name, took in seconds.items()},
         held_out=found.held_out,
         prediction_error=found.prediction_error,
@@ -134,8 +144,16 @@ def _fitted(
         barrier=found.scores,
         constraints=found.constraints,
     )
+    card = msgspec.structs.replace(card, verdict=judge(card))
     threshold = jnp.asarray(found.ood.threshold, jnp.float32)
     return dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
+
+
+def _unsafe_steps(labels: dict[str, np.ndarray]) -> np.ndarray | None:
+    """(T,) bool: unsafe for anybody by any constraint."""
+    if not labels:
+        return None
+    return np.logical_or.reduce([label if label.ndim == 1 else label.any(1) for label in labels.values()])
 
 
 def _data(store: EpisodeStore, several: bool) -> Data:
@@ -202,15 +220,39 @@ def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, qui
     return parts.get("values", [moved, logged.store.digest("rewards")], blank, fit)
 
 
-def _barrier(logged: Logged, moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool) -> cbf.Barrier:
+def _causes(logged: Logged, moved: str, parts: _Parts) -> Found:
+    """The causes of one constraint's danger; none where it is not told by few entries, or is of a whole body."""
+    settings = parts.settings
+    plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
+    if not plain or logged.map.shared_body or logged.map.joint:
+        return Found()
+    content = [moved, causes.VERSION, _digest(logged.label)]
+    found = parts.json("causes", content, Found, lambda: _found(logged, parts.seed)[0])
+    return found if found.told >= TOLD else Found()
+
+
+def _found(logged: Logged, seed: int) -> tuple[Found, list[causes.Cells]]:
+    steps = logged.fitted_steps
+    rows = np.asarray(logged.arrays["row"])[steps] + 1
+    x = np.asarray(logged.arrays["features"][rows])
+    return causes.find(x, logged.label[steps], logged.store.episode_of_step[steps], logged.map.names, seed)
+
+
+def _digest(array: np.ndarray) -> str:
+    return hashlib.blake2b(array.tobytes(), digest_size=8).hexdigest()
+
+
+def _barrier(
+    logged: Logged, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts, quiet: bool
+) -> cbf.Barrier:
     """ℓ and V of one constraint."""
     settings = parts.settings
-    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings)
-    content = [moved, hashlib.blake2b(logged.label.tobytes(), digest_size=8).hexdigest()]
+    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
+    content = [moved, _digest(logged.label), causes.VERSION, msgspec.to_builtins(found)]
     steps = logged.fitted_steps
 
     def fit_label(key: Key) -> cbf.Barrier:
-        return _label(logged, acts, settings, key, quiet)
+        return _label(logged, acts, settings, found, key, parts.seed, quiet)
 
     label = parts.get("label", content, template, fit_label)
 
@@ -230,7 +272,9 @@ def _barrier(logged: Logged, moved: str, acts: dynamics.Dynamics, parts: _Parts,
     return parts.get("future", content, template, fit_future)
 
 
-def _label(logged: Logged, acts: dynamics.Dynamics, settings: Settings, key: Key, quiet: bool) -> cbf.Barrier:
+def _label(
+    logged: Logged, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key, seed: int, quiet: bool
+) -> cbf.Barrier:
     """ℓ of a data set, with the statistics that it reads by."""
     key_states, key_fit = jax.random.split(key)
     steps = logged.fitted_steps
@@ -241,8 +285,22 @@ def _label(logged: Logged, acts: dynamics.Dynamics, settings: Settings, key: Key
             "them, or take another seed."
         )
     data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], jnp.asarray(logged.label)
+    blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
+    if found.causes:
+        nets = fit_causes(
+            _found(logged, seed)[1],
+            data,
+            steps[unsafe],
+            steps[~unsafe],
+            key_fit,
+            share=settings.predicted_share,
+            updates=settings.barrier_updates,
+            width=settings.barrier_width,
+            quiet=quiet,
+        )
+        return dataclasses.replace(blank, causes=nets)
     return cbf.fit_label(
-        _standardised(blank_barrier(logged.map, settings), logged, key_states),
+        blank,
         data,
         steps[unsafe],
         steps[~unsafe],
@@ -273,6 +331,11 @@ def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier
 def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
     if barrier is None:
         return "no barrier"
+    by_causes = [
+        net for one in (barrier.each if isinstance(barrier, cbf.MinBarrier) else (barrier,)) for net in one.causes
+    ]
+    if by_causes:
+        return "a network for each cause (" + "; ".join(net.cause.name for net in by_causes) + "), the worst one counts"
     shape = barrier.shape
     if shape.pairs:
         kinds = ", ".join(f"{len(entries)} x {kind}" for kind, entries in shape.pairs)
@@ -315,6 +378,22 @@ class _Parts:
             about.append(self.formula)
         code = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:16]
         return cache_dir() / "worlds" / f"{name}-{code}.safetensors"
+
+    def json(self, name: str, content: list[Any], kind: type[T], make: Callable[[], T]) -> T:
+        """What is found about a part before it is fitted, likewise."""
+        file = self.file(name, ["label"], content).with_suffix(".json")
+        if self.cached and file.exists():
+            try:
+                return msgspec.json.decode(file.read_bytes(), type=kind)
+            except (OSError, msgspec.MsgspecError):
+                pass
+        begun = time.perf_counter()
+        made = make()
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+        if self.cached:
+            with whole(file) as temporary:
+                Path(temporary).write_bytes(msgspec.json.encode(made))
+        return made
 
     def get(self, name: str, content: list[Any], template: T, make: Callable[[Key], T]) -> T:
         """The part of that name; made, and then kept, where it is not there."""

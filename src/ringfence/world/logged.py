@@ -19,6 +19,8 @@ from ringfence.world.dynamics import Dynamics
 from ringfence.world.settings import Settings
 
 HELD_OUT = 0.1  # of the episodes, whole ones
+MOST_HELD_OUT = 0.3  # of the dangerous ones, where they are few
+ENOUGH = 30  # dangerous episodes that say something
 FEWEST = 5  # episodes that can be divided
 CLOSE = 20  # steps before danger that its value is learned from most
 AT_ONCE = 50_000  # steps whose ends are predicted at once
@@ -101,8 +103,9 @@ def _after(dynamics: Dynamics, before: Array, action: Array) -> Array:
     return dynamics.step(before, action)[0]
 
 
-def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
-    """(E,) bool: the episodes that no part of a World of this seed learns from."""
+def held_out(store: EpisodeStore, seed: int, unsafe: np.ndarray | None = None) -> np.ndarray:
+    """(E,) bool: the episodes that no part of a World of this seed learns from. Of those with danger, by the `unsafe`
+    steps (T,), the same share, or more where they are few: what is known of danger is what these say."""
     if store.episodes < FEWEST:
         raise UserError(
             f"'{store.card.task}' has {store.episodes} episodes, too few to hold some out; a World needs {FEWEST} "
@@ -110,10 +113,23 @@ def held_out(store: EpisodeStore, seed: int) -> np.ndarray:
         )
     team = store.card.team or 1  # agents of one team are held out together
     episodes = store.episodes // team
-    count = max(1, round(HELD_OUT * episodes))
     out = np.zeros(episodes, bool)
-    out[np.random.default_rng([seed, 77]).choice(episodes, count, replace=False)] = True
+    rng = np.random.default_rng([seed, 77])
+    dangerous = np.zeros(episodes, bool) if unsafe is None else _dangerous(store, unsafe, team)
+    for some, least in ((np.flatnonzero(~dangerous), 1), (np.flatnonzero(dangerous), ENOUGH)):
+        if len(some):
+            count = max(round(HELD_OUT * len(some)), min(least, round(MOST_HELD_OUT * len(some))))
+            out[rng.choice(some, max(count, int(not dangerous.any())), replace=False)] = True
+    if not out.any():
+        out[rng.integers(episodes)] = True
     return np.tile(out, team)
+
+
+def _dangerous(store: EpisodeStore, unsafe: np.ndarray, team: int) -> np.ndarray:
+    """(E,) bool: the episodes in which anybody was in danger."""
+    found = np.zeros(store.episodes, bool)
+    found[store.episode_of_step[unsafe]] = True
+    return np.logical_or.reduce(found.reshape(team, -1), 0)
 
 
 def labels_of(

@@ -28,6 +28,7 @@ class Settings:
     dynamics_width: Width = 128  # units of each of 2 hidden layers
     value_updates: Count = 8000  # of the critic, and again of rewards
     barrier: bool = True
+    causes: bool = True  # find few entries that tell danger; where there are none, networks on all of them
     loss: cbf.Loss = "cross-entropy"  # of labels
     penalty: NonNegative = 1.0  # weight of the gradient's, where the loss has one
     predicted_share: Share = 0.5  # share of labelled steps that end where they were predicted to end

@@ -23,6 +23,7 @@ from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
 from ringfence.world.card import Card
+from ringfence.world.causes import Found
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 
@@ -40,17 +41,20 @@ def blank_world(
     def shapes() -> World:
         acts = dynamics.blank_dynamics(map, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
         value = values.blank_values(map, spec.action_dim, settings.discount, alone)
-        barrier = blank_barrier(map, settings) if settings.barrier else None
+        causes = card.causes if card else {}
         names = tuple(constraints)
+        barrier = blank_barrier(map, settings, causes.get("")) if settings.barrier else None
         if barrier is not None and names:
-            barrier = cbf.MinBarrier((barrier,) * len(names), names)
+            each = tuple(blank_barrier(map, settings, causes.get(name)) for name in names)
+            barrier = cbf.MinBarrier(each, names)
         return World(acts, value, barrier, jnp.ones(()), map, spec, alone, card or Card())
 
     return eqx.filter_eval_shape(shapes)
 
 
-def blank_barrier(map: features.FeatureMap, settings: Settings) -> cbf.Barrier:
-    return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances)
+def blank_barrier(map: features.FeatureMap, settings: Settings, found: Found | None = None) -> cbf.Barrier:
+    causes = found.causes if found else ()
+    return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances, causes)
 
 
 @in_float32

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -24,12 +26,14 @@ from ringfence.world.card import (
     Threshold,
     ValueScores,
 )
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.model import World
+from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 8  # of the validation: cached cards of another are made again
+VERSION = 9  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
@@ -41,8 +45,9 @@ LEAST = {"cross-entropy": 4.0, "hinges": 0.1, "gradient-penalty": 0.1}
 UNJUDGED = 5.0  # the margin of a barrier that held-out episodes say nothing of
 MARGINS = {0.0, 1.0, 2.0, 4.0, 8.0}  # that the card gives numbers of, beside the calibrated one
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
+BEARABLE = 0.8  # share of safe steps that should have the margin
 OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
-BEFORE = (1, 2, 3, 5, 7, 10, 15)  # steps before danger at which it is asked whether it could still be avoided
+BEFORE = (1, 2, 3, 5, 7, 10, 15, 20, 30)  # steps before danger at which it is asked whether it could still be avoided
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
 ENTERED = 100  # entries that are asked about
 ROUNDS = 15  # of the search for actions that avoid it
@@ -62,8 +67,16 @@ class Validation:
     constraints: dict[str, BarrierScores] | None
 
 
-def validate(world: World, logged: Logged, miscoverage: float, loss: str = "cross-entropy") -> Validation:
-    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above."""
+def validate(
+    world: World,
+    logged: Logged,
+    miscoverage: float,
+    loss: str = "cross-entropy",
+    causes: Mapping[str, Found] = MappingProxyType({}),
+) -> Validation:
+    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above; `causes` are
+    those of each constraint."""
+    edges = {cause: edge for found in causes.values() for cause, edge in zip(found.causes, found.edges)}
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
     prediction_error = _prediction_error(world.dynamics, logged, rng)
@@ -76,13 +89,13 @@ def validate(world: World, logged: Logged, miscoverage: float, loss: str = "cros
         each = {}
         constraints = {}
         for name, one in zip(barrier.names, barrier.each):
-            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss])
+            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss], edges)
             constraints[name] = found
             each[name] = _in_units(one, unit)
         barrier = MinBarrier(tuple(each.values()), barrier.names)
-        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, 1.0)
+        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, edges, 1.0)
     elif barrier is not None:
-        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss])
+        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss], edges)
         barrier = _in_units(barrier, unit)
     return Validation(held_out, prediction_error, explained, ood, barrier, scores, constraints)
 
@@ -109,12 +122,28 @@ def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generat
     scale = np.maximum(np.asarray(dynamics.scale), 1e-9)
     entries = dynamics.predicted
     share = _over_entries(error / scale, entries) / np.maximum(_over_entries(change / scale, entries), 1e-9)
+    coasted = _coasted(logged, starts, ahead)
+    coasting = _over_entries(coasted / scale, entries) / np.maximum(_over_entries(change / scale, entries), 1e-9)
     shown = sorted({0, min(2, ahead - 1), ahead - 1})
     return PredictionError(
         steps_ahead=tuple(range(1, ahead + 1)),
         error_of_change=tuple(round(float(v), 4) for v in share),
         by_entry={name: tuple(float(f"{error[k, d]:.3g}") for k in shown) for d, name in enumerate(logged.map.names)},
+        coasting=tuple(round(float(v), 4) for v in coasting),
     )
+
+
+def _coasted(logged: Logged, starts: np.ndarray, ahead: int) -> np.ndarray:
+    """(K, D) root mean square errors where everything goes on as it did in the step before."""
+    row, first = (np.asarray(logged.arrays[name])[starts] for name in ("row", "first_row"))
+    row = row[row > first]
+    if not len(row):
+        return np.full((ahead, len(logged.map.names)), np.nan)
+    x = logged.arrays["features"]
+    now = np.asarray(x[row])
+    moved = now - np.asarray(x[row - 1])
+    errors = [now + k * moved - np.asarray(x[row + k]) for k in range(1, ahead + 1)]
+    return _rms(np.stack(errors, 1))
 
 
 def _rms(error: np.ndarray) -> np.ndarray:
@@ -205,6 +234,7 @@ def _barrier_scores(
     rng: np.random.Generator,
     miscoverage: float,
     least: float,
+    edges: Mapping[Cause, Edge],
     unit: float | None = None,
 ) -> tuple[BarrierScores, float]:
     """(scores, margin): calibrated, at `least` so much, unless it is known."""
@@ -225,11 +255,11 @@ def _barrier_scores(
     if len(predicted) < 2 * OUTLIERS:
         warning = f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is told, or to set a margin"
         return BarrierScores(warning=warning), UNJUDGED
-    miscoverage = max(miscoverage, OUTLIERS / len(predicted))
     if unit is None:
-        unit = max(least, conformal(predicted, 1 - miscoverage))
+        unit = max(least, _margin(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))
     share = float(unsafe[held].mean())
     alarm = np.quantile(now[~truth], FALSE_ALARMS)
+    answers, probed = probe(barrier, logged, edges, unit, rng)
     scores = BarrierScores(
         unsafe_share=share,
         auroc=_auroc(now, truth),
@@ -239,12 +269,34 @@ def _barrier_scores(
         false_unsafe=float((now[~truth] < 0).mean()),
         predicted_false_safe=float((predicted >= 0).mean()),
         margin=float(unit),
-        miscoverage=miscoverage,
+        miscoverage=float((predicted >= unit).mean()),
         calibration=tuple(_of_margin(m, now, truth, predicted, share) for m in sorted(MARGINS | {round(unit, 2)})),
         ahead_kept=float((ahead[~truth] >= unit).mean()),
         avoidable=_avoidable(dynamics, barrier, logged.arrays, ends[:ENTERED]),
+        entries=float(_count_entries(logged, bad)),
+        margin_kept=float((now[~truth] >= unit).mean()),
+        probed=probed,
+        probes=answers,
     )
     return scores, unit
+
+
+def _margin(predicted: np.ndarray, safe: np.ndarray, miscoverage: float) -> float:
+    """The conformal margin of predicted scores of entries into danger, where most safe steps have it. Where they have
+    not, because some danger is told by nothing that is logged, the one that parts most of both."""
+    calibrated = conformal(predicted, 1 - miscoverage)
+    if (safe >= calibrated).mean() >= BEARABLE:
+        return calibrated
+    tried = np.quantile(predicted, np.linspace(0.5, 1.0, 201))
+    below = np.searchsorted(np.sort(predicted), tried) / len(predicted)
+    lost = np.searchsorted(np.sort(safe), tried) / len(safe)
+    return float(tried[np.argmax(below - lost)])
+
+
+def _count_entries(logged: Logged, bad: np.ndarray) -> int:
+    """Steps that entered danger, of those that are unsafe."""
+    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
+    return int(((row[bad] == first[bad]) | ~logged.unsafe[np.maximum(bad - 1, 0)]).sum())
 
 
 def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

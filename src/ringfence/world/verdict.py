@@ -1,0 +1,87 @@
+"""Whether a World is fit to guard by, with its reasons and what helps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal
+
+from ringfence.errors import UserError
+from ringfence.world.card import BarrierScores, Card, Verdict
+
+Word = Literal["fit", "weak", "unfit"]
+ENTRIES = (5, 30)  # held-out entries into danger: with fewer than these nothing, or little, is known
+RECALL = (0.8, 0.95)  # share of unsafe steps found with 1 false alarm in 100
+KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights most actions below it
+AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
+PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
+
+
+def judge(card: Card) -> Verdict:
+    """The verdict on the World of this card."""
+    if card.barrier is None:
+        return Verdict("unfit", ("it was fitted without costs, so it knows no danger",), ("give a formula of danger",))
+    found = list(_barrier(card.barrier, ""))
+    for name, scores in (card.constraints or {}).items():
+        found += _barrier(scores, f" of '{name}'")
+    found += _prediction(card)
+    worst: Word = "fit"
+    for word in ("weak", "unfit"):
+        if any(given == word for given, _, _ in found):
+            worst = word
+    shown = [(reason, remedy) for given, reason, remedy in found if given == worst] if worst != "fit" else []
+    return Verdict(worst, tuple(r for r, _ in shown), tuple(dict.fromkeys(m for _, m in shown)))
+
+
+def _barrier(scores: BarrierScores, of: str) -> Iterator[tuple[Word, str, str]]:
+    """(word, reason, remedy) of what is amiss."""
+    if scores.warning:
+        yield "unfit", f"{scores.warning}{of}", "log more episodes with danger"
+        return
+    checks = (
+        (scores.entries, ENTRIES, "{:.0f} held-out steps enter danger", "log more episodes with danger"),
+        (scores.recall, RECALL, "{:.1%} of unsafe steps are found", "name the entries that tell danger, or log them"),
+        (scores.margin_kept, KEPT, "{:.1%} of safe steps keep the margin", "log more, and more careful, episodes"),
+        (_avoided(scores), AVOIDABLE, "{:.0%} of danger can be avoided", "log stronger braking and turning"),
+        (scores.probed, PROBED, "{:.1%} of states inside the radius are called unsafe", "give a formula of danger"),
+    )
+    for value, limits, words, remedy in checks:
+        word = _word(value, limits)
+        if word != "fit":
+            yield word, f"only {words.format(value)}{of}", remedy
+
+
+def _avoided(scores: BarrierScores) -> float:
+    return max(scores.avoidable.avoided) if scores.avoidable else math.nan
+
+
+def _word(value: float, limits: tuple[float, float]) -> Word:
+    """What a number means; one that is not known means nothing."""
+    unfit, weak = limits
+    if math.isnan(value) or value >= weak:
+        return "fit"
+    return "unfit" if value < unfit else "weak"
+
+
+def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
+    error = card.prediction_error
+    if error is None or not error.coasting:
+        return
+    ours, theirs = error.error_of_change[-1], error.coasting[-1]
+    if ours > theirs:
+        yield (
+            "weak",
+            f"its predictions err by {ours:.0%} of what changes where constant velocity errs by {theirs:.0%}",
+            "log more episodes, or more of what decides how agents move",
+        )
+
+
+def require(card: Card, anyway: bool = False) -> None:
+    """Refuse to guard by a World that is unfit, unless it is insisted on."""
+    verdict = card.verdict or judge(card)
+    if verdict.word != "unfit" or anyway:
+        return
+    raise UserError(
+        f"The World of '{card.data.task}' is unfit to guard by: {'; '.join(verdict.reasons)}; "
+        f"{' or '.join(verdict.remedies)}, or insist with anyway=True (--anyway)."
+    )

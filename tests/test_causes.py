@@ -1,0 +1,201 @@
+"""Causes of danger: found by what is never safe, learned by small networks, asked, judged."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+import pytest
+
+from ringfence import EpisodeStore, fit, guard
+from ringfence.errors import UserError
+from ringfence.problem import features
+from ringfence.world import causes, verdict
+from ringfence.world.card import BarrierScores, Card, Data, PredictionError, Verdict
+from ringfence.world.cause_nets import blank
+from ringfence.world.logged import held_out
+
+N, STEPS = 3, 40
+NAMES = ["own.x", "own.y", "own.v", "goal.dx", "goal.dy"] + [f"other{j}.d{c}" for j in range(N - 1) for c in "xy"]
+OTHERS = np.array([[j for j in range(N) if j != i] for i in range(N)])
+NEAR, POST, FAST = 0.25, 0.4, 0.97
+
+
+def walks(episodes=400, seed=0):
+    """(observations (E, STEPS + 1, N, O), unsafe (E, STEPS, N, 3) by pair, post at the origin and speed)."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform(-1.5, 1.5, (episodes, 1, N, 2)) + np.cumsum(rng.normal(0, 0.12, (episodes, STEPS + 1, N, 2)), 1)
+    speed = rng.uniform(0, 1, (episodes, STEPS + 1, N, 1))
+    goal = np.broadcast_to(rng.uniform(-1.5, 1.5, (episodes, 1, N, 2)), place.shape)
+    others = place[:, :, OTHERS] - place[:, :, :, None]
+    rows = np.concatenate([place, speed, goal - place, others.reshape(*place.shape[:3], -1)], -1)
+    far = np.linalg.norm(others, axis=-1).min(-1)
+    causes_of = np.stack([far < NEAR, np.linalg.norm(place, axis=-1) < POST, speed[..., 0] > FAST], -1)
+    return rows.astype(np.float32), causes_of[:, 1:]
+
+
+@pytest.fixture(scope="module")
+def logged():
+    rows, unsafe = walks()
+    x = rows[:, 1:].reshape(-1, N, rows.shape[-1])
+    return x, unsafe.any(-1).reshape(-1, N), np.repeat(np.arange(len(rows)), STEPS)
+
+
+@pytest.mark.parametrize("each", [False, True])
+def test_every_cause_is_found_and_no_other(logged, each):
+    """A pair, a place and a speed, by one cost of the team or by each agent's own; goals are left out."""
+    x, unsafe, episode = logged
+    found, cells = causes.find(x, unsafe if each else unsafe.any(1), episode, NAMES)
+    assert {c.name for c in found.causes} == {"length of other.dx, other.dy", "own.x, own.y", "own.v"} or {
+        c.name for c in found.causes
+    } == {"length of other.dx, other.dy", "length of own.x, own.y", "own.v"}
+    edges = {c.name: edge for c, edge in zip(found.causes, found.edges)}
+    assert abs(edges["length of other.dx, other.dy"].at - NEAR) < 0.05 and edges["length of other.dx, other.dy"].below
+    assert abs(edges["own.v"].at - FAST) < 0.02 and not edges["own.v"].below
+    assert found.told > 0.75 and found.mistaken < 0.05 and len(cells) == 3
+
+
+def test_causes_are_found_without_names(logged):
+    x, unsafe, episode = logged
+    found, _ = causes.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])
+    entries = {c.things[0] for c in found.causes}
+    assert {(5, 6), (7, 8), (2,), (0, 1)} == entries
+
+
+def test_danger_that_nothing_tells_has_no_cause(logged):
+    x, unsafe, episode = logged
+    chance = np.random.default_rng(0).random(len(x)) < 0.05
+    assert causes.find(x, chance, episode, NAMES)[0].causes == ()
+
+
+def test_what_nobody_visited_is_as_unsafe_as_it_should_be(logged):
+    """Nearer than anybody came is unsafe, farther away is safe; a place that nobody saw is not trusted."""
+    x, unsafe, episode = logged
+    _, cells = causes.find(x, unsafe.any(1), episode, NAMES)
+    by_name = {one.cause.name: one for one in cells}
+    pair = by_name["length of other.dx, other.dy"]
+    values, bad = pair.beyond(500, np.random.default_rng(0))
+    assert not bad[values[:, 0] > 1.0].any() and bad[values[:, 0] < 0.5 * NEAR].all()
+    place = next(one for name, one in by_name.items() if "own.x" in name)
+    if place.cause.width == 2:
+        values, bad = place.beyond(500, np.random.default_rng(0))
+        assert bad[np.abs(values).max(1) > 5].all()
+
+
+def test_scores_of_causes_read_what_they_name(logged):
+    x, unsafe, episode = logged
+    found, _ = causes.find(x, unsafe.any(1), episode, NAMES)
+    nets = blank(found.causes, 8, jax.random.key(0))
+    for net in nets:
+        scores = net.scores(jnp.asarray(x[:5]))
+        assert scores.shape == (5, N, len(net.cause.things))
+        np.testing.assert_allclose(net.of_values(jnp.asarray(net.cause.of(x[:5]))), scores, atol=1e-4)
+
+
+# --- a World of them ---
+
+QUICK = dict(num_ensemble=2, dynamics_updates=400, dynamics_width=32, value_updates=50, future_updates=100)
+
+
+def store_of(episodes=200, unsafe=None, **card):
+    rows, why = walks(episodes)
+    actions = np.diff(rows[..., :2], axis=1)
+    costs = (why.any(-1) if unsafe is None else unsafe(why)).any(-1)
+    card = {"task": "walks", "observation_names": NAMES, **card}
+    return EpisodeStore.from_episodes(rows, actions / 0.8, np.zeros(costs.shape), costs.astype(float), card=card)
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    return fit(store_of(), **QUICK, barrier_updates=1500)
+
+
+def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
+    from ringfence import world
+
+    card = fitted.card
+    assert card.barrier.recall > 0.97 and card.barrier.auroc > 0.99
+    assert card.barrier.probed == 1.0, "somebody inside the radius is unsafe, at rest and closing"
+    assert "Causes of danger" in str(card) and str(card).splitlines()[-1].startswith("VERDICT ")
+    assert len(card.causes[""].causes) == len(fitted.barrier.causes) == 3
+    again = world.load(world.save(fitted, tmp_path / "w.safetensors"))
+    assert again.card == card
+    x = again.map(jnp.asarray(walks(5)[0]), None)
+    np.testing.assert_array_equal(again.barrier.of_steps(x, x), fitted.barrier.of_steps(x, x))
+
+
+def test_networks_on_all_entries_are_a_setting():
+    plain = fit(store_of(60), **QUICK, barrier_updates=50, causes=False)
+    assert plain.card.causes == {"": causes.Found()} and not plain.barrier.causes and plain.barrier.label
+
+
+def test_a_world_that_is_unfit_is_refused_unless_one_insists():
+    chance = np.random.default_rng(3)
+    world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK, barrier_updates=50)
+    assert world.card.verdict.word == "unfit"
+    still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
+    with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
+        guard(still, world)
+    assert guard(still, world, anyway=True).act(walks(1)[0][0, 0]).shape == (N, 2)
+
+
+def test_verdicts_give_their_reasons():
+    good = BarrierScores(entries=100, recall=0.99, margin_kept=0.9, probed=1.0)
+    data = Data(task="t", hazard={})
+    assert verdict.judge(Card(data=data, barrier=good)) == Verdict("fit")
+    cases = (
+        (dict(entries=10), "weak", "only 10 held-out steps enter danger"),
+        (dict(entries=2), "unfit", "only 2 held-out steps enter danger"),
+        (dict(recall=0.5), "unfit", "only 50.0% of unsafe steps are found"),
+        (dict(margin_kept=0.01), "unfit", "only 1.0% of safe steps keep the margin"),
+        (dict(probed=0.5), "unfit", "only 50.0% of states inside the radius are called unsafe"),
+        (dict(warning="no held-out step is unsafe"), "unfit", "no held-out step is unsafe"),
+    )
+    for changes, word, reason in cases:
+        found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, **changes)))
+        assert found.word == word and found.reasons == (reason,) and found.remedies
+    blind = PredictionError(steps_ahead=(1,), error_of_change=(1.3,), by_entry={}, coasting=(0.9,))
+    found = verdict.judge(Card(data=data, barrier=good, prediction_error=blind))
+    assert found.word == "weak" and "constant velocity errs by 90%" in found.reasons[0]
+
+
+def test_episodes_with_danger_are_held_out_like_the_others():
+    store = store_of(100)
+    unsafe = np.zeros(store.steps, bool)
+    unsafe[::STEPS][:20] = True  # the first step of twenty episodes
+    out = held_out(store, 0, unsafe)
+    assert out[:20].sum() == 6 and out[20:].sum() == 8, "three tenths of the few dangerous ones, a tenth of the rest"
+    assert held_out(store, 0, np.zeros(store.steps, bool)).sum() == 10
+
+
+def test_velocities_follow_from_speed_and_heading():
+    """`otherJ.dvx` is the other's v cos less one's own, so it is predicted from what everybody does."""
+    rng = np.random.default_rng(0)
+    steps = 60
+    turn = np.cumsum(rng.normal(0, 0.2, (steps, 2)), 0)
+    speed = rng.uniform(0, 1, (steps, 2))
+    velocity = speed[..., None] * np.stack([np.cos(turn), np.sin(turn)], -1)
+    other = velocity[:, ::-1] - velocity
+    rows = np.concatenate([speed[..., None], np.cos(turn)[..., None], np.sin(turn)[..., None], other], -1)
+    names = ("own.v", "own.cos", "own.sin", "other0.dvx", "other0.dvy")
+    found = features.from_data("pruned", rows.astype(np.float32), None, names, ())
+    assert found.follows == (3, 4)
+    guess = jnp.asarray(rows, jnp.float32).at[1:, :, 3:].set(0.0)
+    np.testing.assert_allclose(found.agreed(guess[None])[0], rows, atol=1e-5)
+    assert features.from_dict(features.to_dict(found)) == found
+
+
+def test_a_far_sighted_guard_looks_as_far_as_the_card_asks(fitted):
+    from ringfence.guards.policy import far_sighted
+    from ringfence.world.card import Avoidable
+
+    def seen(rows, avoided, error):
+        barrier = BarrierScores(avoidable=Avoidable(before=(1, 3, 10), avoided=avoided, rows=rows))
+        prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={})
+        card = Card(data=fitted.card.data, barrier=barrier, prediction_error=prediction)
+        return far_sighted(dataclasses.replace(fitted, card=card))
+
+    assert seen(10, (0.1, 0.4, 0.9), 0.1)["shield"] == {"horizon": 10}
+    assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
+    assert seen(10, (0.1, 0.4, 0.9), 0.8) == {}, "rows that are predicted badly see nothing"
