@@ -103,8 +103,9 @@ def _put(
 
 def _speed_entries(names: Sequence[str], place: np.ndarray) -> np.ndarray | None:
     """Where the relative velocity of that thing stands, as names tell."""
-    wanted = [names[int(d)].replace(".d", ".dv") for d in place]
-    if any(name not in names for name in wanted):
+    given = [names[int(d)] for d in place]
+    wanted = [name.replace(".d", ".dv") for name in given]
+    if any(name not in names or name in given for name in wanted):
         return None
     return np.array([list(names).index(name) for name in wanted])
 

@@ -33,7 +33,7 @@ from ringfence.world.model import World
 from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 9  # of the validation: cached cards of another are made again
+VERSION = 10  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
