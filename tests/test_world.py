@@ -102,7 +102,7 @@ def test_the_card_says_how_far_ahead_danger_is_decided():
     arrays |= {"row": np.arange(20), "first_row": np.zeros(20, int), "last_row": np.full(20, 20)}
     entered = np.array([19])  # the step that ends with a gap below 0
     found = validate._avoidable(Head(), Head(), arrays, entered)
-    assert found.before == validate.BEFORE and found.rows == 7
+    assert found.before == validate.BEFORE[:-1] and found.rows == 7  # the log is 20 steps long
     assert found.avoided == (0, 0, 0, 0, 1, 1, 1, 1)
 
 

@@ -1,0 +1,88 @@
+"""The proving ground in one seed and few episodes: is danger learned from a cost column alone, and kept?
+
+    python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 100]
+
+For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
+of a clone and of the naive driver, alone, under `shield` by what was learned, and under `shield` by the oracle, which
+knows the dynamics and the distances. `ringfence bench proving-ground` plays all rows with 500 episodes.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import ringfence
+from ringfence.datasets.make import make
+from ringfence.datasets.registry import TASKS
+from ringfence.envs.proving.suite import TEST
+from ringfence.errors import UserError
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.training import worlds
+
+ROWS = (("none", None), ("shield", "learned"), ("shield", "oracle"))
+COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
+
+
+def row(run, guard: str, barrier: str | None, episodes: int) -> dict:
+    options = {} if barrier is None else {"guard": guard, "barrier": barrier, "anyway": True}
+    begun = time.perf_counter()
+    found = evaluate(run, episodes=episodes, **options)
+    kept = {name: found[name] for name in COLUMNS if name in found}
+    return kept | {"seconds": round(time.perf_counter() - begun, 1)}
+
+
+def system(task: str, runs: Path, episodes: int) -> dict:
+    begun = time.perf_counter()
+    store, _ = make(TASKS[task])
+    bc = ringfence.train("bc", store, out=str(runs), quiet=True)[0]
+    naive = ringfence.train("naive", store, out=str(runs), quiet=True)[0]
+    fitted = time.perf_counter()
+    card = worlds.fit(store, seed=0).card
+    seconds = {"made and trained": fitted - begun, "fitted": time.perf_counter() - fitted}
+    found = {
+        "task": task,
+        "logs": {
+            "return_mean": float(store.returns.mean()),
+            "violation_rate": float((store.episode_costs > 0).mean()),
+            "unsafe_share": card.barrier.unsafe_share,
+        },
+        "verdict": card.verdict.word,
+        "reasons": list(card.verdict.reasons),
+        "causes": [cause.name for found in card.causes.values() for cause in found.causes],
+        "shape": card.shape,
+        "recall": card.barrier.recall,
+        "auroc": card.barrier.auroc,
+        "margin_kept": card.barrier.margin_kept,
+        "probed": card.barrier.probed,
+        "horizon": card.barrier.avoidable.rows if card.barrier.avoidable else None,
+        "seconds": {name: round(value, 1) for name, value in seconds.items()},
+        "rows": {},
+    }
+    for name, run in (("bc", bc), ("naive", naive)):
+        for guard, barrier in ROWS:
+            label = f"{name} {guard}" + (f" {barrier}" if barrier else "")
+            try:
+                found["rows"][label] = row(run, guard, barrier, episodes)
+            except UserError as error:
+                found["rows"][label] = {"refused": str(error)}
+    return found
+
+
+def main() -> None:
+    reader = argparse.ArgumentParser(description=__doc__)
+    reader.add_argument("out", type=Path)
+    reader.add_argument("--tasks", nargs="*", default=[f"proving-{name}" for name in TEST], choices=sorted(TASKS))
+    reader.add_argument("--episodes", type=int, default=100)
+    reader.add_argument("--runs", type=Path, default=Path("runs"))
+    given = reader.parse_args()
+    given.out.mkdir(parents=True, exist_ok=True)
+    for task in given.tasks:
+        found = system(task, given.runs, given.episodes)
+        (given.out / f"{task}.json").write_text(json.dumps(found, indent=1) + "\n")
+        shown = {name: f"{r.get('violation_rate', -1):.2f} / {r.get('return_mean', 0):.2f}" for name, r in found["rows"].items()}
+        print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", shown, flush=True)
+
+
+if __name__ == "__main__":
+    main()
