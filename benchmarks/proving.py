@@ -24,7 +24,7 @@ ROWS = (("none", None), ("shield", "learned"), ("shield", "oracle"))
 COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
 
 
-def row(run, guard: str, barrier: str | None, episodes: int) -> dict:
+def played(run, guard: str, barrier: str | None, episodes: int) -> dict:
     options = {} if barrier is None else {"guard": guard, "barrier": barrier, "anyway": True}
     begun = time.perf_counter()
     found = evaluate(run, episodes=episodes, **options)
@@ -63,7 +63,7 @@ def system(task: str, runs: Path, episodes: int) -> dict:
         for guard, barrier in ROWS:
             label = f"{name} {guard}" + (f" {barrier}" if barrier else "")
             try:
-                found["rows"][label] = row(run, guard, barrier, episodes)
+                found["rows"][label] = played(run, guard, barrier, episodes)
             except UserError as error:
                 found["rows"][label] = {"refused": str(error)}
     return found
@@ -80,8 +80,9 @@ def main() -> None:
     for task in given.tasks:
         found = system(task, given.runs, given.episodes)
         (given.out / f"{task}.json").write_text(json.dumps(found, indent=1) + "\n")
-        shown = {name: f"{r.get('violation_rate', -1):.2f} / {r.get('return_mean', 0):.2f}" for name, r in found["rows"].items()}
-        print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", shown, flush=True)
+        print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
+        for label, row in found["rows"].items():
+            print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
 
 
 if __name__ == "__main__":
