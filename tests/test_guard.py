@@ -269,7 +269,9 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
     ):
         load(run, guard="shield", world=alone)
     same = worlds.fit(small_store, **QUICK_WORLD)
-    result = evaluate(run, episodes=2, guard="shield", world=same)
+    with pytest.raises(UserError, match="unfit to guard by"):
+        evaluate(run, episodes=2, guard="shield", world=same)
+    result = evaluate(run, episodes=2, guard="shield", world=same, anyway=True)
     assert result["guard"] == "shield" and result["barrier"] == "learned" and 0 <= result["infeasible_rate"] <= 1
     assert registry.get("simple_spread-random").name == result["task"]
 

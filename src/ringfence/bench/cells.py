@@ -18,7 +18,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,7 @@ class Cell:
         if algos.get(self.algorithm).cost_source(self.config) != "nothing":
             return None
         other = registry.paired(self.task)
-        return None if other is None else dataclasses.replace(self, task=other)
+        return None if other is None else replace(self, task=other)
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
         """Evaluations that the folder does not hold yet."""
@@ -395,7 +395,9 @@ class _Group:
         trained = time.perf_counter() - self.begun
         for _, name in cell.missing(self.out, self.episodes):
             num_recorded = 4 if cell.seed == 0 else 0
-            evaluate_spec(PolicySpec.parse(name, run), episodes=self.episodes, num_recorded=num_recorded)
+            # A benchmark measures what an unfit World is worth, too.
+            spec = replace(PolicySpec.parse(name, run), anyway=True)
+            evaluate_spec(spec, episodes=self.episodes, num_recorded=num_recorded)
         played = time.perf_counter() - self.begun - trained
         _record(cell, self.out, "done", self._took(cell, trained, played))
         self.tell("done", self.left.pop(0))
