@@ -53,7 +53,7 @@ def test_every_cause_is_found_and_no_other(logged, each):
     edges = {c.name: edge for c, edge in zip(found.causes, found.edges)}
     assert abs(edges["length of other.dx, other.dy"].at - NEAR) < 0.05 and edges["length of other.dx, other.dy"].below
     assert abs(edges["own.v"].at - FAST) < 0.02 and not edges["own.v"].below
-    assert found.told > 0.75 and found.mistaken < 0.05 and len(cells) == 3
+    assert found.explained > 0.75 and found.false_alarms < 0.05 and len(cells) == 3
 
 
 def test_causes_are_found_without_names(logged):

@@ -191,7 +191,7 @@ def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
     seen, state = small_store.observations[:2], small_store.state[:2]
     memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))
     assert (memory["margin"] == np.float32(0.6)).all()  # nobody chose the first state
-    memory, _ = policy.act(policy.hear(memory, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
+    memory, _ = policy.act(policy.observe_cost(memory, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
     o = policy.guard.options
     expected = 0.6 + o.adapt * (np.array([0.0, 1.0]) - o.rate)
     np.testing.assert_allclose(memory["margin"][:, 0], expected, rtol=1e-5)

@@ -100,8 +100,8 @@ class PolicyStep(NamedTuple):
 class Policy(Protocol):
     """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
 
-    A policy may have `hear(memory, cost) -> memory`: it then hears the cost (B,) of every step. One that knows
-    several steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions
+    A policy may have `observe_cost(memory, cost) -> memory`: it then observes the cost (B,) of every step. One that
+    knows several steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions
     (B, P, K, N, A) in [−1, 1], info), which guards choose from.
     """
 
@@ -114,7 +114,7 @@ class Policy(Protocol):
 class ObservesCost(Protocol):
     """A policy that observes what every step cost, (B,) or (B, N), or that by constraint, and remembers it."""
 
-    def hear(self, memory: PyTree, cost: Any) -> PyTree: ...
+    def observe_cost(self, memory: PyTree, cost: Any) -> PyTree: ...
 
 
 @runtime_checkable

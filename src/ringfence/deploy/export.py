@@ -36,7 +36,7 @@ from ringfence.guards import Guarded
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem.homogeneous import agent_policy
-from ringfence.proposals.base import heard
+from ringfence.proposals.base import with_cost
 from ringfence.training import worlds
 from ringfence.training.job import Job
 from ringfence.training.runs import Run
@@ -179,7 +179,7 @@ def _trace(job: Job, policy: Policy) -> _Traced:
     def act(key: Key, seen_arrays: Sequence[Array], leaves: Sequence[Array]) -> tuple[dict[str, Array], list[Array]]:
         read = dict(zip(seen, seen_arrays))
         costs = {name: read["cost"][k : k + 1] for k, name in enumerate(constraints)}
-        memory = heard(policy, jax.tree.unflatten(structure, leaves), costs or read["cost"][None])
+        memory = with_cost(policy, jax.tree.unflatten(structure, leaves), costs or read["cost"][None])
         state = read["state"][None] if "state" in read else None
         memory, step = policy.act(memory, read["observations"][None], state, key)
         info = {f"info.{k}": step.info[k][0] for k in INFO if k in step.info and step.info[k].ndim == 1}

@@ -16,7 +16,7 @@ from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
 from ringfence.guards import Pilot
-from ringfence.proposals.base import heard
+from ringfence.proposals.base import with_cost
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key
 from ringfence.utils.compilation import keep_programs
@@ -191,7 +191,7 @@ class Table:
             if any(e.lacks_cost for e in self.episodes if not e.skipped):
                 self._charge_by_formula()
             with float32():
-                memory = heard(policy, memory, self._last_costs())
+                memory = with_cost(policy, memory, self._last_costs())
         return key
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray | None]:

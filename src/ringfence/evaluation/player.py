@@ -119,7 +119,7 @@ class _OneByOne:
     def __init__(self, policy: Callback):
         self.policy = policy
         self.start = policy.start
-        self.hear = policy.hear
+        self.observe_cost = policy.observe_cost
 
     def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         function = self.policy.function

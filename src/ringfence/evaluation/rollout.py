@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.envs.base import Env, NativeEnv, Outcome
 from ringfence.errors import UserError
-from ringfence.proposals.base import act_with, heard
+from ringfence.proposals.base import act_with, with_cost
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils.progress import Progress
 
@@ -68,7 +68,7 @@ def _compiled(env: Env, reset_key: Key, act_key: Key) -> Callable[[Policy, int, 
             memory, state = carry
             memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
-            memory = heard(policy, memory, out.cost)
+            memory = with_cost(policy, memory, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
             if out.cost.ndim == 2:
                 kept["violated"] = out.cost > 0
@@ -141,7 +141,7 @@ def _rollout_native(
             lengths += running
             outcomes.append(simulation.step(np.asarray(decided.action)))
             states.append(simulation.state().astype(np.float32))
-            memory = heard(policy, memory, outcomes[-1].cost)
+            memory = with_cost(policy, memory, outcomes[-1].cost)
             counted.append({name: np.asarray(value) & running for name, value in _counted(decided).items()})
             if num_recorded:
                 drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})

@@ -63,7 +63,7 @@ class Guarded(eqx.Module):
             memory["costs"] = jnp.full((batch, constraints), jnp.nan)
         return memory
 
-    def hear(self, memory: PyTree, cost: Cost) -> PyTree:
+    def observe_cost(self, memory: PyTree, cost: Cost) -> PyTree:
         """The memory with the cost of the last step, (B,) or (B, N), or of each constraint by its name: an adapting
         margin follows it. Without a cost the margin follows the guard's own judgement of the step. A cost that names
         none of several constraints is charged to those that judge the step unsafe, or to all."""
@@ -145,7 +145,7 @@ class Guarded(eqx.Module):
 
 
 def costs_of_one(cost: Paid, agents: int) -> np.ndarray | dict[str, np.ndarray]:
-    """What one environment's step cost, as `hear` takes it; what is no cost is refused."""
+    """What one environment's step cost, as `observe_cost` takes it; what is no cost is refused."""
     given = cost_given(cost, agents)
     if isinstance(given, dict):
         return {name: np.full(1, one, np.float32) for name, one in given.items()}

@@ -38,7 +38,7 @@ class Callback:
 
     @property
     def _team(self) -> Any:
-        """Who hears of costs: one guard, or that of each agent."""
+        """Who observes costs: one guard, or that of each agent."""
         return team_policy(self.guarded, self.agents, self.guarded.guard.world.spec.homogeneous)
 
     @in_float32
@@ -46,8 +46,8 @@ class Callback:
         return self._team.start(batch)
 
     @in_float32
-    def hear(self, memory: PyTree, cost) -> PyTree:
-        return self._team.hear(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
+    def observe_cost(self, memory: PyTree, cost) -> PyTree:
+        return self._team.observe_cost(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
 
     def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
@@ -140,7 +140,7 @@ class Pilot:
             paid = None if cost is None else costs_of_one(cost, self.policy.agents)
             # Copies: a function that writes into what it sees must not blind its guard.
             wanted = self.policy.function(seen.copy(), None if whole is None else whole.copy())
-            memory = self._memory if paid is None else self.policy.hear(self._memory, paid)
+            memory = self._memory if paid is None else self.policy.observe_cost(self._memory, paid)
             key, now = jax.random.split(self._key)
             shown = seen[None], None if whole is None else whole[None]
             memory, step = self.policy.decided(memory, *shown, [wanted], now)

@@ -8,7 +8,7 @@ import numpy as np
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.guards.policy import Paid, acted, costs_of_one, no_safe_action
 from ringfence.loading.resolve import load
-from ringfence.proposals.base import act_with, heard
+from ringfence.proposals.base import act_with, with_cost
 from ringfence.training.runs import Run
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as
@@ -53,7 +53,7 @@ class Controller:
             seen, whole = self._seen(observations, state)
             memory = self._memory
             if cost is not None:
-                memory = heard(self.policy, memory, costs_of_one(cost, self.job.team))
+                memory = with_cost(self.policy, memory, costs_of_one(cost, self.job.team))
             key, now = jax.random.split(self._key)
             whole = None if whole is None else whole[None]
             memory, step = self._act(self.policy, memory, seen[None], whole, now)

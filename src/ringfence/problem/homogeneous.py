@@ -31,7 +31,7 @@ class PerAgent(eqx.Module):
         batch, agents = observations.shape[:2]
         return memory, merge_agents(step, (batch, agents))
 
-    def hear(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+    def observe_cost(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
         """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
         if not isinstance(self.one, ObservesCost):
             return memory
@@ -41,8 +41,8 @@ class PerAgent(eqx.Module):
             return own.reshape(-1)
 
         if isinstance(cost, dict):
-            return self.one.hear(memory, {name: own(part) for name, part in cost.items()})
-        return self.one.hear(memory, own(cost))
+            return self.one.observe_cost(memory, {name: own(part) for name, part in cost.items()})
+        return self.one.observe_cost(memory, own(cost))
 
 
 def team_policy(policy: Any, agents: int, homogeneous: bool) -> Any:

@@ -84,10 +84,10 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
     return jnp.stack(actions, 1)[:, None]
 
 
-def heard(policy: Policy, memory: PyTree, cost: Any) -> PyTree:
+def with_cost(policy: Policy, memory: PyTree, cost: Any) -> PyTree:
     """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
     of NumPy or JAX."""
-    return policy.hear(memory, cost) if isinstance(policy, ObservesCost) else memory
+    return policy.observe_cost(memory, cost) if isinstance(policy, ObservesCost) else memory
 
 
 def act_with(policy: Policy, memory: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:

@@ -287,7 +287,7 @@ def _of_causes(card: Card) -> Iterator[str]:
         if parts:
             yield (
                 f"Causes of danger{of}, with the share of unsafe steps that each tells: {'; '.join(parts)}; together "
-                f"{percent(found.told, 3)}, and {percent(found.mistaken)} of the safe ones."
+                f"{percent(found.explained, 3)}, and {percent(found.false_alarms)} of the safe ones."
             )
 
 

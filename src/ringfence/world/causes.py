@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-VERSION = 2  # of the search: what was found by another is looked for again
+VERSION = 3  # of the search: what was found by another is looked for again
 CELLS = {1: 200, 2: 48, 3: 20, 4: 11}  # along each axis, by the number of entries, at most
 STEPS = 60_000  # that causes are looked for in
 MOST = 8  # causes
@@ -72,8 +72,8 @@ class Found(msgspec.Struct, frozen=True):
     """Causes of a data set, and how much of its danger they tell on steps that did not find them."""
 
     causes: tuple[Cause, ...] = ()
-    told: float = 0.0  # share of unsafe steps that a cause explains
-    mistaken: float = 0.0  # share of safe steps that a cause calls unsafe
+    explained: float = 0.0  # share of unsafe steps that a cause explains
+    false_alarms: float = 0.0  # share of safe steps that a cause calls unsafe
     shares: tuple[float, ...] = ()  # by cause: share of unsafe steps that it explains
     edges: tuple[Edge, ...] = ()  # by cause
 
@@ -441,6 +441,6 @@ def _summary(steps: _Steps, chosen: list[_Tried]) -> Found:
         called = safe[steps.tested] < limit
         return float(called[unsafe].mean()), float(called[~unsafe].mean())
 
-    told, mistaken = explained(_together(steps, chosen))
+    share, false_alarms = explained(_together(steps, chosen))
     shares = tuple(round(explained(one.safe)[0], 4) for one in chosen)
-    return Found(tuple(one.cells.cause for one in chosen), round(told, 4), round(mistaken, 4), shares)
+    return Found(tuple(one.cells.cause for one in chosen), round(share, 4), round(false_alarms, 4), shares)

@@ -41,7 +41,7 @@ from ringfence.world.storage import blank_barrier, blank_world, load, save
 from ringfence.world.verdict import judge
 
 FORMAT = 5  # of what is fitted: what is cached of another is made again
-TOLD = 0.7  # share of the unsafe steps that causes have to tell, or networks read all entries
+EXPLAINED = 0.7  # share of the unsafe steps that causes have to tell, or networks read all entries
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -228,7 +228,7 @@ def _causes(logged: Logged, moved: str, parts: _Parts) -> Found:
         return Found()
     content = [moved, causes.VERSION, _digest(logged.label)]
     found = parts.json("causes", content, Found, lambda: _found(logged, parts.seed)[0])
-    return found if found.told >= TOLD else Found()
+    return found if found.explained >= EXPLAINED else Found()
 
 
 def _found(logged: Logged, seed: int) -> tuple[Found, list[causes.Cells]]:

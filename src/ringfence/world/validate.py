@@ -33,7 +33,7 @@ from ringfence.world.model import World
 from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 10  # of the validation: cached cards of another are made again
+VERSION = 11  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
@@ -46,6 +46,7 @@ UNJUDGED = 5.0  # the margin of a barrier that held-out episodes say nothing of
 MARGINS = {0.0, 1.0, 2.0, 4.0, 8.0}  # that the card gives numbers of, beside the calibrated one
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin
+FEW = 5  # entries into danger, with fewer of which nothing is said
 OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
 BEFORE = (1, 2, 3, 5, 7, 10, 15, 20, 30)  # steps before danger at which it is asked whether it could still be avoided
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
@@ -252,7 +253,7 @@ def _barrier_scores(
     ends = _entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
     predicted = _predicted_scores(dynamics, barrier, logged, ends)
-    if len(predicted) < 2 * OUTLIERS:
+    if _count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
         warning = f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is told, or to set a margin"
         return BarrierScores(warning=warning), UNJUDGED
     if unit is None:
