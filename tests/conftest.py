@@ -82,8 +82,16 @@ def small_store(played) -> EpisodeStore:
 
 @pytest.fixture(scope="session")
 def small_world(small_store):
-    """The World of the small store. So little of it is unfit to guard by, which tests of guards insist on once."""
+    """The World of the small store."""
     from ringfence.training import worlds
-    from tests.quick import QUICK_WORLD, insisted
+    from tests.quick import QUICK_WORLD
 
-    return insisted(worlds.fit(small_store, **QUICK_WORLD))
+    return worlds.fit(small_store, **QUICK_WORLD)
+
+
+@pytest.fixture(autouse=True)
+def insist(request, monkeypatch):
+    """Worlds of tests are fitted in a second and unfit to guard by, so guards insist on them; but where a test is of
+    verdicts (`@pytest.mark.verdicts`)."""
+    if request.node.get_closest_marker("verdicts") is None:
+        monkeypatch.setattr("ringfence.guards.policy.require", lambda card, anyway=False: None)

@@ -103,7 +103,7 @@ def store_of(episodes=200, unsafe=None, **card):
     actions = np.diff(rows[..., :2], axis=1)
     costs = (why.any(-1) if unsafe is None else unsafe(why)).any(-1)
     card = {"task": "walks", "observation_names": NAMES, **card}
-    return EpisodeStore.from_episodes(rows, actions / 0.8, np.zeros(costs.shape), costs.astype(float), card=card)
+    return EpisodeStore.from_episodes(rows, actions / 0.8, actions.sum((-1, -2)), costs.astype(float), card=card)
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +130,7 @@ def test_networks_on_all_entries_are_a_setting():
     assert plain.card.causes == {"": causes.Found()} and not plain.barrier.causes and plain.barrier.label
 
 
+@pytest.mark.verdicts
 def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     chance = np.random.default_rng(3)
     world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK, barrier_updates=50)

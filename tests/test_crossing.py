@@ -25,7 +25,7 @@ from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save
 from ringfence.world.logged import held_out
-from tests.quick import QUICK_WORLD, insisted
+from tests.quick import QUICK_WORLD
 
 
 def lone(velocity, **room) -> tuple[Crossing, CrossingState]:
@@ -179,7 +179,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     """One set of weights for all agents, a World of what each of them sees, and a guard that hears of nobody."""
     monkeypatch.setattr(sys.modules["ringfence.evaluation.rollout"], "CHUNK", 2)
     run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
-    world = insisted(worlds.fit(logs, **QUICK_WORLD))
+    world = worlds.fit(logs, **QUICK_WORLD)
     assert world.alone and world.spec.n_agents == 1 and world.card.data.episodes == 20
     result = evaluate(run, episodes=2, guard="shield", world=world, agents=3, correction_steps=1, horizon=1)
     assert result["agents"] == 3 and result["execution"] == "decentralized" and 0 <= result["infeasible_rate"] <= 1
@@ -255,7 +255,7 @@ def test_own_logs_of_agents_who_are_alike(logs, tmp_path):
     card = {"observation_names": names, "hazard": logs.card.hazard, "task": "fleet", "homogeneous": True}
     mine = dataclasses.replace(logs, state=None, card=card)
     run = loop.train("bc", mine, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
-    world = insisted(worlds.fit(mine, **QUICK_WORLD))
+    world = worlds.fit(mine, **QUICK_WORLD)
     assert world.map.decentralized and world.map.dt == pytest.approx(0.1)  # as names and steps tell
     assert world.map.own == Crossing().feature_map("pruned").own
     world = worlds.load(save(world, tmp_path / "fleet.world"))

@@ -24,7 +24,7 @@ from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
-from tests.quick import QUICK_WORLD, insisted
+from tests.quick import QUICK_WORLD
 
 SHIELD = dict(guard="shield", horizon=1, correction_steps=3, margin=4.0)
 FULL = dict(guard="full", horizon=1, correction_steps=1, optimizer_steps=2, num_restarts=3, num_samples=1)
@@ -302,7 +302,7 @@ def test_metadata_is_json_where_nothing_was_told_yet(played, small_store, tmp_pa
     named = [played[name] for name in ("observations", "actions", "rewards")]
     store = EpisodeStore.from_episodes(*named, costs, card=card, **state)
     (run,) = loop.train("bc", store, changes={"num_updates": 4, "width": 16}, quiet=True, out=tmp_path)
-    options = {**SHIELD, "adapt": 0.1, "world": insisted(worlds.fit(store, labels="costs", **QUICK_WORLD))}
+    options = {**SHIELD, "adapt": 0.1, "world": worlds.fit(store, labels="costs", **QUICK_WORLD)}
     file = exporting.export(run, tmp_path / "p.stablehlo", "stablehlo", **options)
     with zipfile.ZipFile(file) as packed:
         metadata = json.loads(packed.read("metadata.json"), parse_constant=refuse)

@@ -254,6 +254,7 @@ def test_any_callable_is_guarded(small_world, small_store):
         ringfence.guard(lambda *_: 0, None)
 
 
+@pytest.mark.verdicts
 def test_a_world_of_other_data_is_refused(small_store, tmp_path):
     tiny = dict(changes={"num_updates": 2, "width": 8}, quiet=True, out=tmp_path)
     run = loop.train("bc", small_store, **tiny)[0]

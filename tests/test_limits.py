@@ -14,7 +14,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.report import build_report
 from ringfence.report.pooling import pool
 from ringfence.training import loop, worlds
-from tests.quick import QUICK_WORLD, insisted
+from tests.quick import QUICK_WORLD
 from tests.test_report import CONSTANTS, folder, result
 
 LIMITS = {"contact": 0.0, "fast": 20.0}
@@ -75,7 +75,7 @@ def charged(scale: float) -> EpisodeStore:
 def adapted(scale: float) -> tuple[np.ndarray, np.ndarray]:
     """(actions, margins) of a guard that hears of a cost at every step."""
     store = charged(scale)
-    pilot = ringfence.guard(lambda o, s: np.zeros((2, 2)), insisted(worlds.fit(store, **QUICK_WORLD)), guard="adapt")
+    pilot = ringfence.guard(lambda o, s: np.zeros((2, 2)), worlds.fit(store, **QUICK_WORLD), guard="adapt")
     actions, margins = [], []
     for t in range(10):
         actions.append(pilot.act(store.observations[t], cost={"hit": scale, "fast": scale}))
@@ -185,6 +185,6 @@ class Narrow:
 
 
 def test_a_simulator_that_does_not_take_what_a_policy_does_is_refused():
-    pilot = ringfence.guard(lambda o, s: np.zeros((2, 2)), insisted(worlds.fit(charged(1.0), **QUICK_WORLD)))
+    pilot = ringfence.guard(lambda o, s: np.zeros((2, 2)), worlds.fit(charged(1.0), **QUICK_WORLD))
     with pytest.raises(UserError, match="action space of a in Narrow is from -0.5 to 0.5, the policy acts"):
         ringfence.play(pilot, Narrow, episodes=1)
