@@ -33,7 +33,7 @@ from ringfence.world.model import World
 from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 11  # of the validation: cached cards of another are made again
+VERSION = 12  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
@@ -130,7 +130,7 @@ def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generat
         steps_ahead=tuple(range(1, ahead + 1)),
         error_of_change=tuple(round(float(v), 4) for v in share),
         by_entry={name: tuple(float(f"{error[k, d]:.3g}") for k in shown) for d, name in enumerate(logged.map.names)},
-        coasting=tuple(round(float(v), 4) for v in coasting),
+        coasting=tuple(round(float(v), 4) for v in coasting) if np.isfinite(coasting).all() else (),
     )
 
 
