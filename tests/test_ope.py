@@ -110,7 +110,8 @@ def test_pages_of_logs_and_of_policies_open_anywhere(run, logs, world, tmp_path,
     said, noted = capsys.readouterr()
     assert "'judge' is called 'ope' now" in noted
     assert "that it was trained on" in said and "danger is predicted within 3 steps" in said
-    app.main(["fit", str(file), "--report", str(tmp_path / "fit.html")])
+    with pytest.raises(SystemExit, match="3"):  # so little of a World is unfit to guard by
+        app.main(["fit", str(file), "--report", str(tmp_path / "fit.html")])
     for name in ("ope", "fit"):
         page = (tmp_path / f"{name}.html").read_text()
         assert "What a margin means" in page and "http" not in page and "mathdefault" not in page
