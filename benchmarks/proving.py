@@ -3,8 +3,9 @@
     python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 100]
 
 For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
-of a clone and of the naive driver, alone, under `shield` by what was learned, and under `shield` by the oracle, which
-knows the dynamics and the distances. `ringfence bench proving-ground` plays all rows with 500 episodes.
+of a clone and of the naive driver: alone, under `shield` by what was learned, the same with networks on all entries in
+the place of causes (`causes=False`, the one difference), and by the oracle, which knows dynamics and distances. The
+clone is also played with other horizons. `ringfence bench proving-ground` plays all rows with 500 episodes.
 """
 
 import argparse
@@ -20,16 +21,38 @@ from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.training import worlds
 
-ROWS = (("none", None), ("shield", "learned"), ("shield", "oracle"))
 COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
+LEARNED = {"guard": "shield", "anyway": True}
+# What a clone and the naive driver are played by; the World of `all` is fitted without a search for causes.
+ROWS = {
+    "none": {},
+    "shield learned": LEARNED,
+    "shield learned, networks on all entries": LEARNED | {"world": "all"},
+    "shield oracle": {"guard": "shield", "barrier": "oracle"},
+}
+# What a clone alone is played by, too: how far the guard looks.
+HORIZONS = {f"shield learned, {rows} rows": LEARNED | {"horizon": rows} for rows in (3, 15, 30)}
 
 
-def played(run, guard: str, barrier: str | None, episodes: int) -> dict:
-    options = {} if barrier is None else {"guard": guard, "barrier": barrier, "anyway": True}
+def played(run, options: dict, episodes: int) -> dict:
     begun = time.perf_counter()
     found = evaluate(run, episodes=episodes, **options)
     kept = {name: found[name] for name in COLUMNS if name in found}
     return kept | {"seconds": round(time.perf_counter() - begun, 1)}
+
+
+def described(card) -> dict:
+    """What a World says of itself."""
+    return {
+        "verdict": card.verdict.word,
+        "reasons": list(card.verdict.reasons),
+        "causes": [cause.name for found in card.causes.values() for cause in found.causes],
+        "recall": card.barrier.recall,
+        "auroc": card.barrier.auroc,
+        "margin_kept": card.barrier.margin_kept,
+        "probed": card.barrier.probed,
+        "horizon": card.barrier.avoidable.rows if card.barrier.avoidable else None,
+    }
 
 
 def system(task: str, runs: Path, episodes: int) -> dict:
@@ -47,25 +70,19 @@ def system(task: str, runs: Path, episodes: int) -> dict:
             "violation_rate": float((store.episode_costs > 0).mean()),
             "unsafe_share": card.barrier.unsafe_share,
         },
-        "verdict": card.verdict.word,
-        "reasons": list(card.verdict.reasons),
-        "causes": [cause.name for found in card.causes.values() for cause in found.causes],
-        "shape": card.shape,
-        "recall": card.barrier.recall,
-        "auroc": card.barrier.auroc,
-        "margin_kept": card.barrier.margin_kept,
-        "probed": card.barrier.probed,
-        "horizon": card.barrier.avoidable.rows if card.barrier.avoidable else None,
+        **described(card),
         "seconds": {name: round(value, 1) for name, value in seconds.items()},
         "rows": {},
     }
-    for name, run in (("bc", bc), ("naive", naive)):
-        for guard, barrier in ROWS:
-            label = f"{name} {guard}" + (f" {barrier}" if barrier else "")
+    every = worlds.fit(store, seed=0, causes=False)
+    found["networks on all entries"] = described(every.card)
+    for name, run, rows in (("bc", bc, ROWS | HORIZONS), ("naive", naive, ROWS)):
+        for label, options in rows.items():
+            given = options | {"world": every} if "world" in options else options
             try:
-                found["rows"][label] = played(run, guard, barrier, episodes)
+                found["rows"][f"{name} {label}"] = played(run, given, episodes)
             except UserError as error:
-                found["rows"][label] = {"refused": str(error)}
+                found["rows"][f"{name} {label}"] = {"refused": str(error)}
     return found
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -120,20 +120,36 @@ class Scene:
 
 def frames(env: Filmed, states: np.ndarray, moments: list[tuple[int, bool]]) -> Iterator[Image]:
     """Pictures of an episode, states (T+1, S), at `moments`: (step, whether somebody touched since the one before)."""
+    scene = Scene.of(env, states)
+
+    def draw(paper: ImageDraw, step: int) -> None:
+        scene.draw(paper, step, headings=env.body == "unicycle")
+
+    def caption(step: int, touches: int) -> str:
+        contact = f"{touches} steps of contact" if touches else "no contact"
+        return f"{step * env.dt:4.1f} s    {env.n_agents} agents    {contact}"
+
+    yield from captioned(moments, np.any(scene.touching, axis=1), draw, caption)
+
+
+def captioned(
+    moments: list[tuple[int, bool]],
+    bad: np.ndarray,
+    draw: Callable[[ImageDraw, int], None],
+    caption: Callable[[int, int], str],
+) -> Iterator[Image]:
+    """Pictures that `draw` makes of steps, under a line that says how many of the steps (T+1,) bool were bad so far."""
     from PIL import Image, ImageDraw, ImageFont
 
-    scene = Scene.of(env, states)
     font = ImageFont.load_default(13 * FINE)
-    touches = 0
+    count = 0
     before = 0
     for step, _ in moments:
         picture = Image.new("RGB", (SIZE * FINE, SIZE * FINE), PAPER)
-        draw = ImageDraw.Draw(picture)
-        scene.draw(draw, step, headings=env.body == "unicycle")
-        touches += int(scene.touching[before + 1 : step + 1].any(1).sum())
+        paper = ImageDraw.Draw(picture)
+        draw(paper, step)
+        count += int(bad[before + 1 : step + 1].sum())
         before = step
-        draw.rectangle((0, 0, SIZE * FINE, LABEL * FINE), fill=PAPER)
-        contact = f"{touches} steps of contact" if touches else "no contact"
-        text = f"{step * env.dt:4.1f} s    {env.n_agents} agents    {contact}"
-        draw.text((10 * FINE, 3 * FINE), text, fill=RED if touches else BLUE, font=font)
+        paper.rectangle((0, 0, SIZE * FINE, LABEL * FINE), fill=PAPER)
+        paper.text((10 * FINE, 3 * FINE), caption(step, count), fill=RED if count else BLUE, font=font)
         yield picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)

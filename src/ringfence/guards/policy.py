@@ -28,7 +28,7 @@ from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
 BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
-FARTHEST = 15  # rows: a correction of more is seldom found (docs/guard.md)
+FARTHEST = 15  # rows (benchmarks/proving.py plays more of them)
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps
 

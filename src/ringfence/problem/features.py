@@ -130,6 +130,17 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     return found
 
 
+def numbered(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
+    """Fields of each of several things that names number (`other0.dx`, `wall1.dy`), by kind and in order: their
+    entries."""
+    found: dict[str, dict[int, dict[str, int]]] = {}
+    for d, name in enumerate(names):
+        match = re.fullmatch(r"([a-z]+)(\d+)\.(\w+)", name)
+        if match:
+            found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
+    return {kind: [fields for _, fields in sorted(things.items())] for kind, things in found.items()}
+
+
 def headed(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """The velocity of an agent that tells its speed and heading: two products of entries, along x and y; none where
     it tells no such thing."""

@@ -31,7 +31,7 @@ import optax
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.constraints import least, lowest
-from ringfence.problem.features import FeatureMap
+from ringfence.problem.features import FeatureMap, numbered
 from ringfence.types import Array, Key
 from ringfence.world.cause_nets import CauseNet, blank, worst
 from ringfence.world.causes import Cause
@@ -170,15 +170,10 @@ def _own_but_place(name: str) -> bool:
 def _things(names: tuple[str, ...]) -> dict[str, list[tuple[int, ...]]]:
     """Entries of each other, obstacle or wall, by kind, in the order of their fields' names; of kinds whose things all
     have the same fields."""
-    found: dict[str, dict[int, dict[str, int]]] = {}
-    for d, name in enumerate(names):
-        match = re.fullmatch(r"([a-z]+)(\d+)\.(\w+)", name)
-        if match and match[1] in DANGEROUS:
-            found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
     kinds: dict[str, list[tuple[int, ...]]] = {}
-    for kind, things in found.items():
-        if len({tuple(sorted(fields)) for fields in things.values()}) == 1:
-            kinds[kind] = [tuple(fields[f] for f in sorted(fields)) for _, fields in sorted(things.items())]
+    for kind, things in numbered(names).items():
+        if kind in DANGEROUS and len({tuple(sorted(fields)) for fields in things}) == 1:
+            kinds[kind] = [tuple(fields[f] for f in sorted(fields)) for fields in things]
     return kinds
 
 
@@ -342,8 +337,9 @@ def fit_future(
     quiet: bool = True,
 ) -> Barrier:
     """V by in-sample backups y = (1 − γ) ℓ + γ min(ℓ, V̄(s')), y = ℓ where the task ended, with an upper expectile over
-    what the logs did, V̄ a slow copy. It begins as ℓ, which it never exceeds, where that reads states alone. A quarter
-    of every batch is of the steps `close` to danger; the rest is of all that are `picked`.
+    what the logs did, V̄ a slow copy. It begins as ℓ, which it never exceeds; from fresh weights where ℓ reads both ends
+    of steps, or causes. A quarter of every batch is of the steps `close` to danger; the rest is of all that are
+    `picked`.
     """
     key_nets, key_fit = jax.random.split(key)
     shape = _still(barrier.shape)

@@ -2,8 +2,8 @@
 
 Which agent and which cause made a step unsafe is not logged. Learning takes the soft minimum of all scores, from an
 average over causes to the sum of odds (noisy-or), with a small term by which every score explains the cost alone.
-Beyond what was ever visited a score is taught to be like the nearest visited place, so it has no pockets there: what
-lies deeper in a wall, nearer than any pair came, or faster than anybody drove is as unsafe as its edge.
+What was never visited is taught, too (`Cells.beyond`): a distance is as unsafe as the nearest one that was, and any
+other place is unsafe, whether it lies deeper in a wall or merely where nobody went.
 """
 
 from __future__ import annotations

@@ -13,16 +13,19 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from msgspec.structs import replace
+
+from ringfence.problem.features import numbered
 
 VERSION = 3  # of the search: what was found by another is looked for again
 CELLS = {1: 200, 2: 48, 3: 20, 4: 11}  # along each axis, by the number of entries, at most
-STEPS = 60_000  # that causes are looked for in
+UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
+SAFE_STEPS = 120_000  # likewise
 MOST = 8  # causes
 WIDEST = 4  # entries of one cause
 SUFFICIENT = 0.3  # share of unsafe steps, beyond what others explain, at which a cell is dangerous
@@ -31,12 +34,10 @@ SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
 SURE = 3.0  # standard errors, over episodes, by which a gain has to exceed nothing
 TESTED = 0.3  # share of the episodes that gains are measured on
-WHOLE = 1e-9  # least probability of an unexplained step
 BEYOND = 0.5  # of the range of what was seen: how far outside of it cells are taken to be like the nearest ones
 APART = 1.5  # cells from the nearest visited one, from which on a place counts as never visited
 NEARBY = 4.0  # cells, deviation of the places that are asked about close to visited ones
 VISITED = 3  # visits that make a cell known
-THINGS = r"([a-z]+?)(\d+)\.(\w+)"  # names of entries of one of several others, obstacles or walls
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -171,16 +172,11 @@ def offsets(names: Sequence[str]) -> list[Cause]:
 
 def _things(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
     """Fields of each thing, by kind: those that all of a kind have."""
-    found: dict[str, dict[int, dict[str, int]]] = {}
-    for d, name in enumerate(names):
-        match = re.fullmatch(THINGS, name)
-        if match:
-            found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
     kinds = {}
-    for kind, things in found.items():
-        shared = set.intersection(*[set(fields) for fields in things.values()])
+    for kind, things in numbered(names).items():
+        shared = set.intersection(*[set(fields) for fields in things])
         if shared:
-            kinds[kind] = [{f: fields[f] for f in fields if f in shared} for _, fields in sorted(things.items())]
+            kinds[kind] = [{f: d for f, d in fields.items() if f in shared} for fields in things]
     return kinds
 
 
@@ -198,26 +194,21 @@ def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
 def _wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     """The cause with one more entry of oneself, or of the same thing."""
     if cause.length:
-        cause = replaced(cause, length=False, name=cause.name.removeprefix("length of "))
+        cause = replace(cause, length=False, name=cause.name.removeprefix("length of "))
     if len(cause.things[0]) >= WIDEST:
         return
     things = _things(names)
     inside = {d for kind in things.values() for fields in kind for d in fields.values()}
     for d, name in enumerate(names):
         if d not in inside and d not in cause.things[0]:
-            yield replaced(cause, name=f"{cause.name}, {name}", things=tuple((*t, d) for t in cause.things))
+            yield replace(cause, name=f"{cause.name}, {name}", things=tuple((*t, d) for t in cause.things))
     for kind, each in things.items():
         if len(each) != len(cause.things) or not set(cause.things[0]) & set(each[0].values()):
             continue
         for field in each[0]:
             if each[0][field] not in cause.things[0]:
                 more = tuple((*t, thing[field]) for t, thing in zip(cause.things, each))
-                yield replaced(cause, name=f"{cause.name}, {kind}.{field}", things=more)
-
-
-def replaced(cause: Cause, **changes: object) -> Cause:
-    """The cause with other fields."""
-    return msgspec.structs.replace(cause, **changes)
+                yield replace(cause, name=f"{cause.name}, {kind}.{field}", things=more)
 
 
 # --- finding ---
@@ -271,29 +262,30 @@ def find(
         return Found(), []
     cells = [_counted(steps, one.cells.cause, _without(steps, chosen, one), everything=True) for one in chosen]
     edges = tuple(one.edge for one in cells)
-    return msgspec.structs.replace(_summary(steps, chosen), edges=edges), cells
+    return replace(_summary(steps, chosen), edges=edges), cells
 
 
 def _some(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.random.Generator) -> _Steps:
     """As many steps as are needed, whole episodes tested."""
-    bad = unsafe if unsafe.ndim == 1 else unsafe.any(1)
-    if len(x) > STEPS:
-        rows = np.flatnonzero(bad)
-        rows = rng.choice(rows, min(len(rows), STEPS // 2), replace=False)
-        kept = len(rows) / max(bad.sum(), 1)
-        # as many safe ones as belong to them, where there are too many
-        fine = np.flatnonzero(~bad)
-        fine = rng.choice(fine, min(len(fine), max(int(kept * len(fine)), STEPS - len(rows))), replace=False)
-        fine = fine[: STEPS * 2]
-        some = np.sort(np.concatenate([rows, fine]))
-    else:
-        some = np.arange(len(x))
+    bad = unsafe if unsafe.ndim == 1 else np.asarray(unsafe.any(1))
+    some = _sampled(bad, rng) if len(x) > SAFE_STEPS // 2 else np.arange(len(x))
     x = np.asarray(x[some], np.float32)
     flat = x.reshape(-1, x.shape[-1])
     flat = flat[:: max(1, len(flat) // 200_000)]
     low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
     tested_episodes = rng.random(int(episode.max()) + 1) < TESTED
     return _Steps(x, unsafe[some], tested_episodes[episode[some]], episode[some], low, high, {})
+
+
+def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rows of steps, in order: UNSAFE_STEPS of the unsafe ones at most, and the same share of the safe ones, at least
+    as many and at most SAFE_STEPS."""
+    rows = np.flatnonzero(bad)
+    rows = rng.choice(rows, min(len(rows), UNSAFE_STEPS), replace=False)
+    fine = np.flatnonzero(~bad)
+    share = len(rows) / max(bad.sum(), 1)
+    count = min(len(fine), SAFE_STEPS, max(int(share * len(fine)), UNSAFE_STEPS))
+    return np.sort(np.concatenate([rows, rng.choice(fine, count, replace=False)]))
 
 
 def _grown(steps: _Steps, names: Sequence[str]) -> list[_Tried]:

@@ -1,9 +1,11 @@
 """Fitting a World: per data set, settings and seed; parts are cached by content, so that data sets which differ in
-their costs alone share what does not depend on them, and an interrupted fit goes on with the part that it was at."""
+their costs alone, and hold out the same episodes, share what does not depend on them, and an interrupted fit goes on
+with the part that it was at."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
 import time
@@ -34,7 +36,7 @@ from ringfence.world import causes, dynamics, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Found
-from ringfence.world.logged import Logged, held_out, labels_of
+from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
@@ -113,15 +115,16 @@ def _fitted(
     if settings.execution == "decentralized":
         map = features.alone(map)
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
-    out = held_out(store, parts.seed, _unsafe_steps(labels))
+    out = held_out(store, parts.seed, unsafe_of(labels) if labels else None)
     logged = Logged.of(store, map, out, labels)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
 
     world = blank_world(map, spec, settings)
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
-    found_by = {name: _causes(logged.by(name), moved, parts) for name in labels}
-    each = [_barrier(logged.by(name), moved, acts, found, parts, quiet) for name, found in found_by.items()]
+    searches = {name: _Search(logged.by(name), parts.seed) for name in labels}
+    found_by = {name: _causes(search, moved, parts) for name, search in searches.items()}
+    each = [_barrier(search, moved, acts, found_by[name], parts, quiet) for name, search in searches.items()]
     barrier = None
     if each:
         barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
@@ -147,13 +150,6 @@ def _fitted(
     card = msgspec.structs.replace(card, verdict=judge(card))
     threshold = jnp.asarray(found.ood.threshold, jnp.float32)
     return dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
-
-
-def _unsafe_steps(labels: dict[str, np.ndarray]) -> np.ndarray | None:
-    """(T,) bool: unsafe for anybody by any constraint."""
-    if not labels:
-        return None
-    return np.logical_or.reduce([label if label.ndim == 1 else label.any(1) for label in labels.values()])
 
 
 def _data(store: EpisodeStore, several: bool) -> Data:
@@ -220,22 +216,34 @@ def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, qui
     return parts.get("values", [moved, logged.store.digest("rewards")], blank, fit)
 
 
-def _causes(logged: Logged, moved: str, parts: _Parts) -> Found:
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """The search for the causes of one constraint's danger, made at most once."""
+
+    logged: Logged
+    seed: int
+
+    @functools.cached_property
+    def result(self) -> tuple[Found, list[causes.Cells]]:
+        """What is found, and the cells of each cause."""
+        logged = self.logged
+        steps = logged.fitted_steps
+        rows = np.asarray(logged.arrays["row"])[steps] + 1
+        x = np.asarray(logged.arrays["features"][rows])
+        episode = logged.store.episode_of_step[steps]
+        return causes.find(x, logged.label[steps], episode, logged.map.names, self.seed)
+
+
+def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
     """The causes of one constraint's danger; none where it is not told by few entries, or is of a whole body."""
     settings = parts.settings
+    logged = search.logged
     plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
     if not plain or logged.map.shared_body or logged.map.joint:
         return Found()
     content = [moved, causes.VERSION, _digest(logged.label)]
-    found = parts.json("causes", content, Found, lambda: _found(logged, parts.seed)[0])
+    found = parts.json("causes", content, Found, lambda: search.result[0])
     return found if found.explained >= EXPLAINED else Found()
-
-
-def _found(logged: Logged, seed: int) -> tuple[Found, list[causes.Cells]]:
-    steps = logged.fitted_steps
-    rows = np.asarray(logged.arrays["row"])[steps] + 1
-    x = np.asarray(logged.arrays["features"][rows])
-    return causes.find(x, logged.label[steps], logged.store.episode_of_step[steps], logged.map.names, seed)
 
 
 def _digest(array: np.ndarray) -> str:
@@ -243,16 +251,17 @@ def _digest(array: np.ndarray) -> str:
 
 
 def _barrier(
-    logged: Logged, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts, quiet: bool
+    search: _Search, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts, quiet: bool
 ) -> cbf.Barrier:
     """ℓ and V of one constraint."""
     settings = parts.settings
+    logged = search.logged
     template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
     content = [moved, _digest(logged.label), causes.VERSION, msgspec.to_builtins(found)]
     steps = logged.fitted_steps
 
     def fit_label(key: Key) -> cbf.Barrier:
-        return _label(logged, acts, settings, found, key, parts.seed, quiet)
+        return _label(search, acts, settings, found, key, quiet)
 
     label = parts.get("label", content, template, fit_label)
 
@@ -273,9 +282,10 @@ def _barrier(
 
 
 def _label(
-    logged: Logged, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key, seed: int, quiet: bool
+    search: _Search, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key, quiet: bool
 ) -> cbf.Barrier:
     """ℓ of a data set, with the statistics that it reads by."""
+    logged = search.logged
     key_states, key_fit = jax.random.split(key)
     steps = logged.fitted_steps
     unsafe = logged.unsafe[steps]
@@ -288,7 +298,7 @@ def _label(
     blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
     if found.causes:
         nets = fit_causes(
-            _found(logged, seed)[1],
+            search.result[1],
             data,
             steps[unsafe],
             steps[~unsafe],
@@ -331,11 +341,10 @@ def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier
 def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
     if barrier is None:
         return "no barrier"
-    by_causes = [
-        net for one in (barrier.each if isinstance(barrier, cbf.MinBarrier) else (barrier,)) for net in one.causes
-    ]
-    if by_causes:
-        return "a network for each cause (" + "; ".join(net.cause.name for net in by_causes) + "), the worst one counts"
+    each = barrier.each if isinstance(barrier, cbf.MinBarrier) else (barrier,)
+    names = [net.cause.name for one in each for net in one.causes]
+    if names:
+        return f"a network for each cause ({'; '.join(names)}), the worst one counts"
     shape = barrier.shape
     if shape.pairs:
         kinds = ", ".join(f"{len(entries)} x {kind}" for kind, entries in shape.pairs)

@@ -58,7 +58,7 @@ class Logged:
     @functools.cached_property
     def unsafe(self) -> np.ndarray:
         """(T,) bool: unsafe for anybody."""
-        return self.label if self.label.ndim == 1 else np.logical_or.reduce(self.label, 1)
+        return unsafe_of(self.labels)
 
     @functools.cached_property
     def fitted_steps(self) -> np.ndarray:
@@ -101,6 +101,12 @@ class Logged:
 @jax.jit
 def _after(dynamics: Dynamics, before: Array, action: Array) -> Array:
     return dynamics.step(before, action)[0]
+
+
+def unsafe_of(labels: dict[str, np.ndarray]) -> np.ndarray:
+    """(T,) bool: unsafe for anybody by any of the constraints."""
+    each = [label if label.ndim == 1 else np.logical_or.reduce(label, 1) for label in labels.values()]
+    return np.logical_or.reduce(each)
 
 
 def held_out(store: EpisodeStore, seed: int, unsafe: np.ndarray | None = None) -> np.ndarray:

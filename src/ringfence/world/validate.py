@@ -295,9 +295,16 @@ def _margin(predicted: np.ndarray, safe: np.ndarray, miscoverage: float) -> floa
 
 
 def _count_entries(logged: Logged, bad: np.ndarray) -> int:
-    """Steps that entered danger, of those that are unsafe."""
-    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
-    return int(((row[bad] == first[bad]) | ~logged.unsafe[np.maximum(bad - 1, 0)]).sum())
+    """Times that somebody was in danger: steps that entered it, or began in it, of those that are unsafe."""
+    begins, entered = _entered(logged, bad)
+    return int((begins | entered).sum())
+
+
+def _entered(logged: Logged, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(begins an episode, follows a safe step) of unsafe steps, each (W,) bool."""
+    row, first = (np.asarray(logged.arrays[name])[bad] for name in ("row", "first_row"))
+    begins = row == first
+    return begins, ~begins & ~logged.unsafe[np.maximum(bad - 1, 0)]
 
 
 def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -326,9 +333,8 @@ def _score_ahead(barrier: Barrier | MinBarrier, after: Array) -> Array:
 def _entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
     """Steps that entered danger, of those that are unsafe. Those that were in it already say little of where it begins:
     where a log is nearly all unsafe, most of them lie far beyond. Few entries say nothing; then it is all of `bad`."""
-    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
-    entered = bad[(row[bad] > first[bad]) & ~logged.unsafe[np.maximum(bad - 1, 0)]]
-    return entered if len(entered) >= ENTRIES else bad
+    _, entered = _entered(logged, bad)
+    return bad[entered] if entered.sum() >= ENTRIES else bad
 
 
 def _predicted_scores(

@@ -98,8 +98,24 @@ class Body(Protocol):
         ...
 
 
+class AsItIs:
+    """What most bodies are: observed as they are, without a heading, drawn as a point."""
+
+    def show(self, pose: Array) -> Array:
+        return pose
+
+    def read(self, shown: Array) -> Array:
+        return shown
+
+    def ahead(self, pose: Array) -> Array | None:
+        return None
+
+    def joints(self, config: Array) -> Array:
+        return config[..., None, :]
+
+
 @dataclass(frozen=True)
-class Point:
+class Point(AsItIs):
     """A double integrator: pushed along every axis. In the plane, or (`line`) a car of a platoon."""
 
     line: bool = False
@@ -133,15 +149,6 @@ class Point:
     def steer(self, now: Motion, want: Array, cap: Array, plant: Plant) -> Array:
         return ((want - now.rate) / (SETTLED * plant.dt) + plant.drag * now.rate) * plant.mass
 
-    def show(self, pose: Array) -> Array:
-        return pose
-
-    def read(self, shown: Array) -> Array:
-        return shown
-
-    def ahead(self, pose: Array) -> Array | None:
-        return None
-
     def joints(self, config: Array) -> Array:
         if self.line:
             config = jnp.concatenate([config, jnp.zeros_like(config)], -1)
@@ -149,7 +156,7 @@ class Point:
 
 
 @dataclass(frozen=True)
-class Unicycle:
+class Unicycle(AsItIs):
     """Pushed along its heading, and turned. It does not back up."""
 
     axes: tuple[str, ...] = ("x", "y")
@@ -182,12 +189,9 @@ class Unicycle:
     def ahead(self, pose: Array) -> Array | None:
         return along(pose)
 
-    def joints(self, config: Array) -> Array:
-        return config[..., None, :]
-
 
 @dataclass(frozen=True)
-class Car:
+class Car(AsItIs):
     """A kinematic bicycle: it turns as it rolls, by a steering angle that follows what is asked for."""
 
     axes: tuple[str, ...] = ("x", "y")
@@ -227,12 +231,9 @@ class Car:
     def ahead(self, pose: Array) -> Array | None:
         return along(pose[..., :1])
 
-    def joints(self, config: Array) -> Array:
-        return config[..., None, :]
-
 
 @dataclass(frozen=True)
-class Quadrotor:
+class Quadrotor(AsItIs):
     """A quadrotor in a vertical plane: thrust along its own axis, and a pitch rate that follows what is asked for."""
 
     axes: tuple[str, ...] = ("x", "y")  # y is up
@@ -260,21 +261,9 @@ class Quadrotor:
         thrust = plant.mass[:, 0] * asked[..., 1] / jnp.maximum(jnp.cos(pitch), 0.5)
         return jnp.stack([thrust, 7.0 * (wanted - pitch) - 0.4 * now.pose[..., 1]], -1)
 
-    def show(self, pose: Array) -> Array:
-        return pose
-
-    def read(self, shown: Array) -> Array:
-        return shown
-
-    def ahead(self, pose: Array) -> Array | None:
-        return None
-
-    def joints(self, config: Array) -> Array:
-        return config[..., None, :]
-
 
 @dataclass(frozen=True)
-class Arm:
+class Arm(AsItIs):
     """An arm of two links in the plane, without gravity, moved by torques; arms stand in a row."""
 
     axes: tuple[str, ...] = ("q1", "q2")
@@ -314,15 +303,6 @@ class Arm:
         torque = jnp.stack([a * asked[..., 0] + b * asked[..., 1], b * asked[..., 0] + c * asked[..., 1]], -1)
         return torque * plant.mass + self._whirl(now.config, now.rate)
 
-    def show(self, pose: Array) -> Array:
-        return pose
-
-    def read(self, shown: Array) -> Array:
-        return shown
-
-    def ahead(self, pose: Array) -> Array | None:
-        return None
-
     def joints(self, config: Array) -> Array:
         n = config.shape[-2]
         foot = jnp.broadcast_to(in_a_row(n, self.spacing), (*config.shape[:-1], 2))
@@ -332,7 +312,7 @@ class Arm:
 
 
 @dataclass(frozen=True)
-class Motor:
+class Motor(AsItIs):
     """A shaft that a torque turns; motors stand in a row."""
 
     axes: tuple[str, ...] = ("angle",)
@@ -353,15 +333,6 @@ class Motor:
 
     def steer(self, now: Motion, want: Array, cap: Array, plant: Plant) -> Array:
         return (1.6 * (want - now.rate) + plant.drag * now.rate) * plant.mass
-
-    def show(self, pose: Array) -> Array:
-        return pose
-
-    def read(self, shown: Array) -> Array:
-        return shown
-
-    def ahead(self, pose: Array) -> Array | None:
-        return None
 
     def joints(self, config: Array) -> Array:
         foot = jnp.broadcast_to(in_a_row(config.shape[-2], self.spacing), (*config.shape[:-1], 2))

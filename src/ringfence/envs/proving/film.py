@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ringfence.envs.discs import FINE, HUES, LABEL, SIZE, TAIL
-from ringfence.envs.film import BLUE, DARK, EMPTY, PAPER, RED
+from ringfence.envs.discs import FINE, HUES, LABEL, SIZE, TAIL, captioned
+from ringfence.envs.film import BLUE, DARK, EMPTY, RED
 from ringfence.envs.proving.layout import Layout, SystemState
 
 if TYPE_CHECKING:
@@ -117,20 +117,10 @@ class Scene:
 
 def frames(scene: Scene, moments: list[tuple[int, bool]]) -> Iterator[Image]:
     """Pictures of an episode at `moments`: (step, whether there was a cost since the last)."""
-    from PIL import Image, ImageDraw, ImageFont
-
     system = scene.system
-    font = ImageFont.load_default(13 * FINE)
-    steps = 0
-    before = 0
-    for step, _ in moments:
-        picture = Image.new("RGB", (SIZE * FINE, SIZE * FINE), PAPER)
-        draw = ImageDraw.Draw(picture)
-        scene.draw(draw, step)
-        steps += int(scene.unsafe[before + 1 : step + 1].any(1).sum())
-        before = step
-        draw.rectangle((0, 0, SIZE * FINE, LABEL * FINE), fill=PAPER)
-        costs = f"{steps} unsafe steps" if steps else "safe"
-        text = f"{step * system.dt:4.1f} s    {system.n_agents} x {system.body}, {', '.join(system.danger)}    {costs}"
-        draw.text((10 * FINE, 3 * FINE), text, fill=RED if steps else BLUE, font=font)
-        yield picture.resize((SIZE, SIZE), Image.Resampling.LANCZOS)
+
+    def caption(step: int, unsafe: int) -> str:
+        costs = f"{unsafe} unsafe steps" if unsafe else "safe"
+        return f"{step * system.dt:4.1f} s    {system.n_agents} x {system.body}, {', '.join(system.danger)}    {costs}"
+
+    yield from captioned(moments, np.any(scene.unsafe, axis=1), scene.draw, caption)
