@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.datasets import behaviour, matd3
+from ringfence.datasets import behaviour, matd3, registry
 from ringfence.datasets.behaviour import (
     BehaviourPolicy,
     MATD3Config,
@@ -23,6 +23,7 @@ from ringfence.datasets.behaviour import (
     statistics,
     train_behaviour,
 )
+from ringfence.datasets.recipes import spread
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.errors import UserError
 
@@ -159,6 +160,38 @@ def test_shipped_tiers_match_the_public_returns(level, mean):
     assert policy.info["task"] == "simple_spread" and policy.info["level"] == level
 
 
+@pytest.mark.parametrize("level, mean", [("medium", 259.85), ("expert", 516.76)])
+def test_the_pools_policies_match_the_public_pools(level, mean):
+    """Five learners: the mean of the pool is that of the public sets of five seeds, and no two play alike."""
+    policies = [shipped_policy(level, lineage=k) for k in range(behaviour.LINEAGES)]
+    assert np.mean([p.info["return"] for p in policies]) == pytest.approx(mean, rel=0.02)
+    assert [p.info.get("lineage", 0) for p in policies] == list(range(5))
+    seen = ENV.observe(ENV.reset(jax.random.key(0), 200))
+    acts = np.stack([matd3.act(p.actors, seen) for p in policies])
+    assert min(np.abs(acts[a] - acts[b]).mean() for a in range(5) for b in range(a)) > 0.2
+
+
+@pytest.mark.parametrize("tier", ["expert", "medium-replay", "random"])
+def test_pooled_tiers_take_turns(tier):
+    """Episode e is of lineage e mod 5; the card says so, and the arrays hold nothing of it."""
+    task = registry.get(f"simple_spread-{tier}-pooled")
+    card = {"task": task.name}
+    store = task.recipe.collect(task, 12 * 25, 0, card)
+    assert store.episodes == 12 and store.card.task == task.name
+    assert ("drivers" in store.card.extra) == (tier != "random")
+    for k, episodes in ((0, [0, 5, 10]), (4, [4, 9])):
+        alone = spread._of_lineage(ENV, tier, len(episodes), 0, k)
+        rows = np.concatenate([np.arange(e * 25, e * 25 + 25) for e in episodes])
+        np.testing.assert_array_equal(store.actions[rows], alone["actions"].reshape(-1, 3, 2))
+
+
+def test_lineages_that_do_not_ship_are_refused():
+    with pytest.raises(UserError, match="no lineage 5; the package ships 0 to 4"):
+        shipped_policy("expert", lineage=5)
+    with pytest.raises(UserError, match="1 to 780 episodes"):
+        behaviour.shipped_replay(ENV, 781, 1)
+
+
 def test_random_tier_matches_the_public_returns():
     found = statistics(collect(ENV, "random", 2000, jax.random.key(5)))
     assert found["return_mean"] == pytest.approx(159.9, rel=0.05)
@@ -193,3 +226,5 @@ def test_shipped_files_are_small():
     for level in ("medium", "expert"):
         assert (behaviour.POLICIES / f"simple_spread-{level}.safetensors").stat().st_size < 100_000
     assert (behaviour.POLICIES / "simple_spread-medium-replay.npz").stat().st_size < 1_500_000
+    of_pools = [file for k in range(1, 5) for file in behaviour.POLICIES.glob(f"simple_spread-*-{k}.*")]
+    assert len(of_pools) == 12 and sum(file.stat().st_size for file in of_pools) < 1_000_000

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ringfence.cli.app import main
-from ringfence.datasets import registry
+from ringfence.datasets import behaviour, registry
 from ringfence.datasets.importers.omar import import_omar
 from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import StoreError, UserError
@@ -232,3 +232,46 @@ def test_other_hazards_and_bad_values(tmp_path, few):
         import_omar(folder)
     with pytest.raises(StoreError, match="fewer than one episode of 1000"):
         import_omar(folder, episode_length=1000)
+
+
+def test_seeds_are_pooled(tmp_path, few, capsys):
+    """One store of several seeds: their episodes one after the other, and on the card how many are whose."""
+    parts = [{name: x[:5] for name, x in few.items()}, {name: x[5:] for name, x in few.items()}]
+    folders = [write(tmp_path / "expert" / f"seed_{k}_data", part) for k, part in enumerate(parts)]
+    pool, whole = import_omar(folders), import_omar(write(tmp_path / "whole", few))
+    for name in ("observations", "state", "actions", "rewards", "costs", "truncated", "episode_ends"):
+        np.testing.assert_array_equal(getattr(pool, name), getattr(whole, name), err_msg=name)
+    assert pool.card.task == "simple_spread-expert-pooled"
+    assert pool.card.extra["episodes_of_driver"] == [5, 3]
+    assert pool.card.extra["drivers"] == [str(folder) for folder in folders]
+    out = tmp_path / "pool.h5"
+    main(["data", "import-omar", *map(str, folders), "--out", str(out)])
+    assert EpisodeStore.load(out).card == pool.card
+    main(["data", "import-omar", str(folders[0]), "--out", str(out)])
+    assert EpisodeStore.load(out).card.task == "simple_spread-expert"
+
+
+def test_seeds_that_disagree_are_refused(tmp_path, few):
+    first = write(tmp_path / "expert" / "seed_0_data", few)
+    other = write(tmp_path / "expert" / "seed_1_data", few)
+    with pytest.raises(StoreError, match="No directory was given"):
+        import_omar([])
+    with pytest.raises(StoreError, match="given twice; name every seed once"):
+        import_omar([first, other, first])
+    with pytest.raises(StoreError, match="is of simple_spread-expert, '.*' of simple_spread-medium; pool one tier"):
+        import_omar([first, write(tmp_path / "medium" / "seed_1_data", few)])
+    with pytest.raises(StoreError, match="do not both hold next_obs"):
+        import_omar([first, write(tmp_path / "expert" / "seed_2_data", few, following=False)])
+    env = SimpleSpread(n_agents=4)
+    wide = behaviour.collect(env, "random", 2, jax.random.key(0))
+    with pytest.raises(StoreError, match="holds 4 agents, '.*' 3; pool seeds of one team"):
+        import_omar([first, write(tmp_path / "expert" / "seed_3_data", wide)])
+    for i in range(3):
+        change(other / f"acs_{i}.npy", lambda a: a / 2)
+    with pytest.raises(StoreError, match="seed_1_data' moves differently from .*seed_0_data', so action bounds"):
+        import_omar([first, other])
+    for i in range(3):
+        change(other / f"acs_{i}.npy", lambda a: a * 2)
+        change(other / f"rews_{i}.npy", lambda r: r / 10)
+    with pytest.raises(StoreError, match="seed_1_data' is rewarded differently"):
+        import_omar([first, other])

@@ -182,15 +182,15 @@ def import_bag(
 
 
 def import_omar(
-    directory: Positional[Path],
+    directories: Positional[list[Path]],
     out_file: Out,
     radius: float | None = None,
     task: str | None = None,
 ) -> None:
-    """Import one of OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy).
+    """Import OMAR's seed directories (obs_i.npy, acs_i.npy, rews_i.npy, next_obs_i.npy, dones_i.npy), several as one.
 
     Args:
-        directory: e.g. simple_spread/expert/seed_0_data.
+        directories: e.g. simple_spread/expert/seed_0_data; those of several seeds make a pooled set.
         out_file: the store to write.
         radius: m between two agents' centres below which a step costs 1; 0.30 by default, and another one needs --task.
         task: a name for the data; that of the tier in the directory's path by default.
@@ -202,7 +202,7 @@ def import_omar(
         raise UserError(f"--radius {radius:g} is another danger than the tiers'; give the data a name with --task.")
     hazard = None if radius is None else Separation(radius, radius / 4)
     file = writable(out_file)
-    imported(import_omar(directory, hazard, task), file)
+    imported(import_omar(directories[0] if len(directories) == 1 else directories, hazard, task), file)
 
 
 def import_ogmarl(

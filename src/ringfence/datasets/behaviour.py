@@ -6,7 +6,8 @@ The public Simple Spread data (OMAR, Pan et al. 2022) are four tiers of one such
 * `medium-replay`: everything the learner did from scratch until it was about as good as `medium`;
 * `medium`, `expert`: two snapshots of the learner, rolled out with Gaussian exploration noise.
 
-One seeded run of `train_tier_policies` makes all of them, and its results are shipped under `policies/`:
+One seeded run of `train_tier_policies` makes all of them, and its results are shipped under `policies/`. So are those
+of four more seeds, for pools of five learners as the public sets are:
 
     python -m ringfence.datasets.behaviour
 """
@@ -17,7 +18,7 @@ import json
 import os
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -41,6 +42,7 @@ from ringfence.types import Array, Key, PyTree
 POLICIES = Path(__file__).parent / "policies"
 COMMAND = "python -m ringfence.datasets.behaviour"
 TIERS = ("random", "medium-replay", "medium", "expert")
+LINEAGES = 5  # seeded learners whose policies ship; pooled tiers are of all of them
 REPLAY_TRANSITIONS = 97_500  # size of the public medium-replay set
 FORMAT = 1  # version of the policy file
 
@@ -163,11 +165,21 @@ def load_behaviour(path: str | Path) -> BehaviourPolicy:
     return BehaviourPolicy(actors, noise, card)
 
 
-def shipped_policy(level: str, task: str = "simple_spread") -> BehaviourPolicy:
-    """The behaviour policy of a tier, `medium` or `expert`, for three agents, from the files that ship."""
+def shipped_policy(level: str, task: str = "simple_spread", lineage: int = 0) -> BehaviourPolicy:
+    """The behaviour policy of a tier, `medium` or `expert`, for three agents, from the files that ship.
+
+    `lineage`: the seed of the learner that it is a snapshot of, 0 to 4; unpooled tiers are of 0.
+    """
     if level not in ("medium", "expert"):
         raise unknown("behaviour level", level, ("medium", "expert"))
-    return load_behaviour(POLICIES / f"{task}-{level}.safetensors")
+    return load_behaviour(POLICIES / f"{task}-{level}{_suffix(lineage)}.safetensors")
+
+
+def _suffix(lineage: int) -> str:
+    """Of a file's name."""
+    if not 0 <= lineage < LINEAGES:
+        raise UserError(f"There is no lineage {lineage}; the package ships 0 to {LINEAGES - 1}.")
+    return f"-{lineage}" if lineage else ""
 
 
 def collect(
@@ -238,6 +250,15 @@ def replay_episodes(
     return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
 
 
+def shipped_replay(env: SimpleSpread, episodes: int, lineage: int) -> dict[str, np.ndarray]:
+    """`episodes` of the replay that ships of a lineage, spread evenly over its learning; same arrays as `collect`."""
+    if not 1 <= episodes <= REPLAY_SHARE:
+        raise UserError(f"A lineage gives 1 to {REPLAY_SHARE} episodes of its replay, got {episodes}; ask for fewer.")
+    initial, actions = _load_replay(POLICIES / f"simple_spread-medium-replay{_suffix(lineage)}.npz")
+    rows = np.linspace(0, len(actions) - 1, episodes).round().astype(int)
+    return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
+
+
 def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
     """Per-episode numbers of `collect`'s arrays: return (sum over time of the agents' mean reward) and cost.
 
@@ -263,22 +284,47 @@ def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
 
 # ------------------------------------------------------------------------------------------------ the shipped tiers
 
-TARGETS = {"medium": 273.4, "expert": 531.0}  # mean returns of the public sets
+TARGETS = {"medium": 273.4, "expert": 531.0}  # mean returns of the public sets of seed 0
+POOL_TARGETS = {"medium": 259.85, "expert": 516.76}  # and of the public sets of seeds 0 to 4 together
 TIER_NOISE = 0.1  # std of the exploration noise in the medium and expert data (OMAR's default)
 LINEAGE = 375_000  # transitions of the run that the shipped tiers come from; it ends beyond the expert's level
+REPLAY_SHARE = 780  # episodes of the replay that ship of each lineage but the first, spread evenly over it
+ACTION_STEPS = 127  # of [0, 1], in those
+
+
+def target_return(level: str, lineage: int) -> float:
+    """The return that a lineage's snapshot is chosen by: the public set's for seed 0; for the others what makes the
+    pool's mean the public pool's."""
+    first = TARGETS[level]
+    return first if lineage == 0 else (LINEAGES * POOL_TARGETS[level] - first) / (LINEAGES - 1)
 
 
 def train_tier_policies(
-    folder: str | Path = POLICIES, progress: Callable[[int, float], None] | None = None
+    folder: str | Path = POLICIES,
+    progress: Callable[[int, float], None] | None = None,
+    lineages: Sequence[int] = range(LINEAGES),
 ) -> dict[str, dict[str, float]]:
-    """Make the shipped files: one learner, seed 0; its first 97 500 transitions are the replay.
+    """Make the shipped files: one learner for each seed; its first 97 500 transitions are the replay.
 
-    Of its snapshots, `medium` and `expert` are those whose return, with noise `TIER_NOISE`, is nearest to the public
-    sets' over 20 000 episodes. Returns the statistics of each tier. About four minutes on two cores.
+    Of its snapshots, `medium` and `expert` are those whose return, with noise `TIER_NOISE`, is nearest to
+    `target_return` over 20 000 episodes. All but seed 0's are kept at half precision, and their replays as
+    `REPLAY_SHARE` episodes. Returns the statistics of each tier. A minute or two a seed on a core.
     """
+    tiers = {}
+    for lineage in lineages:
+        tiers |= _train_lineage(lineage, Path(folder), progress)
+    return tiers
+
+
+def _train_lineage(
+    lineage: int, folder: Path, progress: Callable[[int, float], None] | None
+) -> dict[str, dict[str, float]]:
+    """The files of one seed, and their statistics."""
     env = SimpleSpread()
-    folder = Path(folder)
-    run = train_behaviour(env, MATD3Config(), jax.random.key(0), LINEAGE, progress)
+    suffix = _suffix(lineage)
+    dtype = np.float16 if lineage else np.float32
+    run = train_behaviour(env, MATD3Config(), jax.random.key(lineage), LINEAGE, progress)
+    run = run._replace(actors=jax.tree.map(lambda x: x.astype(dtype).astype(np.float32), run.actors))
     policies = [snapshot(run, k, TIER_NOISE) for k in range(len(run.seen))]
 
     def score(k: int, episodes: int) -> dict[str, float]:
@@ -286,10 +332,11 @@ def train_tier_policies(
 
     rough = np.array([score(k, 2000)["return_mean"] for k in range(len(policies))])
     tiers = {}
-    for level, target in TARGETS.items():
+    for level in TARGETS:
+        target = target_return(level, lineage)
         scores = {int(k): score(k, 20_000) for k in np.argsort(np.abs(rough - target))[:4]}
         best = min(scores, key=lambda k: abs(scores[k]["return_mean"] - target))
-        tiers[level] = {"seen": int(run.seen[best]), **scores[best]}
+        tiers[level + suffix] = {"seen": int(run.seen[best]), **scores[best]}
         card = {
             "task": "simple_spread",
             "level": level,
@@ -297,13 +344,26 @@ def train_tier_policies(
             "transitions": int(run.seen[best]),
             "command": COMMAND,
         }
-        save_behaviour(replace(policies[best], info=card), folder / f"simple_spread-{level}.safetensors")
+        if lineage:
+            card["lineage"] = lineage
+        policy = replace(policies[best], info=card)
+        save_behaviour(policy, folder / f"simple_spread-{level}{suffix}.safetensors", dtype)
     episodes = REPLAY_TRANSITIONS // env.episode_length
-    initial = jax.tree.map(lambda x: x[:episodes], run.initial)
-    actions = run.actions[:episodes]
-    _save_replay(initial, actions, folder / "simple_spread-medium-replay.npz")
-    tiers["medium-replay"] = statistics(resimulate(env, initial, actions))
+    rows = np.arange(episodes)
+    if lineage:
+        rows = np.linspace(0, episodes - 1, REPLAY_SHARE).round().astype(int)
+    initial = jax.tree.map(lambda x: x[rows], run.initial)
+    actions = run.actions[rows]
+    if lineage:
+        actions = np.round(actions.astype(np.float32) * ACTION_STEPS).astype(np.int8)
+    _save_replay(initial, actions, folder / f"simple_spread-medium-replay{suffix}.npz")
+    tiers[f"medium-replay{suffix}"] = statistics(resimulate(env, initial, _of_steps(actions)))
     return tiers
+
+
+def _of_steps(actions: np.ndarray) -> np.ndarray:
+    """Actions in [-1, 1] of a file that may hold them in steps of 1/127."""
+    return actions.astype(np.float32) / ACTION_STEPS if actions.dtype == np.int8 else actions
 
 
 def _save_replay(initial: SpreadState, actions: np.ndarray, path: Path) -> None:
@@ -321,7 +381,7 @@ def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
             position, landmarks, actions = file["position"], file["landmarks"], file["actions"]
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
         raise CheckpointError(f"{path} is not a whole replay ({error}); make it again with `{COMMAND}`.") from error
-    return SpreadState(position, np.zeros_like(position), landmarks), actions
+    return SpreadState(position, np.zeros_like(position), landmarks), _of_steps(actions)
 
 
 # ---------------------------------------------------------------------------------------------------- the learner

@@ -8,13 +8,15 @@ A directory holds, for every agent i, `obs_i.npy` (M, O), `acs_i.npy` (M, 2), `r
   every episode is dropped, because nothing says where it led;
 * the global state is recovered from the joint observation; costs are recomputed from a hazard on the states reached.
 
-Whatever contradicts Simple Spread or the length of episodes is refused, with file and row.
+Whatever contradicts Simple Spread or the length of episodes is refused, with file and row. Several directories, one for
+each seed of the learner, are read into one store; the literature trains on all five.
 """
 
 from __future__ import annotations
 
 import os
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -23,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.datasets import registry
+from ringfence.datasets.recipes.spread import POOLED
 from ringfence.envs import SimpleSpread
 from ringfence.errors import StoreError
 from ringfence.logs.schema import complete_card
@@ -34,23 +37,113 @@ REQUIRED = ("obs", "acs", "rews", "dones")  # next_obs may be absent
 TIER = re.compile(r"(?:simple_spread[-_])?(medium[-_]replay|medium|expert|random)")
 ACTION_SLACK = 1e-3  # rounding beyond the bounds that is clipped; more is an error
 STATE_SLACK = 1e-3  # m or m/s; two records of the same state differ by rounding alone
+REWARD_SLACK = 0.05  # of a reward of up to 30, which changes fast near a landmark
 CHUNK = 50_000  # rows at a time
+CHECKED = 2_000  # first steps of each of several seeds, which must be of one simulator
 
 
 def import_omar(
-    directory: str | os.PathLike,
+    directory: str | os.PathLike | Sequence[str | os.PathLike],
     hazard: constraints.Hazard | None = None,
     task: str | None = None,
     episode_length: int = 25,
 ) -> EpisodeStore:
-    """The store of one of OMAR's directories, e.g. `simple_spread/expert/seed_0_data`, for any number of agents.
+    """The store of one of OMAR's directories, e.g. `simple_spread/expert/seed_0_data`, for any number of agents; or of
+    several, one after the other, with the number of episodes of each on the card.
 
     `hazard` defines the costs (default: `Separation(0.30)`, the contact of two agents). `task` defaults to
-    `simple_spread-<tier>` where the path names the tier, else to `simple_spread-imported`.
+    `simple_spread-<tier>` where the path names the tier, with `-pooled` behind it for several directories, else to
+    `simple_spread-imported`.
     """
     if task is not None:
         complete_card({"task": task})  # a name that cannot be one is refused before the files are read
-    directory = Path(directory)
+    if isinstance(directory, str | os.PathLike):
+        return _import_seed(Path(directory), hazard, task, episode_length)
+    directories = [Path(d) for d in directory]
+    _check_alike(directories)
+    task = _common_task(directories) if task is None else task
+    stores = [_import_seed(d, hazard, task, episode_length) for d in directories]
+    _check_constants(directories, stores)
+    pool = stores[0]
+    for other in stores[1:]:
+        pool = pool.followed_by(other)
+    names = [str(d) for d in directories]
+    notes = [f"'{name}': {note}" for name, store in zip(names, stores) for note in store.card.warnings]
+    card = pool.card.updated(
+        provenance="imported from OMAR arrays in " + ", ".join(f"'{name}'" for name in names),
+        drivers=names,
+        episodes_of_driver=[store.episodes for store in stores],
+        warnings=notes,
+    )
+    return replace(pool, card=card)
+
+
+def _common_task(directories: list[Path]) -> str:
+    """What data of several directories are called, which must be of the same tier."""
+    n, _ = _survey(directories[0])
+    names = [_task_name(d, n) for d in directories]
+    for directory, name in zip(directories, names):
+        if name != names[0]:
+            raise StoreError(
+                f"'{directories[0]}' is of {names[0]}, '{directory}' of {name}; pool one tier, or pass a task."
+            )
+    pooled = names[0] + POOLED
+    return pooled if pooled in registry.TASKS else names[0]
+
+
+def _check_alike(directories: list[Path]) -> None:
+    """Refuse directories that are given twice, are of different agents or hold different files."""
+    if not directories:
+        raise StoreError("No directory was given; pass those of the seeds, e.g. expert/seed_0_data expert/seed_1_data.")
+    places = [d.resolve() for d in directories]
+    for k, place in enumerate(places):
+        if place in places[:k]:
+            raise StoreError(f"'{directories[k]}' is given twice; name every seed once.")
+    surveys = [_survey(d) for d in directories]
+    for directory, (n, has_next) in zip(directories, surveys):
+        if n != surveys[0][0]:
+            raise StoreError(
+                f"'{directory}' holds {n} agents, '{directories[0]}' {surveys[0][0]}; pool seeds of one team."
+            )
+        if has_next != surveys[0][1]:
+            raise StoreError(
+                f"'{directory}' and '{directories[0]}' do not both hold next_obs, so their episodes differ in length; "
+                "pool seeds with the same files."
+            )
+
+
+def _check_constants(directories: list[Path], stores: list[EpisodeStore]) -> None:
+    """Refuse seeds of which one moves or is rewarded as Simple Spread says and another is not: their actions have other
+    bounds, or their simulators other constants."""
+    first = _follows(stores[0])
+    for directory, store in zip(directories[1:], stores[1:]):
+        found = _follows(store)
+        for what, here, there in zip(("moves", "is rewarded"), found, first):
+            if here != there:
+                raise StoreError(
+                    f"'{directory}' {what} differently from '{directories[0]}', so action bounds or constants of their "
+                    "simulators differ; pool seeds of one simulator."
+                )
+
+
+def _follows(store: EpisodeStore) -> tuple[bool, bool]:
+    """Whether the first steps of a store move, and are rewarded, as Simple Spread says (most of them: two records of a
+    contact may differ)."""
+    assert store.state is not None, "OMAR's observations determine the state"
+    env = SimpleSpread(n_agents=store.n_agents)
+    step = np.arange(min(store.steps, CHECKED))
+    row = step + store.episode_of_step[step]
+    before = env.from_global_state(jnp.asarray(store.state[row]))
+    after, told = jax.jit(env.step)(before, jnp.asarray(store.actions[step]))
+    moved = np.abs(np.asarray(env.global_state(after)) - store.state[row + 1]).max(-1)
+    paid = np.abs(np.asarray(told.reward) - store.rewards[step]).max(-1)
+    return bool(np.median(moved) <= STATE_SLACK), bool(np.median(paid) <= REWARD_SLACK)
+
+
+def _import_seed(
+    directory: Path, hazard: constraints.Hazard | None, task: str | None, episode_length: int
+) -> EpisodeStore:
+    """The store of one directory."""
     n, has_next = _survey(directory)
     if episode_length < 1 or (episode_length < 2 and not has_next):
         raise StoreError(f"episode_length={episode_length} leaves no whole step; OMAR's episodes have 25.")
@@ -196,7 +289,7 @@ def _survey(directory: Path) -> tuple[int, bool]:
         if below:
             names = ", ".join(f"'{f.parent.relative_to(directory)}'" for f in below[:10])
             more = f" and {len(below) - 10} more" if len(below) > 10 else ""
-            raise StoreError(f"'{directory}' holds several data sets; pass one of its subfolders: {names}{more}.")
+            raise StoreError(f"'{directory}' holds several data sets; pass subfolders of one tier: {names}{more}.")
         raise StoreError(f"'{directory}' lacks obs_0.npy; pass a directory of OMAR arrays (obs_0.npy, acs_0.npy, ...).")
     n = max(agents) + 1
     kinds = REQUIRED + (("next_obs",) if found["next_obs"] else ())

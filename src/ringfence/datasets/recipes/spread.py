@@ -1,4 +1,5 @@
-"""Simple Spread's data sets, as OMAR describes the public ones: MATD3 at two levels, its replay, random actions."""
+"""Simple Spread's data sets, as OMAR describes the public ones: MATD3 at two levels, its replay, random actions; of one
+learner, or pooled of five, as most of the literature reads the public ones."""
 
 from __future__ import annotations
 
@@ -13,6 +14,9 @@ from ringfence.datasets.version import RECIPES
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.logs.store import EpisodeStore
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
+
+POOLED = "-pooled"  # ends the names of tiers of five learners
+TURNS = "its number in the full set modulo 5"
 
 
 def about(task: Task) -> Card:
@@ -47,14 +51,21 @@ def references(task: Task) -> dict[str, Policy]:
 def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore:
     """The data set of a tier."""
     env = _env(task)
-    episodes, how = played(env, task.tier, transitions // env.episode_length, seed)
+    count = transitions // env.episode_length
+    drivers: Card = {}
+    if task.tier.endswith(POOLED):
+        episodes, how = pooled(env, task.tier.removesuffix(POOLED), count, seed)
+        if task.tier.removesuffix(POOLED) != "random":
+            drivers = {"drivers": [f"MATD3 seed {k}" for k in range(policies.LINEAGES)], "driver_of_episode": TURNS}
+    else:
+        episodes, how = played(env, task.tier, count, seed)
     return EpisodeStore.from_episodes(
         episodes["observations"],
         episodes["actions"],
         episodes["rewards"],
         episodes["costs"],
         state=episodes["state"],
-        card=card | {"transitions": transitions, "collected": how},
+        card=card | {"transitions": transitions, "collected": how} | drivers,
     )
 
 
@@ -69,6 +80,30 @@ def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
         how = f"MATD3 policy, Gaussian action noise {policy.noise:g}"
         return policies.collect(env, policy, episodes, key), how
     return policies.collect(env, "random", episodes, key), "uniform actions"
+
+
+def pooled(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict[str, np.ndarray], str]:
+    """As `played`, by the learners of five seeds, who take turns."""
+    shares = [len(range(k, episodes, policies.LINEAGES)) for k in range(policies.LINEAGES)]
+    parts = [_of_lineage(env, tier, share, seed, k) for k, share in enumerate(shares) if share]
+    turn = np.argsort(np.concatenate([np.arange(share) * policies.LINEAGES + k for k, share in enumerate(shares)]))
+    together = {name: np.concatenate([part[name] for part in parts])[turn] for name in parts[0]}
+    how = {
+        "medium-replay": "the experience of five MATD3 learners from scratch up to the medium level, thinned evenly",
+        "random": "uniform actions",
+    }.get(tier, f"five MATD3 policies, Gaussian action noise {policies.TIER_NOISE:g}")
+    return together, f"{how}; in turn"
+
+
+def _of_lineage(env: SimpleSpread, tier: str, episodes: int, seed: int, lineage: int) -> dict[str, np.ndarray]:
+    """One learner's share of a pooled tier."""
+    if tier == "medium-replay" and seed == 0:
+        return policies.shipped_replay(env, episodes, lineage)
+    if tier == "medium-replay":
+        return policies.replay_episodes(env, episodes, policies.LINEAGES * seed + lineage)
+    key = jax.random.fold_in(jax.random.fold_in(jax.random.key(COLLECTION), seed), lineage)
+    policy = policies.shipped_policy(tier, lineage=lineage) if tier in policies.TARGETS else "random"
+    return policies.collect(env, policy, episodes, key)
 
 
 def _env(task: Task) -> SimpleSpread:
