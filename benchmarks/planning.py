@@ -17,11 +17,11 @@ import jax.numpy as jnp
 import numpy as np
 from _common import Rows, record
 
+from ringfence import guard
 from ringfence.datasets import behaviour, registry
 from ringfence.datasets.task import Task
 from ringfence.envs import SimpleSpread
 from ringfence.evaluation.latency import plan_latency
-from ringfence.guards import guard
 from ringfence.loading.resolve import make_policy
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds

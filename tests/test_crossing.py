@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ringfence import guard
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.recipes import crossing as recipe
@@ -20,7 +21,6 @@ from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import unsafe_starts
-from ringfence.guards import guard
 from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save

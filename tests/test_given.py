@@ -113,13 +113,13 @@ def test_actions_that_are_none_are_refused(actions, world, store):
 
 def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):
     controller = controllers["run"]()
-    step = controller._act
+    step = controller._source._act
 
     def diverged(*arguments):
         memory, found = step(*arguments)
         return memory, found._replace(action=found.action * np.nan)
 
-    controller._act = diverged
+    controller._source._act = diverged
     with pytest.raises(NoSafeAction, match="actions that are not finite; it has diverged"):
         controller.act(store.observations[0])
 

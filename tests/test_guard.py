@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ringfence
+from ringfence import guards, world
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
@@ -16,6 +17,7 @@ from ringfence.guards import BarrierSource, Guard, GuardOptions
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
+from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
@@ -297,3 +299,38 @@ def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_p
     assert run_worlds.for_guard(far) == "the task's"
     assert run_worlds.for_guard(usual).values.discount == 0.9
     assert run_worlds.of_run(far).values.discount == 0.8
+
+
+def test_one_controller_for_a_run_or_a_callable(small_world, tmp_path):
+    """Of a callable it is what `guard` gives; it may be of a World's file, too."""
+    seen, state = (np.zeros(k, np.float32) for k in ((3, 18), 18))
+    idle = lambda *_: np.zeros((3, 2))  # noqa: E731
+    file = world.save(small_world, tmp_path / "w.safetensors")
+    other = ringfence.guard(idle, small_world, guard="adapt")
+    assert isinstance(other, Controller)
+    for given in (file, small_world):
+        mine = Controller(idle, world=given, guard="adapt")
+        np.testing.assert_array_equal(mine.act(seen, state, cost=1.0), other.act(seen, state, cost=1.0))
+        mine.reset(), other.reset()
+    with pytest.raises(UserError, match="has no job"):
+        _ = mine.job
+    for wrong, message in (({}, "give world="), ({"world": file, "planner": "low_temperature"}, "planner='low_temp")):
+        with pytest.raises(UserError, match=message):
+            Controller(idle, **wrong)
+
+
+def test_names_of_before_in_guards_say_those_of_today(small_world):
+    with pytest.warns(FutureWarning, match=r"ringfence\.guards\.Pilot is called ringfence\.Controller now"):
+        assert guards.Pilot is Controller
+    with pytest.warns(FutureWarning, match=r"is called ringfence\.guard now"):
+        assert guards.guard is ringfence.guard
+    with pytest.warns(FutureWarning, match="BarrierSource now"):
+        assert guards.Danger is guards.barrier.Danger is BarrierSource
+    with pytest.raises(AttributeError, match=r"module 'ringfence\.guards' has no attribute 'nothing'"):
+        _ = guards.nothing
+    controller = ringfence.guard(lambda *_: np.zeros((3, 2)), small_world)
+    controller.act(np.zeros((3, 18)), np.zeros(18))
+    with pytest.warns(FutureWarning, match=r"info\['strange'\] is called info\['ood'\] now"):
+        assert controller.info["strange"] == controller.info["ood"]
+    with pytest.raises(KeyError, match="nothing"):
+        _ = controller.info["nothing"]

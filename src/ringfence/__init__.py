@@ -27,7 +27,7 @@ _WHERE = {
     "World": "ringfence.world",
     "fit": "ringfence.training.worlds",
     "load_world": "ringfence.training.worlds:load",
-    "guard": "ringfence.guards",
+    "guard": "ringfence.loading.controller",
     "build_report": "ringfence.report",
     "UserError": "ringfence.errors",
 }

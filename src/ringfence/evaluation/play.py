@@ -15,7 +15,7 @@ from ringfence.errors import LAST_SEED, UserError, known, whole_number
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
-from ringfence.guards import Pilot
+from ringfence.loading.controller import Controller
 from ringfence.proposals.base import with_cost
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key
@@ -31,7 +31,7 @@ OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary
 
 
 def play(
-    run: Run | str | Pilot,
+    run: Run | str | Controller,
     make_env: Callable[[], Any],
     *,
     episodes: int = 20,

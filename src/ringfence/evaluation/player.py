@@ -13,8 +13,8 @@ from ringfence.datasets.task import Task
 from ringfence.envs.episode import Shape
 from ringfence.errors import UserError
 from ringfence.evaluation import evaluate
-from ringfence.guards import Pilot
 from ringfence.guards.wrap import Callback
+from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem.constraints import CostColumn
@@ -53,10 +53,10 @@ class RunPlayer(Player):
     variant: str
 
 
-def player_of(policy: Run | str | Pilot, planner: str, split: str, options: dict[str, Any]) -> Player:
+def player_of(policy: Run | str | Controller, planner: str, split: str, options: dict[str, Any]) -> Player:
     """A run as planner and options say, or a function under guard, which takes neither."""
-    if isinstance(policy, Pilot):
-        return _of_function(policy, planner, options)
+    if isinstance(policy, Controller):
+        return _of_function(policy.policy, planner, options)
     return _of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split)
 
 
@@ -87,17 +87,19 @@ def _unsafe_by_formula(job: Job) -> Unsafe:
     return in_float32(lambda observations, state: np.asarray(unsafe(observations, state)))
 
 
-def _of_function(pilot: Pilot, planner: str, options: dict[str, Any]) -> Player:
+def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Player:
+    if not isinstance(callback, Callback):
+        raise UserError("This controller is of a run; play the run itself, with its options beside it.")
     if options or planner != DEFAULT:
         raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
-    world = pilot.policy.guarded.guard.world
+    world = callback.guarded.guard.world
     spec = world.spec
     return Player(
         name="a function under guard",
-        policy=_OneByOne(pilot.policy),
+        policy=_OneByOne(callback),
         act=act_with,
         task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
-        shape=_shape_of(world, pilot.policy.agents),
+        shape=_shape_of(world, callback.agents),
         episode_length=spec.episode_length,
         unsafe=None,
         about={"guard": "own"},
@@ -114,7 +116,7 @@ def _shape_of(world: World, agents: int) -> Shape:
 
 
 class _OneByOne:
-    """A function under guard that is asked for each simulator by itself, as by its pilot; the guard filters all."""
+    """A function under guard that is asked for each simulator by itself; the guard filters all."""
 
     def __init__(self, policy: Callback):
         self.policy = policy

@@ -6,7 +6,7 @@ from ringfence.guards.barrier import BARRIERS, BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.guards.policy import Guarded, options_of
-from ringfence.guards.wrap import Pilot, guard
+from ringfence.utils import renamed
 
 __all__ = [
     "BARRIERS",
@@ -15,7 +15,7 @@ __all__ = [
     "Guard",
     "GuardOptions",
     "Guarded",
-    "Pilot",
-    "guard",
     "options_of",
 ]
+
+__getattr__ = renamed.names_of(__name__)

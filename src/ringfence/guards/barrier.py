@@ -8,10 +8,12 @@ import jax.numpy as jnp
 from ringfence.errors import UserError
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
+from ringfence.utils import renamed
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, MinBarrier
 
 BARRIERS = ("learned", "analytic", "both")
+__getattr__ = renamed.names_of(__name__)
 
 
 class BarrierSource(eqx.Module):

@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.guards.policy import Guarded, Paid, acted, build, costs_of_one, no_safe_action
+from ringfence.errors import UserError
+from ringfence.guards.policy import Guarded, build
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
 from ringfence.proposals.base import held
@@ -108,47 +108,6 @@ class Callback:
         return memory, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
 
 
-class Pilot:
-    """Anybody's function (observations, state) -> actions under guard at run time: one environment, NumPy in, NumPy
-    out, as `Controller`.
-
-    pilot.reset()                                  # at the start of every episode
-    action = pilot.act(observations, state)        # (N, O), (S,) or None -> (N, A)
-
-    `info` says of the last action what the guard knows of it. `policy` is what simulators of whole batches play.
-    """
-
-    def __init__(self, policy: Callback, seed: int = 0):
-        self.policy = policy
-        self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
-        self.info: dict[str, np.ndarray] = {}
-        self.last_action: np.ndarray | None = None
-        self.reset()
-
-    def reset(self) -> None:
-        """Begin an episode."""
-        self._memory = self.policy.start(1)
-
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
-        """(N, A) joint action; the function is asked with the same arrays. `cost` is what the last step cost, in all or
-        by each constraint's name, which an adapting guard follows.
-
-        What nobody can act upon safely is refused with `NoSafeAction`, whose `last_action` is that of the step before:
-        arrays of another shape than the World's, what is not finite, and what is no cost."""
-        with no_safe_action(self.last_action):
-            seen, whole = self.policy.seen(observations, state)
-            paid = None if cost is None else costs_of_one(cost, self.policy.agents)
-            # Copies: a function that writes into what it sees must not blind its guard.
-            wanted = self.policy.function(seen.copy(), None if whole is None else whole.copy())
-            memory = self._memory if paid is None else self.policy.observe_cost(self._memory, paid)
-            key, now = jax.random.split(self._key)
-            shown = seen[None], None if whole is None else whole[None]
-            memory, step = self.policy.decided(memory, *shown, [wanted], now)
-            action, info = acted(step, "The guard")
-        self._memory, self._key, self.info, self.last_action = memory, key, info, action.copy()
-        return action
-
-
 class Nothing(eqx.Module):
     """Stands where a callback's proposals come from outside."""
 
@@ -156,27 +115,18 @@ class Nothing(eqx.Module):
         return {}
 
 
-@in_float32
-def guard(
+def under_guard(
     policy: Any,
     world: World,
     *,
     guard: str = "shield",
     barrier: str = "learned",
     hazard: constraints.Hazard | None = None,
-    seed: int = 0,
     agents: int | None = None,
     anyway: bool = False,
-    **options,
-):
-    """Any policy under guard.
-
-    policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
-    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Pilot`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
-    GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one,
-    where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
-    """
+    **options: Any,
+) -> Guarded | PerAgent | Callback:
+    """A policy of the library, or any callable, under guard; the arguments are those of `ringfence.guard`."""
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
     options = renamed(options, stored.GUARD_OPTIONS | {"danger": "barrier"}, "the guard")
@@ -195,4 +145,4 @@ def guard(
     if agents not in (None, spec.n_agents) and not spec.homogeneous:
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
     guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
-    return Pilot(Callback(policy, guarded, agents or spec.n_agents), seed)
+    return Callback(policy, guarded, agents or spec.n_agents)

@@ -1,67 +1,129 @@
-"""A trained policy at run time: NumPy in, NumPy out."""
+"""Policies at run time: NumPy in, NumPy out."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
 
 import jax
 import numpy as np
 
 from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.guards.policy import Paid, acted, costs_of_one, no_safe_action
+from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
+from ringfence.guards.wrap import Callback, under_guard
 from ringfence.loading.resolve import load
+from ringfence.problem.constraints import Hazard
+from ringfence.problem.homogeneous import PerAgent
 from ringfence.proposals.base import act_with, with_cost
+from ringfence.proposals.options import DEFAULT
+from ringfence.training import worlds
+from ringfence.training.job import Job
 from ringfence.training.runs import Run
+from ringfence.types import Key, Policy, PolicyStep, PyTree
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as
 from ringfence.utils.precision import in_float32
+from ringfence.utils.renamed import Info
+from ringfence.world import World
+
+Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,) of one environment
+OneCost = np.ndarray | dict[str, np.ndarray]  # (1,), or that by constraint
 
 
 class Controller:
-    """A trained policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
+    """A policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
 
     controller = Controller("runs/…/seed-0", guard="shield", barrier="learned")
     controller.reset()                             # at the start of every episode
     action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
 
-    `info` says of the last action what the policy knows of it, e.g. `ood`: the World knows nothing there. Not for
-    several threads at once.
+    run: a trained run, with options of `ringfence.load`; or any callable (observations (N, O), state (S,) or None) ->
+    actions (N, A), with `world=` and options of `ringfence.guard`. `info` says of the last action what is known of it,
+    e.g. `ood`: the World knows nothing there. `policy` is what simulators of whole batches play. Not for several
+    threads at once.
     """
 
-    @in_float32
-    def __init__(self, run: Run | str, planner: str = "default", seed: int = 0, **options):
+    def __init__(
+        self, run: Run | str | Path | Callable | Callback, planner: str = DEFAULT, seed: int = 0, **options: Any
+    ):
         keep_programs()
-        self.job, self.policy = load(run, planner=planner, **options)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
-        self._act = jax.jit(act_with)
-        self.info: dict[str, np.ndarray] = {}
+        self._source = _source(run, planner, options)
+        self.policy: Policy = self._source.policy
+        self.info: dict[str, np.ndarray] = Info()
         self.last_action: np.ndarray | None = None
         self.reset()
+
+    @property
+    def job(self) -> Job:
+        """What the run was trained for; a callable has no job."""
+        if isinstance(self._source, _Function):
+            raise UserError("This controller is of a callable, which has no job; only one of a run has.")
+        return self._source.job
 
     @in_float32
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._memory = self.policy.start(1)
 
-    @in_float32
     def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
-        """(N, A) joint action within the task's bounds; `cost` is what the last step cost, in all or by each
-        constraint's name, which an adapting guard follows. Arrays of another shape than the run's are refused, and so
-        is what is not finite: indices beyond an array's end would be clipped in silence, and noise would follow
-        NaN.
+        """(N, A) joint action within the task's bounds; a callable is asked with the same arrays. `cost` is what the
+        last step cost, in all or by each constraint's name, which an adapting guard follows. Arrays of another shape
+        than the run's or the World's are refused, and so is what is not finite: indices beyond an array's end would be
+        clipped in silence, and noise would follow NaN.
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
+        source = self._source
         with no_safe_action(self.last_action):
-            seen, whole = self._seen(observations, state)
-            memory = self._memory
-            if cost is not None:
-                memory = with_cost(self.policy, memory, costs_of_one(cost, self.job.team))
+            seen = source.seen(observations, state)
+            paid = None if cost is None else costs_of_one(cost, source.agents)
             key, now = jax.random.split(self._key)
-            whole = None if whole is None else whole[None]
-            memory, step = self._act(self.policy, memory, seen[None], whole, now)
-            action, info = acted(step, "The run's policy")
-        self._memory, self._key, self.info, self.last_action = memory, key, info, action.copy()
+            memory, step = source.act(self._memory, seen, paid, now)
+            action, info = acted(step, source.name)
+        self._memory, self._key, self.info, self.last_action = memory, key, Info(info), action.copy()
         return action
 
-    def _seen(self, observations: np.ndarray, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+
+@in_float32
+def guard(
+    policy: Policy | Callable,
+    world: World,
+    *,
+    guard: str = "shield",
+    barrier: str = "learned",
+    hazard: Hazard | None = None,
+    seed: int = 0,
+    agents: int | None = None,
+    anyway: bool = False,
+    **options: Any,
+) -> Guarded | PerAgent | Controller:
+    """Any policy under guard.
+
+    policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
+    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
+    which gives a `Controller`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
+    GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one,
+    where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
+    """
+    found = under_guard(
+        policy, world, guard=guard, barrier=barrier, hazard=hazard, agents=agents, anyway=anyway, **options
+    )
+    return Controller(found, seed=seed) if isinstance(found, Callback) else found
+
+
+class _TrainedRun:
+    """A trained run, which says what arrays it takes."""
+
+    name = "The run's policy"
+
+    @in_float32
+    def __init__(self, run: Run | str | Path, planner: str, options: dict[str, Any]):
+        self.job, self.policy = load(cast("Run | str", run), planner=planner, **options)
+        self.agents = self.job.team
+        self._act = jax.jit(act_with)
+
+    def seen(self, observations: Any, state: Any) -> Seen:
         """Copies of what one environment shows, of the widths of the run's data."""
         width, state_width = self.job.widths
         seen = given_as("observations", observations, (self.job.team, width))
@@ -80,6 +142,12 @@ class Controller:
             self._reaches(seen, whole)
         return seen, whole
 
+    @in_float32
+    def act(self, memory: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        if cost is not None:
+            memory = with_cost(self.policy, memory, cost)
+        return self._act(self.policy, memory, *_batch(seen), key)
+
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
         """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
         view, last = self.job.feature_map, int(self.job.feature_map.plus.max())
@@ -90,3 +158,43 @@ class Controller:
             name, there = "observations and state", there + len(state)
         if last >= there:
             raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
+
+
+class _Function:
+    """A callable under guard, which is asked in the precision of its own program."""
+
+    name = "The guard"
+
+    def __init__(self, policy: Callback):
+        self.policy = policy
+        self.agents = policy.agents
+        self.seen = policy.seen
+
+    def act(self, memory: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        observations, state = seen
+        # Copies: a function that writes into what it sees must not blind its guard.
+        wanted = self.policy.function(observations.copy(), None if state is None else state.copy())
+        if cost is not None:
+            memory = self.policy.observe_cost(memory, cost)
+        return self.policy.decided(memory, *_batch(seen), [wanted], key)
+
+
+def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _Function:
+    if isinstance(run, Callback):
+        return _Function(run)
+    if not callable(run):
+        return _TrainedRun(run, planner, options)
+    if planner != DEFAULT:
+        raise UserError(f"planner='{planner}' is read by nothing of a callable; leave it out.")
+    world = options.pop("world", None)
+    if world is None:
+        raise UserError("A callable acts under guard alone; give world=, the World that its guard reads.")
+    found = in_float32(under_guard)(run, worlds.load(world) if isinstance(world, str | Path) else world, **options)
+    assert isinstance(found, Callback)  # of whatever is no policy of the library
+    return _Function(found)
+
+
+def _batch(seen: Seen) -> Seen:
+    """The same as a batch of one."""
+    observations, state = seen
+    return observations[None], None if state is None else state[None]

@@ -2,13 +2,53 @@
 
 from __future__ import annotations
 
+import importlib
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
 from ringfence.errors import UserError
 
 T = TypeVar("T")
+
+# What a module called by another name: where it is now, as "module:name".
+NAMES = {
+    "ringfence.guards": {
+        "guard": "ringfence:guard",
+        "Pilot": "ringfence:Controller",
+        "Danger": "ringfence.guards:BarrierSource",
+        "DANGERS": "ringfence.guards:BARRIERS",
+    },
+    "ringfence.guards.barrier": {
+        "Danger": "ringfence.guards.barrier:BarrierSource",
+        "DANGERS": "ringfence.guards.barrier:BARRIERS",
+    },
+}
+INFO = {"strange": "ood"}  # what is known of an action
+
+
+def names_of(module: str) -> Callable[[str], Any]:
+    """The `__getattr__` of a module that had other names."""
+
+    def find(name: str) -> Any:
+        if name not in NAMES[module]:
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+        place, _, today = NAMES[module][name].partition(":")
+        deprecated(f"{module}.{name}", f"{place}.{today}")
+        return getattr(importlib.import_module(place), today)
+
+    return find
+
+
+class Info(dict[str, T]):
+    """What is known of an action, by name."""
+
+    def __missing__(self, name: str) -> T:
+        today = INFO.get(name, name)
+        if today not in self:
+            raise KeyError(name)
+        deprecated(f"info['{name}']", f"info['{today}']")
+        return self[today]
 
 
 def renamed(given: Mapping[str, Any], names: Mapping[str, str], of: str, warn: bool = True) -> dict[str, Any]:
