@@ -45,7 +45,7 @@ def tasks() -> None:
         return f"< {h.radius:g} m" if isinstance(h, constraints.Separation) else type(h).__name__
 
     names = ("task", "danger", "limit l", "r_min to r_max")
-    table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE)
+    table = Table(*(Column(n, no_wrap=True) for n in names), box=box.SIMPLE, pad_edge=False)
     for t in registry.TASKS.values():
         constants = f"{t.return_min:g} to {t.return_max:g}"
         table.add_row(terminal(t.name), danger(t.hazard), f"{t.cost_limit:g}", constants)
