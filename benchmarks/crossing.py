@@ -58,15 +58,15 @@ def acting(run, world, agents: int, options: dict, steps: int = 200) -> np.ndarr
     """(steps,) milliseconds of joint actions along two episodes, where agents meet."""
     job, policy = load(run, agents=agents, **options, **({"world": world} if options else {}))
     env = job.task.env
-    act = jax.jit(lambda policy, memory, seen, key: policy.act(memory, seen, None, key))
+    act = jax.jit(lambda policy, carry, seen, key: policy.act(carry, seen, None, key))
     move, look = jax.jit(env.step), jax.jit(env.observe)
     key, took = jax.random.key(0), []
     for t in range(steps):
         if t % env.episode_length == 0:
-            state, memory = env.reset(jax.random.fold_in(key, t), 1), policy.start(1)
+            state, carry = env.reset(jax.random.fold_in(key, t), 1), policy.initial_state(1)
         seen = jax.block_until_ready(look(state))
         begun = time.perf_counter()
-        memory, step = jax.block_until_ready(act(policy, memory, seen, jax.random.fold_in(key, t)))
+        carry, step = jax.block_until_ready(act(policy, carry, seen, jax.random.fold_in(key, t)))
         took.append((time.perf_counter() - begun) * 1e3)
         state, _ = move(state, step.action)
     return np.array(took[10:])

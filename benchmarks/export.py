@@ -77,7 +77,7 @@ def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarra
             file = export.export(run, Path(folder) / form, form, **options)
             row |= {f"{form}_s": time.perf_counter() - begun, f"{form}_kib": file.stat().st_size / 1024}
             play[form] = _player(file, form)
-    act, memory = jax.jit(act_with), policy.start(1)
+    act, carry = jax.jit(act_with), policy.initial_state(1)
     gaps, took = {f: [] for f in play}, {f: [] for f in ["controller", *play]}
     for k in range(len(seen)):
         key = jax.random.key(k)
@@ -86,7 +86,7 @@ def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarra
         given |= {f"noise.{i}": np.asarray(x) for i, x in enumerate(noise)}
         given = {e.name: np.asarray(given[e.name], e.dtype) for e in made.inputs}
         begun = time.perf_counter()
-        action = np.asarray(act(policy, memory, seen[k][None], whole_states[k][None], key)[1].action[0])
+        action = np.asarray(act(policy, carry, seen[k][None], whole_states[k][None], key)[1].action[0])
         took["controller"].append(time.perf_counter() - begun)
         for form, call in play.items():
             begun = time.perf_counter()

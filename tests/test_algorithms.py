@@ -74,7 +74,7 @@ def test_contract(name, trained):
     actions = []
     for _ in range(2):
         _, policy = load(run, sampling_steps=2)
-        _, out = policy.act(policy.start(5), env.observe(state), env.global_state(state), jax.random.key(1))
+        _, out = policy.act(policy.initial_state(5), env.observe(state), env.global_state(state), jax.random.key(1))
         actions.append(np.asarray(out.action))
     assert actions[0].shape == (5, 3, 2) and np.abs(actions[0]).max() <= 1.0
     np.testing.assert_array_equal(*actions)
@@ -90,7 +90,7 @@ def test_policies_act_within_any_bounds(name, trained):
     for low, high in ((-1.0, 1.0), (2.0, 8.0)):
         spec = dataclasses.replace(policy.spec, action_low=low, action_high=high)
         told = dataclasses.replace(policy, spec=spec)
-        act = jax.jit(lambda key, told=told: told.act(told.start(5), seen, whole, key)[1].action)
+        act = jax.jit(lambda key, told=told: told.act(told.initial_state(5), seen, whole, key)[1].action)
         acted.append(np.asarray(act(jax.random.key(1))))
     np.testing.assert_allclose(acted[1], 5 + 3 * acted[0], atol=1e-4)
 
@@ -289,7 +289,7 @@ def test_who_saw_one_agent_plans_alone(small_store, tmp_path):
         seen, state = small_store.observations[:4], small_store.state[:4]
         other = seen.copy()
         other[:, 1] += 0.5
-        steps = (policy.act(policy.start(4), o, state, jax.random.key(0))[1] for o in (seen, other))
+        steps = (policy.act(policy.initial_state(4), o, state, jax.random.key(0))[1] for o in (seen, other))
         a, b = (np.asarray(step.action) for step in steps)
         moved[observe] = np.abs(a - b)[:, 0].max()
     assert moved["all"] > 1e-5 and moved["single"] < 1e-7
@@ -423,7 +423,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     run = loop.train("icbf", store, out=tmp_path, **how)[0]
     _, policy = load(run, guard="select", num_samples=2, sampling_steps=2)
     seen = jnp.asarray(store.observations[:4])
-    _, out = policy.act(policy.start(4), seen, None, jax.random.key(0))
+    _, out = policy.act(policy.initial_state(4), seen, None, jax.random.key(0))
     assert out.action.shape == (4, 3, 2)
     with pytest.raises(UserError, match="only as data"):
         evaluate(run)
@@ -467,11 +467,11 @@ def test_an_unfinished_run_is_said_to_be_one(small_store, trained, tmp_path, cap
 class Lost(eqx.Module):
     """Its actions are no numbers."""
 
-    def start(self, batch):
+    def initial_state(self, batch):
         return {}
 
-    def act(self, memory, observations, state, key):
-        return memory, PolicyStep(jnp.full((*observations.shape[:2], 2), jnp.nan), {})
+    def act(self, carry, observations, state, key):
+        return carry, PolicyStep(jnp.full((*observations.shape[:2], 2), jnp.nan), {})
 
 
 def test_actions_that_are_no_numbers_do_not_pass_for_safe():
@@ -650,7 +650,7 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     state = jax.tree.map(lambda x: x + 0.1 if x.dtype == jnp.float32 else x, state)  # as if it had learned
     policy = resolve.make_policy(job, state, {})
     seen, whole = store.observations[:4], store.state[:4]
-    action = np.asarray(policy.act(policy.start(4), seen, whole, jax.random.key(0))[1].action)
+    action = np.asarray(policy.act(policy.initial_state(4), seen, whole, jax.random.key(0))[1].action)
     assert (action[:, 1, 1] == 0).all() and (np.abs(action[:, [0, 2]]) > 0).all() and (action[:, 1, 0] != 0).all()
     wide = store.card.updated(action_sizes=[2, 3, 2])
     with pytest.raises(UserError, match=r"action_sizes=\[2, 3, 2\]; it must say for each of the 3 agents .* 1 to 2"):
@@ -713,7 +713,8 @@ def test_cloning_that_reads_returns_does_what_it_is_asked_for(tmp_path):
         changes |= {"view": "decentralized", "num_updates": 150, "width": 32, "lr": 3e-3}
         run = loop.train(algorithm, store, out=tmp_path / name, changes=changes, quiet=True)[0]
         policy = load(run)[1]
-        acted = policy.act(policy.start(64), jnp.asarray(store.observations[:64]), None, jax.random.key(0))[1].action
+        seen = jnp.asarray(store.observations[:64])
+        acted = policy.act(policy.initial_state(64), seen, None, jax.random.key(0))[1].action
         earned[name] = float(acted[..., 0].mean())
     assert earned["high"] > 0.2 and earned["low"] < -0.2
     assert earned["best"] > 0.2  # the mean of all is 0

@@ -167,9 +167,9 @@ def test_margins_follow_the_constraint_that_was_paid(fitted, logs):
         (0.0, [0.0, -0.125]),
         (1.0, [0.5, 0.375]),  # nobody judges it unsafe: it may have been any
     ):
-        before = np.asarray(pilot._memory["margin"])[0]
+        before = np.asarray(pilot._carry["margin"])[0]
         pilot.act(seen, cost=cost)
-        np.testing.assert_allclose(np.asarray(pilot._memory["margin"])[0] - before, moved, atol=1e-5)
+        np.testing.assert_allclose(np.asarray(pilot._carry["margin"])[0] - before, moved, atol=1e-5)
     with pytest.raises(UserError, match="Unknown constraint 'wal'; did you mean 'wall'"):
         pilot.act(seen, cost={"wal": 1.0})
 

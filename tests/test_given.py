@@ -116,8 +116,8 @@ def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):
     step = controller._source._act
 
     def diverged(*arguments):
-        memory, found = step(*arguments)
-        return memory, found._replace(action=found.action * np.nan)
+        carry, found = step(*arguments)
+        return carry, found._replace(action=found.action * np.nan)
 
     controller._source._act = diverged
     with pytest.raises(NoSafeAction, match="actions that are not finite; it has diverged"):

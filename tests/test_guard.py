@@ -22,6 +22,7 @@ from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
+from ringfence.types import PolicyStep
 from ringfence.world.card import Avoidable, BarrierScores, Card
 from tests.quick import QUICK_WORLD
 
@@ -191,12 +192,12 @@ def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
 def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
     policy = build(Constant(small_world.spec), small_world, constraints.Separation(), "adapt", "analytic")
     seen, state = small_store.observations[:2], small_store.state[:2]
-    memory, first = policy.act(policy.start(2), seen, state, jax.random.key(0))
-    assert (memory["margin"] == np.float32(0.6)).all()  # nobody chose the first state
-    memory, _ = policy.act(policy.observe_cost(memory, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
+    carry, first = policy.act(policy.initial_state(2), seen, state, jax.random.key(0))
+    assert (carry["margin"] == np.float32(0.6)).all()  # nobody chose the first state
+    carry, _ = policy.act(policy.observe_cost(carry, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
     o = policy.guard.options
     expected = 0.6 + o.adapt * (np.array([0.0, 1.0]) - o.rate)
-    np.testing.assert_allclose(memory["margin"][:, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(carry["margin"][:, 0], expected, rtol=1e-5)
 
 
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
@@ -334,3 +335,23 @@ def test_names_of_before_in_guards_say_those_of_today(small_world):
         assert controller.info["strange"] == controller.info["ood"]
     with pytest.raises(KeyError, match="nothing"):
         _ = controller.info["nothing"]
+
+
+def test_policies_of_before_are_understood(small_world, small_store):
+    """`start` is called `initial_state`; whose policy has the old name is played, and who calls it is told."""
+
+    class Before:
+        def start(self, batch):
+            return jnp.zeros(batch)
+
+        def act(self, memory, observations, state, key):
+            return memory + 1, PolicyStep(jnp.zeros((*observations.shape[:2], 2)), {})
+
+    with pytest.warns(FutureWarning, match="start of the policy Before is called initial_state now"):
+        guarded = ringfence.guard(Before(), small_world)
+    seen, state = small_store.observations[:2], small_store.state[:2]
+    carry, _ = guarded.act(guarded.initial_state(2), seen, state, jax.random.key(0))
+    assert carry["inner"].tolist() == [1.0, 1.0]
+    for policy in (guarded, Constant(small_world.spec)):
+        with pytest.warns(FutureWarning, match="start of a policy is called initial_state now"):
+            jax.tree.map(np.testing.assert_array_equal, policy.start(2), policy.initial_state(2))

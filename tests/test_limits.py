@@ -79,7 +79,7 @@ def adapted(scale: float) -> tuple[np.ndarray, np.ndarray]:
     actions, margins = [], []
     for t in range(10):
         actions.append(pilot.act(store.observations[t], cost={"hit": scale, "fast": scale}))
-        margins.append(np.asarray(pilot._memory["margin"]))
+        margins.append(np.asarray(pilot._carry["margin"]))
     return np.array(actions), np.array(margins)
 
 

@@ -168,14 +168,14 @@ def test_an_oracle_keeps_a_naive_driver_from_what_it_would_touch():
     first = first._replace(goal=first.config + inward)
 
     def unsafe(policy) -> float:
-        def step(carry, key):
-            memory, state = carry
-            memory, decided = policy.act(memory, system.observe(state), system.global_state(state), key)
+        def step(before, key):
+            carry, state = before
+            carry, decided = policy.act(carry, system.observe(state), system.global_state(state), key)
             state, out = system.step(state, decided.action)
-            return (memory, state), out.cost
+            return (carry, state), out.cost
 
         keys = jax.random.split(jax.random.key(1), 40)
-        _, costs = jax.jit(lambda: jax.lax.scan(step, (policy.start(8), first), keys))()
+        _, costs = jax.jit(lambda: jax.lax.scan(step, (policy.initial_state(8), first), keys))()
         return float(costs.sum())
 
     assert unsafe(guarded) < 0.2 * unsafe(naive)

@@ -99,16 +99,16 @@ def test_collected_episodes_are_whole_and_replay():
 class Push(eqx.Module):
     """Every joint of the 4x2 Ant with full torque."""
 
-    def start(self, batch):
+    def initial_state(self, batch):
         return {}
 
-    def act(self, memory, observations, state, key):
-        return memory, PolicyStep(jnp.ones((*observations.shape[:2], 2)), {})
+    def act(self, carry, observations, state, key):
+        return carry, PolicyStep(jnp.ones((*observations.shape[:2], 2)), {})
 
 
 class Wait(Push):
-    def act(self, memory, observations, state, key):
-        return memory, PolicyStep(jnp.zeros((*observations.shape[:2], 4)), {})
+    def act(self, carry, observations, state, key):
+        return carry, PolicyStep(jnp.zeros((*observations.shape[:2], 4)), {})
 
 
 def test_rollouts_stop_where_the_robot_falls(monkeypatch):
@@ -139,12 +139,12 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
 class Outside:
     """A policy that knows nothing of JAX, like one around a network of another library."""
 
-    def start(self, batch):
+    def initial_state(self, batch):
         return 0
 
-    def act(self, memory, observations, state, key):
+    def act(self, carry, observations, state, key):
         assert isinstance(observations, np.ndarray)
-        return memory + 1, PolicyStep(np.full((*observations.shape[:2], 3), 0.1 * (memory % 2)), {})
+        return carry + 1, PolicyStep(np.full((*observations.shape[:2], 3), 0.1 * (carry % 2)), {})
 
 
 def test_any_object_can_play_a_robot():

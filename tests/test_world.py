@@ -71,7 +71,7 @@ def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):
     @jax.jit
     def start(guarded):
         traced.append(guarded)
-        return guarded.start(1)
+        return guarded.initial_state(1)
 
     for _ in range(2):
         loaded = worlds.load(file)

@@ -24,7 +24,7 @@ def test_every_one_is_loaded_with_the_world_that_guards_it(name, tmp_path, monke
     run = zoo.pretrained(name, tmp_path)
     job, policy = load(run, guard="shield")
     assert (job.task.name, job.algorithm.name) == tuple(name.split("/"))
-    assert policy.start(2)
+    assert policy.initial_state(2)
     assert run.path == tmp_path / name / "seed-0" and zoo.pretrained(name, tmp_path).path == run.path
 
 

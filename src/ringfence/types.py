@@ -98,31 +98,31 @@ class PolicyStep(NamedTuple):
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts on a batch of environments. `memory` is a pytree carried between steps (a plan in progress, a history).
+    """Acts on a batch of environments. `carry` is a pytree carried between steps (a plan in progress, a history).
 
-    A policy may have `observe_cost(memory, cost) -> memory`: it then observes the cost (B,) of every step. One that
-    knows several steps ahead has `propose(memory, observations, state, key, count, rows, world)` -> (memory, actions
+    A policy may have `observe_cost(carry, cost) -> carry`: it then observes the cost (B,) of every step. One that
+    knows several steps ahead has `propose(carry, observations, state, key, count, rows, world)` -> (carry, actions
     (B, P, K, N, A) in [−1, 1], info), which guards choose from.
     """
 
-    def start(self, batch: int) -> PyTree: ...
+    def initial_state(self, batch: int) -> PyTree: ...
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]: ...
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]: ...
 
 
 @runtime_checkable
 class ObservesCost(Protocol):
     """A policy that observes what every step cost, (B,) or (B, N), or that by constraint, and remembers it."""
 
-    def observe_cost(self, memory: PyTree, cost: Any) -> PyTree: ...
+    def observe_cost(self, carry: PyTree, cost: Any) -> PyTree: ...
 
 
 @runtime_checkable
 class Proposes(Policy, Protocol):
-    """A policy that knows several steps ahead: (memory, actions (B, P, K, N, A) in [−1, 1], info)."""
+    """A policy that knows several steps ahead: (carry, actions (B, P, K, N, A) in [−1, 1], info)."""
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Any, key: Key, count: int, rows: int, world: Any
+        self, carry: PyTree, observations: Array, state: Any, key: Key, count: int, rows: int, world: Any
     ) -> tuple[PyTree, Array, dict[str, Array]]: ...
 
 

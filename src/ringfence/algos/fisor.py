@@ -36,6 +36,7 @@ from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
 from ringfence.utils.config import AtLeastOne, BatchSize, Count, Natural, NonNegative, Positive, Rows, Share, Width
+from ringfence.utils.renamed import HadStart
 
 DANGER = 25.0  # h of an unsafe state; a safe one has −1
 LEVEL_WIDTH = 16  # entries of the embedding of k
@@ -166,7 +167,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     return update
 
 
-class Proposer(eqx.Module):
+class Proposer(HadStart, eqx.Module):
     """Draws actions per agent and takes the one that its danger critics find least dangerous."""
 
     actor: MLP
@@ -177,10 +178,10 @@ class Proposer(eqx.Module):
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
     candidates: int = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O) -> joint action (B, N, A)."""
         x = self.normaliser.state(self.feature_map(observations, state))
         (b, n, _), s = x.shape, self.candidates
@@ -195,7 +196,7 @@ class Proposer(eqx.Module):
         actions = jnp.moveaxis(jnp.clip(drawn, -1.0, 1.0).reshape(b, s, n, -1), 1, 2)  # (B, N, S, A)
         q = jnp.moveaxis(self.danger(x, actions).max(1), 0, 1)  # (B, N, S)
         best = jnp.take_along_axis(actions, q.argmin(-1)[..., None, None], 2)[:, :, 0]
-        return memory, PolicyStep(from_unit(best, self.spec), {})
+        return carry, PolicyStep(from_unit(best, self.spec), {})
 
 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, options=None) -> Proposer:

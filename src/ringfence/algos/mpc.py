@@ -9,27 +9,28 @@ import jax.numpy as jnp
 
 from ringfence.algos.untrained import untrained
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 
 
-class Rest(eqx.Module):
+class Rest(HadStart, eqx.Module):
     """Proposes to do nothing."""
 
     spec: Spec = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         s = self.spec
         middle = (s.action_low + s.action_high) / 2
-        return memory, PolicyStep(jnp.full((observations.shape[0], s.n_agents, s.action_dim), middle), {})
+        return carry, PolicyStep(jnp.full((observations.shape[0], s.n_agents, s.action_dim), middle), {})
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
         shape = (observations.shape[0], 1, rows, self.spec.n_agents, self.spec.action_dim)
-        return memory, jnp.zeros(shape), {}
+        return carry, jnp.zeros(shape), {}
 
 
 MPC = untrained("mpc", Rest)

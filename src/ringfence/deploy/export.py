@@ -7,7 +7,7 @@ The function in the file is one joint action of `evaluate.Controller`, of one en
 Whatever nothing reads is left out: cloning under a shield takes observations (and the state, where its World sees it)
 and remembers nothing. `next.NAME` is `memory.NAME` of the step after; `cost` is what the last step cost, NaN where
 nobody gave; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random numbers
-differ between runtimes. What memory begins with, names, shapes and the facts of the run are metadata of the file.
+differ between runtimes. What is carried begins with, names, shapes and the facts of the run are metadata of the file.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One joint action as a function of arrays alone, in the order of `inputs`, and what its memory begins with."""
+    """One joint action as a function of arrays alone, in the order of `inputs`, and what its carry begins with."""
 
     call: Callable[..., list[Array]]
     inputs: tuple[Entry, ...]
@@ -115,21 +115,21 @@ def _constraints(policy: Policy) -> list[str]:
 class _Traced:
     """One joint action as programs: the one that draws, and the one that is given its noise instead."""
 
-    drawing: core.ClosedJaxpr  # (key, *seen, *memory) -> (*results, *memory)
-    given: core.ClosedJaxpr  # (key, *seen, *noise, *memory) -> (*results, *memory)
+    drawing: core.ClosedJaxpr  # (key, *seen, *carry) -> (*results, *carry)
+    given: core.ClosedJaxpr  # (key, *seen, *noise, *carry) -> (*results, *carry)
     seen: dict[str, jax.ShapeDtypeStruct]
     noise: dict[str, jax.ShapeDtypeStruct]
-    memory: dict[str, Array]  # what it begins with
+    carry: dict[str, Array]  # what it begins with
     results: list[str]  # the action and what is known of it
 
     @property
     def inputs(self) -> dict[str, Any]:
         """Arrays or their shapes, by name; the key, which comes first, is no input of a file."""
-        return self.seen | self.noise | self.memory
+        return self.seen | self.noise | self.carry
 
     @property
     def outputs(self) -> list[str]:
-        return [*self.results, *(name.replace("memory.", "next.", 1) for name in self.memory)]
+        return [*self.results, *(name.replace("memory.", "next.", 1) for name in self.carry)]
 
 
 def step_of(job: Job, policy: Policy) -> Step:
@@ -137,18 +137,16 @@ def step_of(job: Job, policy: Policy) -> Step:
     traced = _trace(job, policy)
     program = traced.given.jaxpr
     names = list(traced.inputs)
-    equations, used = live(program, ["key", *names], list(traced.memory), len(traced.results))
+    equations, used = live(program, ["key", *names], list(traced.carry), len(traced.results))
     if "key" in used:
         raise UserError(
             "This policy draws more than normal noise, and a file holds nothing that draws; play it with "
             "ringfence.Controller."
         )
-    used -= _constant_memory(traced)
+    used -= _constant_carry(traced)
     inputs = [k for k, name in enumerate(names) if name in used]
     outputs = [k for k, name in enumerate(traced.outputs) if k < len(traced.results) or _before(name) in used]
-    unread = {
-        variable: traced.memory[name] for name, variable in zip(names, program.invars[1:]) if name in traced.memory
-    }
+    unread = {variable: traced.carry[name] for name, variable in zip(names, program.invars[1:]) if name in traced.carry}
     constants = _shared(values_of(traced.given)) | unread
 
     def call(*arrays: Array) -> list[Array]:
@@ -164,7 +162,7 @@ def step_of(job: Job, policy: Policy) -> Step:
         call,
         tuple(_entry(names[k], shapes[k]) for k in inputs),
         tuple(_entry(traced.outputs[k], avals[k]) for k in outputs),
-        {name: np.asarray(array) for name, array in traced.memory.items() if name in used},
+        {name: np.asarray(array) for name, array in traced.carry.items() if name in used},
         jax.jit(partial(_drawn, traced)),
     )
 
@@ -172,18 +170,18 @@ def step_of(job: Job, policy: Policy) -> Step:
 def _trace(job: Job, policy: Policy) -> _Traced:
     """A policy's programs, before anything is left out."""
     seen = _seen(job, policy)
-    memory = policy.start(1)
-    leaves, structure = jax.tree.flatten(memory)
+    carry = policy.initial_state(1)
+    leaves, structure = jax.tree.flatten(carry)
     constraints = _constraints(policy)
 
     def act(key: Key, seen_arrays: Sequence[Array], leaves: Sequence[Array]) -> tuple[dict[str, Array], list[Array]]:
         read = dict(zip(seen, seen_arrays))
         costs = {name: read["cost"][k : k + 1] for k, name in enumerate(constraints)}
-        memory = with_cost(policy, jax.tree.unflatten(structure, leaves), costs or read["cost"][None])
+        carry = with_cost(policy, jax.tree.unflatten(structure, leaves), costs or read["cost"][None])
         state = read["state"][None] if "state" in read else None
-        memory, step = policy.act(memory, read["observations"][None], state, key)
+        carry, step = policy.act(carry, read["observations"][None], state, key)
         info = {f"info.{k}": step.info[k][0] for k in INFO if k in step.info and step.info[k].ndim == 1}
-        return {"action": step.action[0]} | info, jax.tree.leaves(memory)
+        return {"action": step.action[0]} | info, jax.tree.leaves(carry)
 
     key = jax.random.key(0)
     drawing, (results, _) = jax.make_jaxpr(act, return_shape=True)(key, list(seen.values()), leaves)
@@ -196,7 +194,7 @@ def _trace(job: Job, policy: Policy) -> _Traced:
         return interpreter.run(drawing, (key, *arrays[: len(seen)], *arrays[len(seen) + len(noise) :]))
 
     given = jax.make_jaxpr(act_given)(key, *seen.values(), *noise.values(), *leaves)
-    names = [f"memory.{name}" for name, _ in named_leaves(memory)]
+    names = [f"memory.{name}" for name, _ in named_leaves(carry)]
     return _Traced(drawing, given, seen, noise, dict(zip(names, leaves)), list(results))
 
 
@@ -224,16 +222,16 @@ def _drawn(traced: _Traced, key: Key) -> list[Array]:
         return noise[-1]
 
     zeros = [jnp.zeros(shape.shape, shape.dtype) for shape in traced.seen.values()]
-    Interpreter(keep).run(traced.drawing, (key, *zeros, *traced.memory.values()))
+    Interpreter(keep).run(traced.drawing, (key, *zeros, *traced.carry.values()))
     return noise
 
 
-def _constant_memory(traced: _Traced) -> set[str]:
-    """Names of memory that no step changes: it is a constant."""
+def _constant_carry(traced: _Traced) -> set[str]:
+    """Names of carry that no step changes: it is a constant."""
     program = traced.given.jaxpr
-    before = program.invars[len(program.invars) - len(traced.memory) :]
+    before = program.invars[len(program.invars) - len(traced.carry) :]
     after = program.outvars[len(traced.results) :]
-    return {name for name, old, new in zip(traced.memory, before, after) if new is old}
+    return {name for name, old, new in zip(traced.carry, before, after) if new is old}
 
 
 def _before(name: str) -> str:

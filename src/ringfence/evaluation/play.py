@@ -180,10 +180,10 @@ class Table:
         """Play until all have ended; the key that is left over."""
         policy = self.player.policy
         with float32():
-            memory = policy.start(len(self.episodes))
+            carry = policy.initial_state(len(self.episodes))
         while any(e.running for e in self.episodes):
             key, now = jax.random.split(key)
-            memory, decided = self.player.act(policy, memory, *self._seen(), now)
+            carry, decided = self.player.act(policy, carry, *self._seen(), now)
             self._count(decided.info)
             for episode, action in zip(self.episodes, np.asarray(decided.action)):
                 if episode.running:
@@ -191,7 +191,7 @@ class Table:
             if any(e.lacks_cost for e in self.episodes if not e.skipped):
                 self._charge_by_formula()
             with float32():
-                memory = with_cost(policy, memory, self._last_costs())
+                carry = with_cost(policy, carry, self._last_costs())
         return key
 
     def _seen(self) -> tuple[np.ndarray, np.ndarray | None]:

@@ -120,11 +120,11 @@ class _OneByOne:
 
     def __init__(self, policy: Callback):
         self.policy = policy
-        self.start = policy.start
+        self.initial_state = policy.initial_state
         self.observe_cost = policy.observe_cost
 
-    def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         function = self.policy.function
         # Copies: a function that writes into what it sees must not blind its guard.
         wanted = [function(x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations)]
-        return self.policy.decided(memory, observations, state, wanted, key)
+        return self.policy.decided(carry, observations, state, wanted, key)

@@ -64,22 +64,22 @@ def _compiled(env: Env, reset_key: Key, act_key: Key) -> Callable[[Policy, int, 
     """A program that plays the chunk `index` of `batch` episodes and keeps what was drawn in the first `keep`."""
 
     def play(policy: Policy, index: int, batch: int, keep: int) -> dict[str, Array]:
-        def step(carry: PyTree, key: Key) -> tuple[PyTree, dict[str, Array]]:
-            memory, state = carry
-            memory, decided = policy.act(memory, env.observe(state), env.global_state(state), key)
+        def step(before: PyTree, key: Key) -> tuple[PyTree, dict[str, Array]]:
+            carry, state = before
+            carry, decided = policy.act(carry, env.observe(state), env.global_state(state), key)
             after, out = env.step(state, decided.action)
-            memory = with_cost(policy, memory, out.cost)
+            carry = with_cost(policy, carry, out.cost)
             kept = {"reward": out.reward.mean(-1), "cost": out.team_cost, "state": env.global_state(after)}
             if out.cost.ndim == 2:
                 kept["violated"] = out.cost > 0
             kept |= _counted(decided)
             if keep:
                 kept |= {name: value[:keep] for name, value in _drawn(decided).items()}
-            return (memory, after), kept
+            return (carry, after), kept
 
         state = env.reset(jax.random.fold_in(reset_key, index), batch)
         keys = jax.random.split(jax.random.fold_in(act_key, index), env.episode_length)
-        _, kept = jax.lax.scan(step, (policy.start(batch), state), keys)
+        _, kept = jax.lax.scan(step, (policy.initial_state(batch), state), keys)
         kept = {name: jnp.moveaxis(value, 0, 1) for name, value in kept.items()}
         kept["state"] = jnp.concatenate([env.global_state(state)[:, None], kept["state"]], 1)
         return kept
@@ -125,7 +125,7 @@ def _rollout_native(
     simulation = env.simulate(episodes)
     simulation.reset([(root, k) for k in range(episodes)])
     act = act_with if _foreign(policy) else jax.jit(act_with)
-    memory = policy.start(episodes)
+    carry = policy.initial_state(episodes)
     states = [simulation.state().astype(np.float32)]
     lengths = np.zeros(episodes, int)
     outcomes: list[Outcome] = []
@@ -136,12 +136,12 @@ def _rollout_native(
             if not simulation.running.any():
                 break
             observations = simulation.observe(states[-1])
-            memory, decided = act(policy, memory, observations, states[-1], jax.random.fold_in(key, t))
+            carry, decided = act(policy, carry, observations, states[-1], jax.random.fold_in(key, t))
             running = simulation.running.copy()
             lengths += running
             outcomes.append(simulation.step(np.asarray(decided.action)))
             states.append(simulation.state().astype(np.float32))
-            memory = with_cost(policy, memory, outcomes[-1].cost)
+            carry = with_cost(policy, carry, outcomes[-1].cost)
             counted.append({name: np.asarray(value) & running for name, value in _counted(decided).items()})
             if num_recorded:
                 drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})

@@ -22,6 +22,7 @@ from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
+from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.card import Avoidable
 from ringfence.world.verdict import require
@@ -36,7 +37,7 @@ Paid = float | Mapping[str, float]  # what a step cost, in all or by each constr
 Cost = Array | dict[str, Array]  # the same of a batch: (B,) or (B, N), or that by constraint
 
 
-class Guarded(eqx.Module):
+class Guarded(HadStart, eqx.Module):
     """A proposal under guard; itself a policy (types.Policy).
 
     A policy that proposes several steps has a method `propose`. One that gives one action at a time has its action
@@ -46,13 +47,13 @@ class Guarded(eqx.Module):
     proposal: Any
     guard: Guard
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         options = self.guard.options
         spec = self.guard.world.spec
         constraints = max(1, len(self.guard.barrier.limits))
         shape = (batch, spec.n_agents, constraints) if self.guard.world.alone else (batch, constraints)
-        memory = {
-            "inner": self.proposal.start(batch),
+        carry = {
+            "inner": self.proposal.initial_state(batch),
             "margin": jnp.full(shape, options.margin),
             "last": jnp.zeros((batch, options.horizon, spec.n_agents, spec.action_dim)),
             "before": jnp.zeros((batch, spec.n_agents, spec.feature_dim)),
@@ -60,15 +61,15 @@ class Guarded(eqx.Module):
             "age": jnp.zeros((), jnp.int32),
         }
         if constraints > 1:
-            memory["costs"] = jnp.full((batch, constraints), jnp.nan)
-        return memory
+            carry["costs"] = jnp.full((batch, constraints), jnp.nan)
+        return carry
 
-    def observe_cost(self, memory: PyTree, cost: Cost) -> PyTree:
-        """The memory with the cost of the last step, (B,) or (B, N), or of each constraint by its name: an adapting
+    def observe_cost(self, carry: PyTree, cost: Cost) -> PyTree:
+        """The carry with the cost of the last step, (B,) or (B, N), or of each constraint by its name: an adapting
         margin follows it. Without a cost the margin follows the guard's own judgement of the step. A cost that names
         none of several constraints is charged to those that judge the step unsafe, or to all."""
         if not isinstance(cost, dict):
-            return {**memory, "cost": _of_team(cost)}
+            return {**carry, "cost": _of_team(cost)}
         costs = {name: _of_team(c) for name, c in cost.items()}
         names = self.guard.barrier.limits
         for name in costs:
@@ -76,26 +77,26 @@ class Guarded(eqx.Module):
                 raise unknown("constraint", name, names)
         if not costs:
             raise UserError("cost names no constraint; give the cost of each, or None where nobody knows it.")
-        if "costs" not in memory:
-            return {**memory, "cost": functools.reduce(jnp.maximum, costs.values())}
-        nothing = jnp.full_like(memory["cost"], jnp.nan)
-        return {**memory, "costs": jnp.stack([costs.get(name, nothing) for name in names], -1)}
+        if "costs" not in carry:
+            return {**carry, "cost": functools.reduce(jnp.maximum, costs.values())}
+        nothing = jnp.full_like(carry["cost"], jnp.nan)
+        return {**carry, "costs": jnp.stack([costs.get(name, nothing) for name in names], -1)}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         key_propose, key_decide = jax.random.split(key)
-        inner, actions, info = self.proposed(memory["inner"], observations, state, key_propose)
+        inner, actions, info = self.proposed(carry["inner"], observations, state, key_propose)
         present = self.guard.world.map(observations, state)
-        memory, step = self.decided({**memory, "inner": inner}, present, actions, key_decide)
-        return memory, step._replace(info=info | step.info)
+        carry, step = self.decided({**carry, "inner": inner}, present, actions, key_decide)
+        return carry, step._replace(info=info | step.info)
 
-    def decided(self, memory: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+    def decided(self, carry: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
         """What becomes of proposals (B, P, K, N, A) in the present (B, N, D)."""
         guard = self.guard
-        margin = jnp.full_like(memory["margin"], guard.options.margin)  # known to the compiler unless it moves
+        margin = jnp.full_like(carry["margin"], guard.options.margin)  # known to the compiler unless it moves
         if guard.options.adapt:
-            adapted = guard.adapted(memory["margin"], self._was_unsafe(memory, present))
-            margin = jnp.where(memory["age"] == 0, margin, adapted)
-        found = guard.decide(present, actions, memory["last"], margin, key)
+            adapted = guard.adapted(carry["margin"], self._was_unsafe(carry, present))
+            margin = jnp.where(carry["age"] == 0, margin, adapted)
+        found = guard.decide(present, actions, carry["last"], margin, key)
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -105,43 +106,43 @@ class Guarded(eqx.Module):
         }
         spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
-        unknown_costs = {name: jnp.full_like(memory[name], jnp.nan) for name in ("cost", "costs") if name in memory}
-        memory = {
-            **memory,
+        unknown_costs = {name: jnp.full_like(carry[name], jnp.nan) for name in ("cost", "costs") if name in carry}
+        carry = {
+            **carry,
             **unknown_costs,
             "margin": margin,
             "last": found.plan,
             "before": present,
-            "age": memory["age"] + 1,
+            "age": carry["age"] + 1,
         }
-        return memory, PolicyStep(action, info)
+        return carry, PolicyStep(action, info)
 
-    def _was_unsafe(self, memory: PyTree, present: Array) -> Array:
+    def _was_unsafe(self, carry: PyTree, present: Array) -> Array:
         """(B, C) bool, or (B, N, C) of agents who are alone: what the step to the present cost, or is judged by the
         guard itself where its cost is not known."""
-        judged = self.guard.barrier.now(memory["before"], present) < 0
+        judged = self.guard.barrier.now(carry["before"], present) < 0
         if not self.guard.world.alone:
             judged = judged.any(-2)
         axes = (1,) * (judged.ndim - 2)
-        cost = memory["cost"].reshape(-1, *axes, 1)
+        cost = carry["cost"].reshape(-1, *axes, 1)
         blamed = (cost > 0) & (judged | ~judged.any(-1, keepdims=True))
         unsafe = jnp.where(jnp.isnan(cost), judged, blamed)
-        if "costs" in memory:
-            costs = memory["costs"].reshape(-1, *axes, memory["costs"].shape[-1])
+        if "costs" in carry:
+            costs = carry["costs"].reshape(-1, *axes, carry["costs"].shape[-1])
             unsafe = jnp.where(jnp.isnan(costs), unsafe, costs > 0)
         return unsafe
 
     def proposed(
         self, inner: PyTree, observations: Array, state: Array | None, key: Key
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(memory, actions (B, P, K, N, A) in [−1, 1], info) of the proposal."""
+        """(carry, actions (B, P, K, N, A) in [−1, 1], info) of the proposal."""
         world = self.guard.world
         options = self.guard.options
         if isinstance(self.proposal, Proposes):
             return self.proposal.propose(inner, observations, state, key, options.num_samples, options.horizon, world)
-        memory, step = self.proposal.act(inner, observations, state, key)
+        carry, step = self.proposal.act(inner, observations, state, key)
         action = normalise.to_unit(step.action, world.spec.action_low, world.spec.action_high)
-        return memory, held(action, options.horizon), {}
+        return carry, held(action, options.horizon), {}
 
 
 def costs_of_one(cost: Paid, agents: int) -> np.ndarray | dict[str, np.ndarray]:

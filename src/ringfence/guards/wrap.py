@@ -19,14 +19,14 @@ from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
 from ringfence.utils.given import NUMBERS, given_as
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import renamed, renamed_values
+from ringfence.utils.renamed import policy_of_before, renamed, renamed_values
 from ringfence.world import World
 
 
 @jax.jit
-def _decided(guarded: Guarded, memory: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+def _decided(guarded: Guarded, carry: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
     """One program for every guard of the same World and options."""
-    return guarded.decided(memory, present, actions, key)
+    return guarded.decided(carry, present, actions, key)
 
 
 class Callback:
@@ -42,16 +42,16 @@ class Callback:
         return team_policy(self.guarded, self.agents, self.guarded.guard.world.spec.homogeneous)
 
     @in_float32
-    def start(self, batch: int) -> PyTree:
-        return self._team.start(batch)
+    def initial_state(self, batch: int) -> PyTree:
+        return self._team.initial_state(batch)
 
     @in_float32
-    def observe_cost(self, memory: PyTree, cost) -> PyTree:
-        return self._team.observe_cost(memory, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
+    def observe_cost(self, carry: PyTree, cost) -> PyTree:
+        return self._team.observe_cost(carry, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
 
-    def act(self, memory: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
-        return self.decided(memory, observations, state, wanted, key)
+        return self.decided(carry, observations, state, wanted, key)
 
     def seen(self, observations: Any, state: Any) -> tuple[np.ndarray, np.ndarray | None]:
         """What one environment shows, (N, O) and (S,) or None: copies, of the widths that the World was fitted to."""
@@ -95,7 +95,7 @@ class Callback:
         return wanted
 
     @in_float32
-    def decided(self, memory: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
+    def decided(self, carry: PyTree, observations, state, wanted, key: Key) -> tuple[PyTree, PolicyStep]:
         """What becomes of the function's actions (B, N, A)."""
         world = self.guarded.guard.world
         spec, batch = world.spec, len(observations)
@@ -104,14 +104,14 @@ class Callback:
         given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
         present = local_features(world.map, spec.homogeneous, *given)
         plan = held(split_agents(action) if spec.homogeneous else action, self.guarded.guard.options.horizon)
-        memory, step = _decided(self.guarded, memory, present, plan, key)
-        return memory, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
+        carry, step = _decided(self.guarded, carry, present, plan, key)
+        return carry, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
 
 
 class Nothing(eqx.Module):
     """Stands where a callback's proposals come from outside."""
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
 
@@ -131,6 +131,7 @@ def under_guard(
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
     options = renamed(options, stored.GUARD_OPTIONS | {"danger": "barrier"}, "the guard")
     barrier = renamed_values({"barrier": options.pop("barrier", barrier)}, stored.VALUES)["barrier"]
+    policy = policy_of_before(policy)
     if isinstance(policy, PerAgent):
         return PerAgent(build(policy.one, world, hazard, guard, barrier, anyway=anyway, **options), policy.agents)
     if isinstance(policy, Policy):

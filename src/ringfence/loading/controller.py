@@ -65,7 +65,7 @@ class Controller:
     @in_float32
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
-        self._memory = self.policy.start(1)
+        self._carry = self.policy.initial_state(1)
 
     def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
         """(N, A) joint action within the task's bounds; a callable is asked with the same arrays. `cost` is what the
@@ -79,9 +79,9 @@ class Controller:
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
             key, now = jax.random.split(self._key)
-            memory, step = source.act(self._memory, seen, paid, now)
+            carry, step = source.act(self._carry, seen, paid, now)
             action, info = acted(step, source.name)
-        self._memory, self._key, self.info, self.last_action = memory, key, Info(info), action.copy()
+        self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
         return action
 
 
@@ -100,11 +100,11 @@ def guard(
 ) -> Guarded | PerAgent | Controller:
     """Any policy under guard.
 
-    policy: a policy of the library (with `start` and `act`), which gives a `Guarded`; or any callable (observations
-    (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network or a controller,
-    which gives a `Controller`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in
-    GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one,
-    where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
+    policy: a policy of the library (with `initial_state` and `act`), which gives a `Guarded`; or any callable
+    (observations (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network, which
+    gives a `Controller`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in GUARDS,
+    `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one, where that
+    is to be used. A World whose verdict is unfit is refused, unless `anyway`.
     """
     found = under_guard(
         policy, world, guard=guard, barrier=barrier, hazard=hazard, agents=agents, anyway=anyway, **options
@@ -143,10 +143,10 @@ class _TrainedRun:
         return seen, whole
 
     @in_float32
-    def act(self, memory: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
         if cost is not None:
-            memory = with_cost(self.policy, memory, cost)
-        return self._act(self.policy, memory, *_batch(seen), key)
+            carry = with_cost(self.policy, carry, cost)
+        return self._act(self.policy, carry, *_batch(seen), key)
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
         """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
@@ -170,13 +170,13 @@ class _Function:
         self.agents = policy.agents
         self.seen = policy.seen
 
-    def act(self, memory: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
         observations, state = seen
         # Copies: a function that writes into what it sees must not blind its guard.
         wanted = self.policy.function(observations.copy(), None if state is None else state.copy())
         if cost is not None:
-            memory = self.policy.observe_cost(memory, cost)
-        return self.policy.decided(memory, *_batch(seen), [wanted], key)
+            carry = self.policy.observe_cost(carry, cost)
+        return self.policy.decided(carry, *_batch(seen), [wanted], key)
 
 
 def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _Function:

@@ -84,25 +84,25 @@ class Foreseen(eqx.Module):
     env: Known = eqx.field(static=True)
     spec: Spec = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
-        return self.policy.start(batch)
+    def initial_state(self, batch: int) -> PyTree:
+        return self.policy.initial_state(batch)
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> Any:
-        return self.policy.act(memory, observations, state, key)
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> Any:
+        return self.policy.act(carry, observations, state, key)
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        def step(carry: tuple[PyTree, PyTree], _: None) -> tuple[tuple[PyTree, PyTree], tuple[Array, PyTree]]:
-            before, now = carry
-            memory, decided = self.policy.act(before, self.env.observe(now), self.env.global_state(now), key)
+        def step(before: tuple[PyTree, PyTree], _: None) -> tuple[tuple[PyTree, PyTree], tuple[Array, PyTree]]:
+            carry, now = before
+            carry, decided = self.policy.act(carry, self.env.observe(now), self.env.global_state(now), key)
             after, _out = self.env.step(now, decided.action)
             unit = normalise.to_unit(decided.action, self.spec.action_low, self.spec.action_high)
-            return (memory, after), (unit, memory)
+            return (carry, after), (unit, carry)
 
-        first = (memory, self.env.from_global_state(state))
-        _, (actions, memories) = jax.lax.scan(step, first, None, length=rows)
-        after_first = jax.tree.map(lambda x: x[0], memories)
+        first = (carry, self.env.from_global_state(state))
+        _, (actions, carries) = jax.lax.scan(step, first, None, length=rows)
+        after_first = jax.tree.map(lambda x: x[0], carries)
         return after_first, jnp.moveaxis(actions, 0, 1)[:, None], {}
 
 

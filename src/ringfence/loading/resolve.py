@@ -26,7 +26,7 @@ from ringfence.training.runs import Run
 from ringfence.types import Policy, PyTree, Spec
 from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import renamed
+from ringfence.utils.renamed import policy_of_before, renamed
 from ringfence.world import World
 
 
@@ -205,4 +205,5 @@ def _stored_widths(stored: Mapping[str, Any]) -> tuple[int | None, int | None]:
 def make_policy(job: Job, state: PyTree, options: Mapping[str, Any]) -> Policy:
     """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
     chosen = build_config(PlanOptions, {**plan_defaults(job.config), **options}, "the planner")
-    return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
+    made = job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
+    return policy_of_before(made)

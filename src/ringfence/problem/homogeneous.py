@@ -14,35 +14,36 @@ import jax.numpy as jnp
 
 from ringfence.problem.features import FeatureMap, X
 from ringfence.types import Array, Key, ObservesCost, PolicyStep, PyTree
+from ringfence.utils.renamed import HadStart
 
 
-class PerAgent(eqx.Module):
+class PerAgent(HadStart, eqx.Module):
     """A policy of teams of one, played by every agent of a team of `agents`. Nobody hears of anybody."""
 
     one: Any
     agents: int = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
-        return self.one.start(batch * self.agents)
+    def initial_state(self, batch: int) -> PyTree:
+        return self.one.initial_state(batch * self.agents)
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O) -> actions (B, N, A); a flag of one agent is one of its team."""
-        memory, step = self.one.act(memory, split_agents(observations), None, key)
+        carry, step = self.one.act(carry, split_agents(observations), None, key)
         batch, agents = observations.shape[:2]
-        return memory, merge_agents(step, (batch, agents))
+        return carry, merge_agents(step, (batch, agents))
 
-    def observe_cost(self, memory: PyTree, cost: Array | dict[str, Array]) -> PyTree:
+    def observe_cost(self, carry: PyTree, cost: Array | dict[str, Array]) -> PyTree:
         """Costs (B, N) of each agent, or (B,) of the team, which are then everybody's; or these by constraint."""
         if not isinstance(self.one, ObservesCost):
-            return memory
+            return carry
 
         def own(cost: Array) -> Array:
             own = cost if cost.ndim == 2 else jnp.repeat(cost[:, None], self.agents, 1)
             return own.reshape(-1)
 
         if isinstance(cost, dict):
-            return self.one.observe_cost(memory, {name: own(part) for name, part in cost.items()})
-        return self.one.observe_cost(memory, own(cost))
+            return self.one.observe_cost(carry, {name: own(part) for name, part in cost.items()})
+        return self.one.observe_cost(carry, own(cost))
 
 
 def team_policy(policy: Any, agents: int, homogeneous: bool) -> Any:

@@ -13,10 +13,11 @@ from ringfence.problem import normalise
 from ringfence.problem.features import FeatureMap, translation
 from ringfence.problem.normalise import Normaliser
 from ringfence.types import Array, Key, ObservesCost, Policy, PolicyStep, PyTree, Spec
+from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 
 
-class Direct(eqx.Module):
+class Direct(HadStart, eqx.Module):
     """An actor network on the present features, one per agent, squashed into the action bounds."""
 
     actor: Any
@@ -24,22 +25,22 @@ class Direct(eqx.Module):
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
-        return memory, PolicyStep(from_unit(self.decide(self.feature_map(observations, state)), self.spec), {})
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        return carry, PolicyStep(from_unit(self.decide(self.feature_map(observations, state)), self.spec), {})
 
     def decide(self, x: Array) -> Array:
         """Actions (..., N, A) in [−1, 1] at features (..., N, D)."""
         return jnp.tanh(self.actor(self.normaliser.state(x)))
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(memory, actions (B, 1, `rows`, N, A) in [−1, 1], info): what the actor does now and along foreseen rows."""
+        """(carry, actions (B, 1, `rows`, N, A) in [−1, 1], info): what the actor does now and along foreseen rows."""
         seen, present = self.feature_map(observations, state), world.map(observations, state)
-        return memory, rolled(self.decide, self.feature_map, world, seen, present, rows), {}
+        return carry, rolled(self.decide, self.feature_map, world, seen, present, rows), {}
 
 
 def from_unit(action: Array, spec: Spec) -> Array:
@@ -47,21 +48,21 @@ def from_unit(action: Array, spec: Spec) -> Array:
     return normalise.from_unit(spec.own(action), spec.action_low, spec.action_high)
 
 
-class Constant(eqx.Module):
+class Constant(HadStart, eqx.Module):
     """Does nothing, or acts uniformly at random: the reference rows of every table."""
 
     spec: Spec = eqx.field(static=True)
     random: bool = eqx.field(static=True, default=False)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         s = self.spec
         shape = (observations.shape[0], s.n_agents, s.action_dim)
         if self.random:
-            return memory, PolicyStep(jax.random.uniform(key, shape, minval=s.action_low, maxval=s.action_high), {})
-        return memory, PolicyStep(jnp.zeros(shape), {})
+            return carry, PolicyStep(jax.random.uniform(key, shape, minval=s.action_low, maxval=s.action_high), {})
+        return carry, PolicyStep(jnp.zeros(shape), {})
 
 
 def held(action: Array, rows: int) -> Array:
@@ -84,12 +85,12 @@ def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, presen
     return jnp.stack(actions, 1)[:, None]
 
 
-def with_cost(policy: Policy, memory: PyTree, cost: Any) -> PyTree:
-    """The memory of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
+def with_cost(policy: Policy, carry: PyTree, cost: Any) -> PyTree:
+    """The carry of a policy that wants to know what its last step cost, (B,) or (B, N), or that by constraint; arrays
     of NumPy or JAX."""
-    return policy.observe_cost(memory, cost) if isinstance(policy, ObservesCost) else memory
+    return policy.observe_cost(carry, cost) if isinstance(policy, ObservesCost) else carry
 
 
-def act_with(policy: Policy, memory: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
+def act_with(policy: Policy, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
     """The policy as an argument, so that what is compiled does not hold its parameters as constants."""
-    return policy.act(memory, observations, state, key)
+    return policy.act(carry, observations, state, key)

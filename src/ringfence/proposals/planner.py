@@ -26,13 +26,14 @@ from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.values import Critic, plan_value
 
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
-class Planner(eqx.Module):
+class Planner(HadStart, eqx.Module):
     """Receding-horizon diffusion planner."""
 
     networks: dict[str, Any]  # denoiser, inverse
@@ -64,7 +65,7 @@ class Planner(eqx.Module):
             raise UserError("execution='centralized' needs a model trained with observe='all' or 'mixed'.")
         diffusion.timesteps(len(self.alpha_bar), o.sampling_steps)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         n, d = self.spec.n_agents, self.spec.feature_dim
         rows = self.history + self.horizon
         return {
@@ -73,24 +74,24 @@ class Planner(eqx.Module):
             "age": jnp.zeros((), jnp.int32),
         }
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds, of one plan."""
-        o, (past, present) = self.options, self._context(memory, observations, state)
+        o, (past, present) = self.options, self._context(carry, observations, state)
         if o.replan == 1:
             plan = self.plans(past, present, key, 1)[:, 0]
             ahead = plan[:, self.history + 1]
         else:
-            fresh = memory["age"] % o.replan == 0
-            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1)[:, 0], lambda: memory["plan"])
-            ahead = jnp.take(plan, self.history + 1 + memory["age"] % o.replan, axis=1)
+            fresh = carry["age"] % o.replan == 0
+            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1)[:, 0], lambda: carry["plan"])
+            ahead = jnp.take(plan, self.history + 1 + carry["age"] % o.replan, axis=1)
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
-        return self._kept(memory, past, present, plan), PolicyStep(from_unit(action, self.spec), info)
+        return self._kept(carry, past, present, plan), PolicyStep(from_unit(action, self.spec), info)
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(memory, actions (B, `count`, `rows`, N, A) in [−1, 1], info): what inverse dynamics does to track plans,
+        """(carry, actions (B, `count`, `rows`, N, A) in [−1, 1], info): what inverse dynamics does to track plans,
         along the rows that the World foresees if it reads the same view, else along the plans themselves."""
         if self.options.replan > 1:
             raise UserError("A guard decides at every step; use replan=1.")
@@ -99,7 +100,7 @@ class Planner(eqx.Module):
                 f"horizon={rows} rows are judged, but plans hold {self.horizon - 1} steps; use at most as many, or a "
                 "longer horizon."
             )
-        past, present = self._context(memory, observations, state)
+        past, present = self._context(carry, observations, state)
         plans = self.plans(past, present, key, count)
         flat = plans.reshape(-1, *plans.shape[2:])
         x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
@@ -108,19 +109,19 @@ class Planner(eqx.Module):
             actions.append(jnp.clip(action, -1.0, 1.0))
             x = world.dynamics.step(x, actions[-1])[0] if tracks else flat[:, row]
         actions = jnp.stack(actions, 1).reshape(*plans.shape[:2], rows, *actions[0].shape[1:])
-        return self._kept(memory, past, present, plans[:, 0]), actions, {}
+        return self._kept(carry, past, present, plans[:, 0]), actions, {}
 
-    def _context(self, memory: PyTree, observations: Array, state: Array | None) -> tuple[Array, Array]:
+    def _context(self, carry: PyTree, observations: Array, state: Array | None) -> tuple[Array, Array]:
         """Past rows (B, history, N, D) and the present (B, N, D)."""
-        present, past = self.feature_map(observations, state), memory["past"]
+        present, past = self.feature_map(observations, state), carry["past"]
         if self.history:
-            past = jnp.where(memory["age"] == 0, jnp.repeat(present[:, None], self.history, 1), past)
+            past = jnp.where(carry["age"] == 0, jnp.repeat(present[:, None], self.history, 1), past)
         return past, present
 
-    def _kept(self, memory: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
+    def _kept(self, carry: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
         if self.history:
             past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
-        return {"past": past, "plan": plan, "age": memory["age"] + 1}
+        return {"past": past, "plan": plan, "age": carry["age"] + 1}
 
     def plans(self, past: Array, present: Array, key: Key, count: int) -> Array:
         """(B, count, rows, N, D) plans from the present (B, N, D). Decentralised, every agent imagines the whole team,

@@ -51,6 +51,26 @@ class Info(dict[str, T]):
         return self[today]
 
 
+class HadStart:
+    """A policy whose `initial_state` was called `start`."""
+
+    def initial_state(self, batch: int) -> Any:
+        raise NotImplementedError
+
+    def start(self, batch: int) -> Any:
+        deprecated("start of a policy", "initial_state")
+        return self.initial_state(batch)
+
+
+def policy_of_before(policy: T) -> T:
+    """Somebody's policy, whose class may call `initial_state` by the name of before."""
+    kind: Any = type(policy)
+    if not hasattr(kind, "initial_state") and hasattr(kind, "start") and hasattr(kind, "act"):
+        deprecated(f"start of the policy {kind.__name__}", "initial_state")
+        kind.initial_state = kind.start
+    return policy
+
+
 def renamed(given: Mapping[str, Any], names: Mapping[str, str], of: str, warn: bool = True) -> dict[str, Any]:
     """What was given by name, under today's names; `names` maps those of before to them. Two names of one choice are
     refused. Without `warn` nothing is said, e.g. of a file that an older version wrote."""

@@ -59,15 +59,15 @@ class Driven(eqx.Module):
     env: Crossing = eqx.field(static=True)
     driver: Driver = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         if state is None:
             raise UserError("The certificates read the global state; pass it.")
         now = self.env.from_global_state(state)
         driver = jnp.broadcast_to(jnp.array(astuple(self.driver)), (*observations.shape[:2], 5))
-        return memory, PolicyStep(drive(self.env, now, driver, key), {})
+        return carry, PolicyStep(drive(self.env, now, driver, key), {})
 
 
 def references(task: Task) -> dict[str, Policy]:

@@ -40,14 +40,14 @@ class Driven(eqx.Module):
     system: System = eqx.field(static=True)
     habit: drivers.Habit = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         if state is None:
             raise UserError("The scripted drivers read the global state; pass it.")
         now = self.system.from_global_state(state)
-        return memory, PolicyStep(drivers.drive(self.system, now, self.habit, key), {})
+        return carry, PolicyStep(drivers.drive(self.system, now, self.habit, key), {})
 
 
 class Naive(eqx.Module):
@@ -55,11 +55,11 @@ class Naive(eqx.Module):
 
     system: System = eqx.field(static=True)
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
-        return memory, PolicyStep(drivers.naive(self.system, observations), {})
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        return carry, PolicyStep(drivers.naive(self.system, observations), {})
 
 
 def references(task: Task) -> dict[str, Policy]:

@@ -34,11 +34,11 @@ class Behaviour(eqx.Module):
 
     policy: policies.BehaviourPolicy
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
-        return memory, PolicyStep(self.policy.act(observations, key), {})
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        return carry, PolicyStep(self.policy.act(observations, key), {})
 
 
 def references(task: Task) -> dict[str, Policy]:

@@ -126,9 +126,9 @@ def _play(
     """(steps, episodes) each: what is earned, whether a step is unsafe, whether it leaves the logs' distribution."""
     spec = world.spec
 
-    def step(carry, key: Key):
-        memory, x = carry
-        memory, decided = policy.act(memory, *observe(x), key)
+    def step(before, key: Key):
+        carry, x = before
+        carry, decided = policy.act(carry, *observe(x), key)
         action = normalise.to_unit(decided.action, spec.action_low, spec.action_high)
         change = world.dynamics.changes(x, action)
         after = world.dynamics.arrived(x, change[member])
@@ -136,9 +136,9 @@ def _play(
         earned = world.values.of_steps(x, action, after)
         earned = earned if earned.ndim == 1 else earned.mean(-1)
         unsafe = _unsafe(barrier, x[:, None], after[:, None], spread[:, None])[:, 0]
-        return (memory, after), (earned, unsafe, (spread > world.ood_threshold).any(-1))
+        return (carry, after), (earned, unsafe, (spread > world.ood_threshold).any(-1))
 
-    _, kept = jax.lax.scan(step, (policy.start(len(starts)), starts), jax.random.split(key, steps))
+    _, kept = jax.lax.scan(step, (policy.initial_state(len(starts)), starts), jax.random.split(key, steps))
     return kept
 
 

@@ -1,4 +1,4 @@
-"""What a policy does in logged states, with the memory of an episode's first step."""
+"""What a policy does in logged states, with the carry of an episode's first step."""
 
 from __future__ import annotations
 
@@ -63,27 +63,27 @@ def _respond(policy: Any, world: World, seen: Array, state: Array | None, key: K
     """Fields of `Responses`."""
     spec = world.spec
     act_key, plan_key = jax.random.split(key)
-    memory, step = policy.act(policy.start(len(seen)), seen, state, act_key)
+    carry, step = policy.act(policy.initial_state(len(seen)), seen, state, act_key)
     action = normalise.to_unit(step.action, spec.action_low, spec.action_high)
     found = {"action": action} | {k: step.info[k] for k in ("infeasible", "ood") if k in step.info}
     if isinstance(policy, Guarded):
-        _, wanted, _ = policy.proposed(policy.start(len(seen))["inner"], seen, state, act_key)
+        _, wanted, _ = policy.proposed(policy.initial_state(len(seen))["inner"], seen, state, act_key)
         wanted = _in_units_of(world, policy.guard.world.spec, wanted)
         difference = jnp.abs(wanted - action[:, None, None])[:, :, 0].max((-2, -1))
         found["changed"] = difference.min(-1) > CHANGED
-    plan = _plan(policy, memory, world, seen, state, action, plan_key, ahead)
+    plan = _plan(policy, carry, world, seen, state, action, plan_key, ahead)
     rest = jnp.broadcast_to(plan[:, -1:], (len(seen), ahead, *plan.shape[2:]))
     return found | {"plan": jnp.concatenate([action[:, None], plan[:, 1:], rest], 1)[:, :ahead]}
 
 
 def _plan(
-    policy: Any, memory: PyTree, world: World, seen: Array, state: Array | None, action: Array, key: Key, ahead: int
+    policy: Any, carry: PyTree, world: World, seen: Array, state: Array | None, action: Array, key: Key, ahead: int
 ) -> Array:
     """(B, K, N, A): the guard's plan, else what the policy proposes, else its action held."""
     if isinstance(policy, Guarded):
-        return _in_units_of(world, policy.guard.world.spec, memory["last"])
+        return _in_units_of(world, policy.guard.world.spec, carry["last"])
     if isinstance(policy, Proposes):
-        proposed = policy.propose(policy.start(len(seen)), seen, state, key, 1, ahead, world)[1][:, 0]
+        proposed = policy.propose(policy.initial_state(len(seen)), seen, state, key, 1, ahead, world)[1][:, 0]
         return _in_units_of(world, getattr(policy, "spec", world.spec), proposed)
     return held(action, ahead)[:, 0]
 
