@@ -11,9 +11,10 @@ import pytest
 from ringfence import EpisodeStore, fit, guard
 from ringfence.errors import UserError
 from ringfence.problem import features
-from ringfence.world import causes, verdict
+from ringfence.world import cause_search, causes, verdict
 from ringfence.world.card import BarrierScores, Card, Data, PredictionError, Verdict
-from ringfence.world.cause_nets import blank
+from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
+from ringfence.world.cells import Cells
 from ringfence.world.logged import held_out
 
 N, STEPS = 3, 40
@@ -46,7 +47,7 @@ def logged():
 def test_every_cause_is_found_and_no_other(logged, each):
     """A pair, a place and a speed, by one cost of the team or by each agent's own; goals are left out."""
     x, unsafe, episode = logged
-    found, cells = causes.find(x, unsafe if each else unsafe.any(1), episode, NAMES)
+    found, cells = cause_search.find(x, unsafe if each else unsafe.any(1), episode, NAMES)
     assert {c.name for c in found.causes} == {"length of other.dx, other.dy", "own.x, own.y", "own.v"} or {
         c.name for c in found.causes
     } == {"length of other.dx, other.dy", "length of own.x, own.y", "own.v"}
@@ -58,7 +59,7 @@ def test_every_cause_is_found_and_no_other(logged, each):
 
 def test_causes_are_found_without_names(logged):
     x, unsafe, episode = logged
-    found, _ = causes.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])
+    found, _ = cause_search.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])
     entries = {c.things[0] for c in found.causes}
     assert {(5, 6), (7, 8), (2,), (0, 1)} == entries
 
@@ -66,13 +67,62 @@ def test_causes_are_found_without_names(logged):
 def test_danger_that_nothing_tells_has_no_cause(logged):
     x, unsafe, episode = logged
     chance = np.random.default_rng(0).random(len(x)) < 0.05
-    assert causes.find(x, chance, episode, NAMES)[0].causes == ()
+    assert cause_search.find(x, chance, episode, NAMES)[0].causes == ()
+
+
+def test_what_holds_for_some_agents_alone_is_found(logged):
+    """The first two must not drift apart; the third may go where it likes."""
+    x, _, episode = logged
+    apart = np.linalg.norm(x[:, 0, 5:7], axis=-1) > 3.0
+    found, _ = cause_search.find(x, apart, episode, NAMES)
+    assert len(found.causes) == 1 and found.explained > 0.9
+    assert found.causes[0].length and set(found.causes[0].who) <= {(0, 0), (1, 0)}
+    assert "of agent" in found.causes[0].name
+    assert abs(found.edges[0].at - 3.0) < 0.05 and not found.edges[0].below
+    net = blank(found, 8)[0]
+    each = np.asarray(scores(net, jnp.asarray(x[:5])))
+    held = net.cause.holds(N)
+    assert (each[:, ~held] == FAR).all() and (each[:, held] < FAR).all()
+
+
+def cells_of(pattern, length=True, visits=100.0):
+    """Cells of one number from 0 to 1, as dangerous as the pattern says; None: never visited."""
+    known = np.array([v is not None for v in pattern])
+    danger = np.array([v or 0.0 for v in pattern])
+    cause = causes.Cause("d", ((0,),), length)
+    return Cells(cause, np.zeros(1), np.ones(1), len(pattern), visits * known, danger)
+
+
+def test_an_edge_does_not_flicker_and_unvisited_ends_are_unsafe():
+    """One odd cell of few visits is no edge; a distance is trusted beyond what was seen, another number is not."""
+    pattern = [0.99] * 4 + [0.0] * 2 + [0.99] + [0.0] * 13
+    odd = cells_of(pattern)
+    odd.visits[6] = 4
+    assert odd.edge.bounds == (0.2,) and odd.edge.at == 0.2 and odd.edge.below
+    speed = cells_of([None, *[0.0] * 15, *[0.99] * 4], length=False).edge
+    assert np.allclose(speed.bounds, (-0.05, 0.8)) and speed.unseen == (True, False) and not speed.below
+    corridor = cells_of([0.99] * 4 + [0.0] * 10 + [0.99] * 6, length=False).edge
+    assert np.allclose(corridor.bounds, (0.2, 0.7)) and corridor.at is None and corridor.inside
+    gap = cells_of([0.0] * 5 + [None] * 10 + [0.0] * 5, length=False)
+    gap.danger[0] = 0.99
+    assert len(gap.edge.bounds) >= 3, "what nobody visited may be a wall"
+
+
+def test_a_distance_grows_without_end_and_nearer_is_worse():
+    found = causes.Found((causes.Cause("d", ((0,),), True),), edges=(cells_of([0.99] * 4 + [0.0] * 16).edge,))
+    net = blank(found, 8)[0]
+    at = jnp.linspace(0.0, 50.0, 500)[:, None]
+    along = np.asarray(net.of_values(at))
+    assert (np.diff(along) > 0).all() and along[0] < 0 < along[-1]
+    np.testing.assert_allclose(along, at[:, 0] - 0.2, atol=1e-4)
+    own = with_margin(net, 0.05)
+    assert float(own.of_values(jnp.array([[0.25]]))[0]) == pytest.approx(LEAST, rel=1e-3)
 
 
 def test_what_nobody_visited_is_as_unsafe_as_it_should_be(logged):
     """Nearer than anybody came is unsafe, farther away is safe; a place that nobody saw is not trusted."""
     x, unsafe, episode = logged
-    _, cells = causes.find(x, unsafe.any(1), episode, NAMES)
+    _, cells = cause_search.find(x, unsafe.any(1), episode, NAMES)
     by_name = {one.cause.name: one for one in cells}
     pair = by_name["length of other.dx, other.dy"]
     values, bad = pair.beyond(500, np.random.default_rng(0))
@@ -85,12 +135,11 @@ def test_what_nobody_visited_is_as_unsafe_as_it_should_be(logged):
 
 def test_scores_of_causes_read_what_they_name(logged):
     x, unsafe, episode = logged
-    found, _ = causes.find(x, unsafe.any(1), episode, NAMES)
-    nets = blank(found.causes, 8, jax.random.key(0))
-    for net in nets:
-        scores = net.scores(jnp.asarray(x[:5]))
-        assert scores.shape == (5, N, len(net.cause.things))
-        np.testing.assert_allclose(net.of_values(jnp.asarray(net.cause.of(x[:5]))), scores, atol=1e-4)
+    found, _ = cause_search.find(x, unsafe.any(1), episode, NAMES)
+    for net in blank(found, 8, jax.random.key(0)):
+        each = scores(net, jnp.asarray(x[:5]))
+        assert each.shape == (5, N, len(net.cause.things))
+        np.testing.assert_allclose(net.of_values(jnp.asarray(net.cause.of(x[:5]))), each, atol=1e-4)
 
 
 # --- a World of them ---

@@ -19,7 +19,7 @@ from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
 from ringfence.world import barrier as cbf
-from ringfence.world import validate
+from ringfence.world import margins, validate
 from tests.quick import QUICK_WORLD
 
 
@@ -198,9 +198,9 @@ def test_danger_is_seen_ahead():
 
 def test_conformal_quantiles_cover_what_they_say():
     rng = np.random.default_rng(0)
-    covered = [rng.normal() <= validate.conformal(rng.normal(size=99), 0.9) for _ in range(4000)]
+    covered = [rng.normal() <= margins.conformal(rng.normal(size=99), 0.9) for _ in range(4000)]
     assert np.mean(covered) == pytest.approx(0.9, abs=0.02)
-    assert validate.conformal(np.arange(5.0), 0.99) == 4.0  # too few to say more
+    assert margins.conformal(np.arange(5.0), 0.99) == 4.0  # too few to say more
 
 
 def test_own_entries_tell_the_rest_where_the_logs_agree(played):

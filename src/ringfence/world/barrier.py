@@ -18,7 +18,6 @@ Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample b
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -33,8 +32,8 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import least, lowest
 from ringfence.problem.features import FeatureMap, numbered
 from ringfence.types import Array, Key
-from ringfence.world.cause_nets import CauseNet, blank, worst
-from ringfence.world.causes import Cause
+from ringfence.world.cause_nets import Score, blank, worst
+from ringfence.world.causes import Found
 
 Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
 DANGEROUS = ("other", "obstacle", "wall")  # kinds of things that names may tell of, each with a pair network of its own
@@ -66,7 +65,7 @@ class Barrier(eqx.Module):
     step_scale: Array
     unit: Array  # () the margin that calibration asks for
     shape: Shape
-    causes: tuple[CauseNet, ...] = ()  # ℓ by causes, where they were found; `label` is empty then
+    causes: tuple[Score, ...] = ()  # ℓ by causes, where they were found; `label` is empty then
 
     def of_steps(self, before: Array, after: Array) -> Array:
         """ℓ (..., N) of steps from features (..., N, D) to others."""
@@ -380,14 +379,14 @@ def blank_barrier(
     width: int,
     use_transition: bool | None = None,
     distances: bool = True,
-    causes: Sequence[Cause] = (),
+    found: Found | None = None,
 ) -> Barrier:
     """A barrier of the right shapes that says nothing."""
     shape = shape_of(map, use_transition, distances)
     one = jnp.ones(len(map.names))
     key = jax.random.key(0)
     return Barrier(
-        label={} if causes else networks(key, shape, width),
+        label={} if found and found.causes else networks(key, shape, width),
         future=networks(key, _still(shape), width),
         mean=one,
         scale=one,
@@ -395,5 +394,5 @@ def blank_barrier(
         step_scale=one,
         unit=jnp.ones(()),
         shape=shape,
-        causes=blank(causes, width),
+        causes=blank(found, width) if found else (),
     )

@@ -32,11 +32,13 @@ from ringfence.utils.cache import cache_dir
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
-from ringfence.world import causes, dynamics, validate, values
+from ringfence.world import cause_search, dynamics, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Found
+from ringfence.world.cells import Cells
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
+from ringfence.world.margins import in_own_margins
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
@@ -90,7 +92,7 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
-    content = [validate.VERSION, causes.VERSION, store.content, features.to_dict(map)]
+    content = [validate.VERSION, cause_search.VERSION, store.content, features.to_dict(map)]
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     file = parts.file("world", list(PARTS), content)
@@ -130,7 +132,7 @@ def _fitted(
         barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, settings.miscoverage, settings.loss, found_by)
+    found = validate.validate(world, logged, settings.miscoverage, settings.loss)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
@@ -224,14 +226,14 @@ class _Search:
     seed: int
 
     @functools.cached_property
-    def result(self) -> tuple[Found, list[causes.Cells]]:
+    def result(self) -> tuple[Found, list[Cells]]:
         """What is found, and the cells of each cause."""
         logged = self.logged
         steps = logged.fitted_steps
         rows = np.asarray(logged.arrays["row"])[steps] + 1
         x = np.asarray(logged.arrays["features"][rows])
         episode = logged.store.episode_of_step[steps]
-        return causes.find(x, logged.label[steps], episode, logged.map.names, self.seed)
+        return cause_search.find(x, logged.label[steps], episode, logged.map.names, self.seed)
 
 
 def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
@@ -241,7 +243,7 @@ def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
     plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
     if not plain or logged.map.shared_body or logged.map.joint:
         return Found()
-    content = [moved, causes.VERSION, _digest(logged.label)]
+    content = [moved, cause_search.VERSION, _digest(logged.label)]
     found = parts.json("causes", content, Found, lambda: search.result[0])
     return found if found.explained >= EXPLAINED else Found()
 
@@ -257,7 +259,7 @@ def _barrier(
     settings = parts.settings
     logged = search.logged
     template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
-    content = [moved, _digest(logged.label), causes.VERSION, msgspec.to_builtins(found)]
+    content = [moved, _digest(logged.label), cause_search.VERSION, msgspec.to_builtins(found)]
     steps = logged.fitted_steps
 
     def fit_label(key: Key) -> cbf.Barrier:
@@ -298,6 +300,7 @@ def _label(
     blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
     if found.causes:
         nets = fit_causes(
+            found,
             search.result[1],
             data,
             steps[unsafe],
@@ -308,6 +311,7 @@ def _label(
             width=settings.barrier_width,
             quiet=quiet,
         )
+        nets = in_own_margins(nets, acts, logged, np.random.default_rng(0))
         return dataclasses.replace(blank, causes=nets)
     return cbf.fit_label(
         blank,
@@ -344,7 +348,7 @@ def _shape_in_words(barrier: cbf.Barrier | cbf.MinBarrier | None) -> str:
     each = barrier.each if isinstance(barrier, cbf.MinBarrier) else (barrier,)
     names = [net.cause.name for one in each for net in one.causes]
     if names:
-        return f"a network for each cause ({'; '.join(names)}), the worst one counts"
+        return f"a score for each cause ({'; '.join(names)}), the worst one counts"
     shape = barrier.shape
     if shape.pairs:
         kinds = ", ".join(f"{len(entries)} x {kind}" for kind, entries in shape.pairs)

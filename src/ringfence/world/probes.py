@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.types import Array
-from ringfence.world import causes
+from ringfence.world import cause_search, causes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import UNKNOWN, Probe
-from ringfence.world.cause_nets import CauseNet
+from ringfence.world.cause_nets import Score
 from ringfence.world.causes import Cause, Edge
 from ringfence.world.logged import Logged
 
@@ -23,19 +23,16 @@ CLOSING = (0.0, 1.0)  # of the fastest closing that was seen
 POINTS = 25  # of a curve
 
 
-Edges = Mapping[Cause, Edge]  # where causes that were found begin to be dangerous
-
-
 def probe(
-    barrier: Barrier | MinBarrier, logged: Logged, edges: Edges, unit: float, rng: np.random.Generator
+    barrier: Barrier | MinBarrier, logged: Logged, unit: float, rng: np.random.Generator
 ) -> tuple[tuple[Probe, ...], float]:
     """(answers in margins of `unit`, share of states with somebody inside the radius that are called unsafe)."""
     each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
-    curves = [_curve(net, edges[net.cause], unit) for one in each for net in one.causes if net.cause.width == 1]
+    curves = [_curve(net, unit) for one in each for net in one.causes if net.cause.width == 1]
     states = _states(logged, rng)
     answers = []
     inside = []
-    for cause, edge in _near(barrier, logged, edges):
+    for cause, edge in _near(barrier, logged):
         if edge.at is None or not edge.below:
             continue
         scores = {ratio: _put(barrier, states, logged.map.names, cause, ratio * edge.at) / unit for ratio in RADII}
@@ -46,8 +43,9 @@ def probe(
     return (*curves, *answers), float(np.mean(inside)) if inside else UNKNOWN
 
 
-def _curve(net: CauseNet, edge: Edge, unit: float) -> Probe:
+def _curve(net: Score, unit: float) -> Probe:
     """Scores of a cause that reads one number, along it."""
+    edge = net.edge
     reach = 0.25 * (edge.high[0] - edge.low[0])
     low = max(0.0, edge.low[0] - reach) if net.cause.length else edge.low[0] - reach
     at = np.linspace(low, edge.high[0] + reach, POINTS)
@@ -58,11 +56,11 @@ def _curve(net: CauseNet, edge: Edge, unit: float) -> Probe:
     return Probe(net.cause.name, tuple(round(float(value), 4) for value in at), shown, begins)
 
 
-def _near(barrier: Barrier | MinBarrier, logged: Logged, edges: Edges) -> list[tuple[Cause, Edge]]:
+def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Edge]]:
     """How near things come: the causes that are a distance, or, of networks on all entries, what names tell of one."""
     each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
     if any(one.causes for one in each):
-        return [(net.cause, edges[net.cause]) for one in each for net in one.causes if net.cause.length]
+        return [(net.cause, net.edge) for one in each for net in one.causes if net.cause.length]
     return [(cause, _radius(cause, logged)) for cause in causes.offsets(logged.map.names)]
 
 
@@ -70,7 +68,7 @@ def _radius(cause: Cause, logged: Logged) -> Edge:
     steps = logged.fitted_steps
     rows = np.asarray(logged.arrays["row"])[steps] + 1
     x = np.asarray(logged.arrays["features"][rows])
-    return causes.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
+    return cause_search.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
 
 
 def _states(logged: Logged, rng: np.random.Generator) -> Array:
@@ -84,20 +82,22 @@ def _states(logged: Logged, rng: np.random.Generator) -> Array:
 def _put(
     barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], cause: Cause, distance: float
 ) -> np.ndarray:
-    """(W * closing,) scores of the first agent with the cause's first thing at that distance, at rest and closing."""
-    place = np.array(cause.things[0])
-    offset = states[:, 0, place]
+    """(W * closing,) scores of the first agent that the cause is about, with its thing at that distance, at rest and
+    closing."""
+    agent, thing = cause.who[0] if cause.who else (0, 0)
+    place = np.array(cause.things[thing])
+    offset = states[:, agent, place]
     length = jnp.maximum(jnp.sqrt((offset**2).sum(-1, keepdims=True)), 1e-6)
     direction = offset / length
-    put = states.at[:, 0, place].set(direction * distance)
+    put = states.at[:, agent, place].set(direction * distance)
     speed = _speed_entries(names, place)
     found = []
     for share in CLOSING:
         moved = put
         if speed is not None:
             fastest = jnp.quantile(jnp.sqrt((states[..., speed] ** 2).sum(-1)), 0.99)
-            moved = put.at[:, 0, speed].set(-share * fastest * direction)
-        found.append(np.asarray(_score_of_first(barrier, states, moved)))
+            moved = put.at[:, agent, speed].set(-share * fastest * direction)
+        found.append(np.asarray(_scores_of_all(barrier, states, moved))[:, agent])
     return np.concatenate(found)
 
 
@@ -111,5 +111,5 @@ def _speed_entries(names: Sequence[str], place: np.ndarray) -> np.ndarray | None
 
 
 @jax.jit
-def _score_of_first(barrier: Barrier | MinBarrier, before: Array, after: Array) -> Array:
-    return barrier.of_steps(before, after)[:, 0]
+def _scores_of_all(barrier: Barrier | MinBarrier, before: Array, after: Array) -> Array:
+    return barrier.of_steps(before, after)

@@ -53,8 +53,7 @@ def blank_world(
 
 
 def blank_barrier(map: features.FeatureMap, settings: Settings, found: Found | None = None) -> cbf.Barrier:
-    causes = found.causes if found else ()
-    return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances, causes)
+    return cbf.blank_barrier(map, settings.barrier_width, settings.use_transition, settings.distances, found)
 
 
 @in_float32

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import equinox as eqx
 import jax
@@ -16,7 +13,6 @@ from ringfence.problem.constraints import lowest
 from ringfence.types import Array
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (
-    JUDGED,
     UNKNOWN,
     Avoidable,
     BarrierScores,
@@ -26,16 +22,24 @@ from ringfence.world.card import (
     Threshold,
     ValueScores,
 )
-from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
+from ringfence.world.margins import (
+    OUTLIERS,
+    WINDOWS,
+    calibrated,
+    conformal,
+    count_entries,
+    entries,
+    predicted_ends,
+    rolled,
+)
 from ringfence.world.model import World
 from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 12  # of the validation: cached cards of another are made again
+VERSION = 13  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
-WINDOWS = 3000  # of each kind
 STEPS = 60_000  # held-out steps that are scored
 SCORED = 20_000  # of them at once
 FALSE_ALARMS = 0.01  # of the safe steps, at which recall is given
@@ -44,10 +48,7 @@ STRANGE = 0.95  # share of held-out episodes that stay below the ensemble's thre
 LEAST = {"cross-entropy": 4.0, "hinges": 0.1, "gradient-penalty": 0.1}
 UNJUDGED = 5.0  # the margin of a barrier that held-out episodes say nothing of
 MARGINS = {0.0, 1.0, 2.0, 4.0, 8.0}  # that the card gives numbers of, beside the calibrated one
-ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
-BEARABLE = 0.8  # share of safe steps that should have the margin
 FEW = 5  # entries into danger, with fewer of which nothing is said
-OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
 BEFORE = (1, 2, 3, 5, 7, 10, 15, 20, 30)  # steps before danger at which it is asked whether it could still be avoided
 AVOIDED = 0.95  # share of entries at which it counts as avoidable
 ENTERED = 100  # entries that are asked about
@@ -73,11 +74,8 @@ def validate(
     logged: Logged,
     miscoverage: float,
     loss: str = "cross-entropy",
-    causes: Mapping[str, Found] = MappingProxyType({}),
 ) -> Validation:
-    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above; `causes` are
-    those of each constraint."""
-    edges = {cause: edge for found in causes.values() for cause, edge in zip(found.causes, found.edges)}
+    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above."""
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
     prediction_error = _prediction_error(world.dynamics, logged, rng)
@@ -90,13 +88,13 @@ def validate(
         each = {}
         constraints = {}
         for name, one in zip(barrier.names, barrier.each):
-            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss], edges)
+            found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss])
             constraints[name] = found
             each[name] = _in_units(one, unit)
         barrier = MinBarrier(tuple(each.values()), barrier.names)
-        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, edges, 1.0)
+        scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, 1.0)
     elif barrier is not None:
-        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss], edges)
+        scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss])
         barrier = _in_units(barrier, unit)
     return Validation(held_out, prediction_error, explained, ood, barrier, scores, constraints)
 
@@ -115,7 +113,7 @@ def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generat
     ahead = int(min(AHEAD, left.max()))
     starts = held[left >= ahead]
     starts = rng.choice(starts, min(WINDOWS, len(starts)), replace=False)
-    predicted, _ = _rolled(dynamics, logged, starts, ahead)
+    predicted, _ = rolled(dynamics, logged, starts, ahead)
     row = np.asarray(logged.arrays["row"])[starts]
     came = np.stack([np.asarray(logged.arrays["features"][row + k]) for k in range(ahead + 1)], 1)
     error = _rms(np.asarray(predicted) - came[:, 1:])
@@ -157,41 +155,14 @@ def _over_entries(error: np.ndarray, entries: np.ndarray) -> np.ndarray:
     return np.sqrt((error[:, entries] ** 2).mean(1))
 
 
-def _rolled(dynamics: Dynamics, logged: Logged, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
-    """Rows (W, K, N, D) and disagreement (W, K, N) from the states before steps, along the logged actions."""
-    row = logged.arrays["row"][starts]
-    last = logged.store.steps - 1
-    actions = jnp.stack([logged.arrays["actions"][np.minimum(starts + k, last)] for k in range(ahead)])
-    rows, spread = _roll(dynamics, logged.arrays["features"][row], actions)
-    return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
-
-
-@jax.jit
-def _roll(dynamics: Dynamics, x: Array, actions: Array) -> tuple[Array, Array]:
-    """Rows (K, W, N, D) and disagreement (K, W, N) along actions (K, W, N, A)."""
-
-    def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
-        after, spread = dynamics.step(x, action)
-        return after, (after, spread)
-
-    return jax.lax.scan(step, x, actions)[1]
-
-
 def _threshold(dynamics: Dynamics, logged: Logged) -> Threshold:
     """The conformal quantile, over held-out episodes, of the ensemble's largest disagreement."""
     steps = logged.held_steps[:STEPS]
-    _, spread = _rolled(dynamics, logged, steps, 1)
+    _, spread = rolled(dynamics, logged, steps, 1)
     worst = np.asarray(spread)[:, 0].max(-1)
     episode = logged.store.episode_of_step[steps]
     most = np.array([worst[episode == e].max() for e in np.unique(episode)])
     return Threshold(threshold=conformal(most, STRANGE), level=STRANGE)
-
-
-def conformal(values: np.ndarray, level: float) -> float:
-    """The value that a new one stays below with that probability, whatever their distribution: the ⌈(n+1) level⌉-th
-    smallest of n, the largest where there are too few."""
-    n = len(values)
-    return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
 
 
 # --- values ---
@@ -235,7 +206,6 @@ def _barrier_scores(
     rng: np.random.Generator,
     miscoverage: float,
     least: float,
-    edges: Mapping[Cause, Edge],
     unit: float | None = None,
 ) -> tuple[BarrierScores, float]:
     """(scores, margin): calibrated, at `least` so much, unless it is known."""
@@ -250,17 +220,17 @@ def _barrier_scores(
     steps = np.unique(np.concatenate([steps, rng.choice(bad, min(WINDOWS, len(bad)), replace=False)]))
     now, ahead = _scored(barrier, logged, steps)
     truth = unsafe[steps]
-    ends = _entries(logged, bad)
+    ends = entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
-    predicted = _predicted_scores(dynamics, barrier, logged, ends)
-    if _count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
+    predicted = np.concatenate([np.asarray(_score(barrier, *step)) for step in predicted_ends(dynamics, logged, ends)])
+    if count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
         warning = f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is told, or to set a margin"
         return BarrierScores(warning=warning), UNJUDGED
     if unit is None:
-        unit = max(least, _margin(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))
+        unit = max(least, calibrated(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))
     share = float(unsafe[held].mean())
     alarm = np.quantile(now[~truth], FALSE_ALARMS)
-    answers, probed = probe(barrier, logged, edges, unit, rng)
+    answers, probed = probe(barrier, logged, unit, rng)
     scores = BarrierScores(
         unsafe_share=share,
         auroc=_auroc(now, truth),
@@ -274,37 +244,12 @@ def _barrier_scores(
         calibration=tuple(_of_margin(m, now, truth, predicted, share) for m in sorted(MARGINS | {round(unit, 2)})),
         ahead_kept=float((ahead[~truth] >= unit).mean()),
         avoidable=_avoidable(dynamics, barrier, logged.arrays, ends[:ENTERED]),
-        entries=float(_count_entries(logged, bad)),
+        entries=float(count_entries(logged, bad)),
         margin_kept=float((now[~truth] >= unit).mean()),
         probed=probed,
         probes=answers,
     )
     return scores, unit
-
-
-def _margin(predicted: np.ndarray, safe: np.ndarray, miscoverage: float) -> float:
-    """The conformal margin of predicted scores of entries into danger, where most safe steps have it. Where they have
-    not, because some danger is told by nothing that is logged, the one that parts most of both."""
-    calibrated = conformal(predicted, 1 - miscoverage)
-    if (safe >= calibrated).mean() >= BEARABLE:
-        return calibrated
-    tried = np.quantile(predicted, np.linspace(0.5, 1.0, 201))
-    below = np.searchsorted(np.sort(predicted), tried) / len(predicted)
-    lost = np.searchsorted(np.sort(safe), tried) / len(safe)
-    return float(tried[np.argmax(below - lost)])
-
-
-def _count_entries(logged: Logged, bad: np.ndarray) -> int:
-    """Times that somebody was in danger: steps that entered it, or began in it, of those that are unsafe."""
-    begins, entered = _entered(logged, bad)
-    return int((begins | entered).sum())
-
-
-def _entered(logged: Logged, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(begins an episode, follows a safe step) of unsafe steps, each (W,) bool."""
-    row, first = (np.asarray(logged.arrays[name])[bad] for name in ("row", "first_row"))
-    begins = row == first
-    return begins, ~begins & ~logged.unsafe[np.maximum(bad - 1, 0)]
 
 
 def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -328,30 +273,6 @@ def _score(barrier: Barrier | MinBarrier, before: Array, after: Array) -> Array:
 @jax.jit
 def _score_ahead(barrier: Barrier | MinBarrier, after: Array) -> Array:
     return lowest(barrier.ahead(after))
-
-
-def _entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
-    """Steps that entered danger, of those that are unsafe. Those that were in it already say little of where it begins:
-    where a log is nearly all unsafe, most of them lie far beyond. Few entries say nothing; then it is all of `bad`."""
-    _, entered = _entered(logged, bad)
-    return bad[entered] if entered.sum() >= ENTRIES else bad
-
-
-def _predicted_scores(
-    dynamics: Dynamics, barrier: Barrier | MinBarrier, logged: Logged, ends: np.ndarray
-) -> np.ndarray:
-    """Scores of steps that entered danger, as they are predicted from up to `JUDGED` steps before."""
-    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
-    found = []
-    for back in range(JUDGED):
-        start = ends - back
-        start = start[(start >= 0) & (row[ends] - back >= first[ends])]
-        if not len(start):
-            continue
-        rows, _ = _rolled(dynamics, logged, start, back + 1)
-        before = logged.arrays["features"][row[start]] if back == 0 else rows[:, -2]
-        found.append(np.asarray(_score(barrier, before, rows[:, -1])))
-    return np.concatenate(found)
 
 
 def _of_margin(margin: float, now: np.ndarray, unsafe: np.ndarray, predicted: np.ndarray, share: float) -> MarginScores:

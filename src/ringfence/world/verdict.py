@@ -13,6 +13,7 @@ Word = Literal["fit", "weak", "unfit"]
 ENTRIES = (5, 30)  # held-out entries into danger: with fewer than these nothing, or little, is known
 RECALL = (0.8, 0.95)  # share of unsafe steps found with 1 false alarm in 100
 KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights most actions below it
+FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to have less than the margin
 AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
 
@@ -42,6 +43,12 @@ def _barrier(scores: BarrierScores, of: str) -> Iterator[tuple[Word, str, str]]:
         (scores.entries, ENTRIES, "{:.0f} held-out steps enter danger", "log more episodes with danger"),
         (scores.recall, RECALL, "{:.1%} of unsafe steps are found", "name the entries that tell danger, or log them"),
         (scores.margin_kept, KEPT, "{:.1%} of safe steps keep the margin", "log more, and more careful, episodes"),
+        (
+            1 - scores.miscoverage,
+            FORESEEN,
+            "{:.1%} of entries into danger are foreseen",
+            "log what decides where danger begins, or more episodes",
+        ),
         (_avoided(scores), AVOIDABLE, "{:.0%} of danger can be avoided", "log stronger braking and turning"),
         (scores.probed, PROBED, "{:.1%} of states inside the radius are called unsafe", "give a formula of danger"),
     )

@@ -1,0 +1,130 @@
+"""Margins: by how much steps that came to be dangerous looked safe before."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.problem.constraints import lowest
+from ringfence.types import Array
+from ringfence.world.card import JUDGED
+from ringfence.world.cause_nets import Score, least_margin, with_margin, worst
+from ringfence.world.dynamics import Dynamics
+from ringfence.world.logged import Logged
+
+WINDOWS = 3000  # entries, and safe steps, that margins are read from
+ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
+BEARABLE = 0.8  # share of safe steps that should have the margin
+OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
+MISSED = 0.001  # share of entries that may look as safe as a cause's own margin
+
+
+def rolled(dynamics: Dynamics, logged: Logged, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
+    """Rows (W, K, N, D) and disagreement (W, K, N) from the states before steps, along the logged actions."""
+    row = logged.arrays["row"][starts]
+    last = logged.store.steps - 1
+    actions = jnp.stack([logged.arrays["actions"][np.minimum(starts + k, last)] for k in range(ahead)])
+    rows, spread = _roll(dynamics, logged.arrays["features"][row], actions)
+    return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
+
+
+@jax.jit
+def _roll(dynamics: Dynamics, x: Array, actions: Array) -> tuple[Array, Array]:
+    """Rows (K, W, N, D) and disagreement (K, W, N) along actions (K, W, N, A)."""
+
+    def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
+        after, spread = dynamics.step(x, action)
+        return after, (after, spread)
+
+    return jax.lax.scan(step, x, actions)[1]
+
+
+def conformal(values: np.ndarray, level: float) -> float:
+    """The value that a new one stays below with that probability, whatever their distribution: the ⌈(n+1) level⌉-th
+    smallest of n, the largest where there are too few."""
+    n = len(values)
+    return float(np.sort(values)[min(math.ceil((n + 1) * level), n) - 1])
+
+
+def calibrated(predicted: np.ndarray, safe: np.ndarray, miscoverage: float) -> float:
+    """The conformal margin of predicted scores of entries into danger, where most safe steps have it. Where they have
+    not, because some danger is told by nothing that is logged, the one that parts most of both."""
+    calibrated = conformal(predicted, 1 - miscoverage)
+    if (safe >= calibrated).mean() >= BEARABLE:
+        return calibrated
+    tried = np.quantile(predicted, np.linspace(0.5, 1.0, 201))
+    below = np.searchsorted(np.sort(predicted), tried) / len(predicted)
+    lost = np.searchsorted(np.sort(safe), tried) / len(safe)
+    return float(tried[np.argmax(below - lost)])
+
+
+def count_entries(logged: Logged, bad: np.ndarray) -> int:
+    """Times that somebody was in danger: steps that entered it, or began in it, of those that are unsafe."""
+    begins, follows = entered(logged, bad)
+    return int((begins | follows).sum())
+
+
+def entered(logged: Logged, bad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(begins an episode, follows a safe step) of unsafe steps, each (W,) bool."""
+    row, first = (np.asarray(logged.arrays[name])[bad] for name in ("row", "first_row"))
+    begins = row == first
+    return begins, ~begins & ~logged.unsafe[np.maximum(bad - 1, 0)]
+
+
+def entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
+    """Steps that entered danger, of those that are unsafe. Those that were in it already say little of where it begins:
+    where a log is nearly all unsafe, most of them lie far beyond. Few entries say nothing; then it is all of `bad`."""
+    _, follows = entered(logged, bad)
+    return bad[follows] if follows.sum() >= ENTRIES else bad
+
+
+def predicted_ends(dynamics: Dynamics, logged: Logged, ends: np.ndarray) -> list[tuple[Array, Array]]:
+    """Steps that entered danger, (before, after) each (W, N, D), as they are predicted from up to `JUDGED` steps
+    before."""
+    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
+    found = []
+    for back in range(JUDGED):
+        start = ends - back
+        start = start[(start >= 0) & (row[ends] - back >= first[ends])]
+        if not len(start):
+            continue
+        rows, _ = rolled(dynamics, logged, start, back + 1)
+        before = logged.arrays["features"][row[start]] if back == 0 else rows[:, -2]
+        found.append((before, rows[:, -1]))
+    return found
+
+
+def in_own_margins(
+    nets: Sequence[Score], dynamics: Dynamics, logged: Logged, rng: np.random.Generator
+) -> tuple[Score, ...]:
+    """The scores of causes, each in units of the margin that its own entries into danger ask for, so that a margin of
+    one is as safe as the same of another: of a distance it is a length."""
+    steps = logged.fitted_steps
+    bad = entries(logged, steps[logged.unsafe[steps]])
+    bad = rng.choice(bad, min(WINDOWS, len(bad)), replace=False)
+    fine = steps[~logged.unsafe[steps]]
+    fine = rng.choice(fine, min(WINDOWS, len(fine)), replace=False)
+    features = logged.arrays["features"]
+    row = np.asarray(logged.arrays["row"])
+    by_each = np.stack([np.asarray(lowest(worst([net], features[row[bad] + 1]))) for net in nets], -1)
+    blamed = by_each.argmin(-1)
+    found = []
+    for k, net in enumerate(nets):
+        ends = bad[blamed == k]
+        found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, features[row[fine] + 1]))
+    return tuple(found)
+
+
+def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: Array) -> Score:
+    of_ends = [lowest(worst([net], after)) for _, after in predicted_ends(dynamics, logged, ends)]
+    predicted = np.concatenate([np.asarray(part) for part in of_ends])
+    missed = max(MISSED, OUTLIERS / len(predicted))
+    of_safe = np.asarray(lowest(worst([net], safe)))
+    margin = calibrated(predicted, of_safe, missed)
+    if (of_safe >= margin).mean() < BEARABLE:
+        margin = 0.0  # what cannot be foreseen is not bought by any margin
+    return with_margin(net, max(margin, least_margin(net)))
