@@ -22,6 +22,7 @@ from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.options import GuardOptions
 from ringfence.nets.mlp import MLP
 from ringfence.problem.constraints import lowest
+from ringfence.problem.homogeneous import team_sum
 from ringfence.types import Array, Key
 from ringfence.world import World
 from ringfence.world.dynamics import Dynamics
@@ -205,11 +206,10 @@ class Guard(eqx.Module):
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
         rows, spread = self.predict(present, plan[:, None])
         short = self.missing(present, self.clear(rows, spread, margin)[:, 0], margin)
-        return short.sum(1) if self.world.alone else short.sum((1, 2))[:, None]
+        return team_sum(short, (1,), self.world.alone)
 
     def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
         """`shielded`, of all teams at once."""
-        alone = self.world.alone
         low, high = self._within(plan, self.options.max_correction)
 
         def shortfall(plan: Array) -> Array:
@@ -219,7 +219,7 @@ class Guard(eqx.Module):
             f, back = jax.vjp(shortfall, c.plan)
             slope = back(jnp.ones_like(f))[0]
             better = (f > c.least)[:, None, :, None]
-            size = (slope**2).sum((1, 3)) if alone else (slope**2).sum((1, 2, 3))[:, None]
+            size = team_sum(slope**2, (1, 3), self.world.alone)
             moved = c.plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
             return Correction(
                 plan=jnp.clip(moved, low, high),
@@ -232,7 +232,7 @@ class Guard(eqx.Module):
         def goes_on(c: Correction) -> Array:  # until the round after the last in which something was missing
             return (c.round < self.options.correction_steps) & (c.short < 0).any()
 
-        nothing = jnp.full((plan.shape[0], plan.shape[2] if alone else 1), -jnp.inf)
+        nothing = jnp.full_like(team_sum(plan, (1, 3), self.world.alone), -jnp.inf)
         begun = Correction(plan, plan, nothing, nothing, jnp.asarray(0))
         found = jax.lax.while_loop(goes_on, correct, begun)
         return jnp.where((shortfall(found.plan) >= found.least)[:, None, :, None], found.plan, found.best)

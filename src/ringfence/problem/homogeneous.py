@@ -72,6 +72,16 @@ def local_features(map: FeatureMap, homogeneous: bool, observations: X | None, s
     return map(split_agents(observations), None)
 
 
+def team_mean(x: Array, alone: bool, axis: int = -1) -> Array:
+    """Mean over the axis of agents; of agents who are alone, what it is of each."""
+    return x if alone else x.mean(axis)
+
+
+def team_sum(x: Array, axes: tuple[int, ...], alone: bool) -> Array:
+    """Sum of (B, K, N, ...) over axes and agents, (B, 1); of agents who are alone over these axes, (B, N)."""
+    return x.sum(axes) if alone else x.sum((*axes, 2))[:, None]
+
+
 def split_agents(x: X) -> X:
     """Teams (B, N, ...) as teams of one, (B N, 1, ...)."""
     return x.reshape(-1, 1, *x.shape[2:])

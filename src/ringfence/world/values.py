@@ -19,6 +19,7 @@ import numpy as np
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.features import FeatureMap
+from ringfence.problem.homogeneous import team_mean
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
 
@@ -59,7 +60,7 @@ class Values(eqx.Module):
         """r̂ (...,) of steps from features (..., N, D) to others with actions (..., N, A), or (..., N) alone."""
         mean, scale = self.critic["value"][0]
         out = self.reward(_of_step(self.critic, self.joint, before, action, after))[..., 0]
-        return (out if self.alone else out.mean(-1)) * scale + mean
+        return team_mean(out, self.alone) * scale + mean
 
     def ahead(self, x: Array) -> Array:
         """V̂ of states (..., N, D), likewise."""
@@ -87,7 +88,7 @@ def fit_values(
     that are `alone` learn what each of them earns, (T, N) rewards and `returns_to_go`, the others what the team does,
     (T,)."""
     key_critic, key_reward, key_net = jax.random.split(key, 3)
-    rewards = arrays["rewards"] if alone else arrays["rewards"].mean(1)
+    rewards = team_mean(arrays["rewards"], alone)
     seen, arrived, returns = _targets(arrays, rewards, picked)
     critic = fit_critic(
         seen, arrived, returns, key_critic, updates, period=period, weight=map.critic_weight, quiet=quiet
@@ -100,7 +101,7 @@ def fit_values(
         out = net(inputs)[..., 0]
         mean, scale = critic["value"][0]
         goal = (earned[pick] - mean) / scale
-        return (((out if alone else out.mean(-1)) - goal) ** 2).mean()
+        return ((team_mean(out, alone) - goal) ** 2).mean()
 
     data = arrays["features"], arrays["actions"][picked], arrays["row"][picked], rewards[picked]
     label = "" if quiet else "rewards, what steps are worth"
@@ -218,7 +219,7 @@ def state_values(critic: Critic, x: Array, each: bool = False) -> tuple[Array, A
     `each`: (..., N), of every agent."""
     value = critic["value"]
     out = critic["net"](_standardised(critic, x))
-    out = (out if each else out.mean(-2)) * value[:, 1] + value[:, 0]
+    out = team_mean(out, each, -2) * value[:, 1] + value[:, 0]
     return out[..., 0], out[..., 1]
 
 
