@@ -35,7 +35,7 @@ Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(meta
 
 
 def tasks() -> None:
-    """List the tasks with their hazards, limits and constants."""
+    """List the tasks with their constraints, limits and constants."""
     from ringfence.datasets import registry
     from ringfence.problem import constraints
 
