@@ -117,13 +117,10 @@ def import_table(
     from ringfence.logs.store import EpisodeStore
 
     kept = writable(out_file)
-    if limits and len(limits) != len(cost):
-        raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
-    bounds = {"constraints": dict(zip(cost, limits))} if len(cost) > 1 else dict(zip(["cost_limit"], limits))
     options = {
         **episodes.options(),
         "cost": cost,
-        "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **bounds},
+        "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **_limits_of(cost, limits)},
     }
     if layout is not None:
         if state or action or reward or goal or episode:
@@ -132,6 +129,15 @@ def import_table(
     options |= {"time": time, "agent": agent, "episode": episode, "state": state}
     options |= {"action": action, "reward": reward, "goal": goal}
     imported(EpisodeStore.from_table(file, **options), kept)
+
+
+def _limits_of(cost: list[str], limits: list[float]) -> dict[str, Any]:
+    """What a card says of the limits of these costs: of each by its name, where there are several."""
+    if limits and len(limits) != len(cost):
+        raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")
+    if len(cost) > 1:
+        return {"constraints": dict(zip(cost, limits))}
+    return {"cost_limit": limits[0]} if limits else {}
 
 
 def import_bag(

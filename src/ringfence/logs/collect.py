@@ -60,8 +60,7 @@ def collect(
     player = _Player.of(policy)
     source = {"simulator": type(env).__name__, "policy": player.name, "first_seed": seed}
     kept = _kept_before(file, source, episodes)
-    begun = 0 if kept is None else kept.episodes + _skipped(kept)
-    if kept is not None and begun >= episodes:
+    if kept is not None and _begun(kept) >= episodes:
         return kept
     rules = _Rules(
         bounds=_bounds(env),
@@ -71,15 +70,22 @@ def collect(
         early_ends=early_ends,
     )
     keeper = _Keeper(env, rules.bounds, source, card, file, kept)
-    with Progress(f"collecting {source['simulator']}", episodes, begun, quiet) as bar:
+    return _filled(keeper, player, rules, episodes, quiet)
+
+
+def _filled(keeper: _Keeper, player: _Player, rules: _Rules, episodes: int, quiet: bool) -> EpisodeStore:
+    """The store, after what is missing of `episodes` was played."""
+    simulator = keeper.source["simulator"]
+    begun = _begun(keeper.kept)
+    with Progress(f"collecting {simulator}", episodes, begun, quiet) as bar:
         try:
             for k in range(begun, episodes):
-                keeper.add(_played(env, player, rules, seed, k))
+                keeper.add(_played(keeper.env, player, rules, keeper.source["first_seed"], k))
                 bar.advance(1)
         finally:  # a refusal or an interruption costs no episode that was finished
             keeper.keep()
     if keeper.kept is None:
-        raise UserError(f"All {episodes} episodes of {source['simulator']} were skipped: agents leave each; cut them.")
+        raise UserError(f"All {episodes} episodes of {simulator} were skipped: agents leave each; cut them.")
     return keeper.kept
 
 
@@ -124,6 +130,11 @@ class _Keeper:
             self.kept = replace(self.kept, card=self.kept.card.updated(skipped_episodes=self.skipped))
         if self.kept is not None and self.file is not None:
             self.kept.save(self.file)
+
+
+def _begun(store: EpisodeStore | None) -> int:
+    """Episodes that were played so far, those left out included."""
+    return 0 if store is None else store.episodes + _skipped(store)
 
 
 def _skipped(store: EpisodeStore) -> int:

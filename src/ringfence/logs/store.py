@@ -256,24 +256,15 @@ class EpisodeStore:
         rewards = _numbers("rewards", rewards)
         costs, several, card = _several(costs, (e, length), n, card)
         costs = np.zeros((e, length)) if costs is None else _numbers("costs", costs)
-        expected_shapes = {
-            "observations": (observations, (e, length + 1, n)),
-            "costs": (costs, (e, length, n)[: max(2, costs.ndim)]),
-            "rewards": (rewards, (e, length, n)[: max(2, rewards.ndim)]),
-        }
-        if state is not None:
-            state = _numbers("state", state)
-            expected_shapes["state"] = (state, (e, length + 1))
-        if terminated is not None:
-            expected_shapes["terminated"] = (np.asarray(terminated), (e,))
-        for name, (value, expected) in expected_shapes.items():
-            entries = name in ("observations", "state")  # one more axis, of any size
-            if value.shape[: len(expected)] != expected or value.ndim != len(expected) + int(entries):
-                wanted = ", ".join(map(str, expected)) + (", ..." if entries else "")
-                raise StoreError(
-                    f"from_episodes got {name} of shape {value.shape}, the actions say {e} episodes of {length} steps "
-                    f"and {n} agents; give ({wanted})."
-                )
+        state = None if state is None else _numbers("state", state)
+        _check_episodes(
+            (e, length, n),
+            observations=observations,
+            costs=costs,
+            rewards=rewards,
+            state=state,
+            terminated=None if terminated is None else np.asarray(terminated),
+        )
         if rewards.ndim == 2:
             rewards = np.repeat(rewards[..., None], n, -1)
         last = np.zeros((e, length), bool)
@@ -321,25 +312,14 @@ class EpisodeStore:
         rewards = _floats("rewards", rewards)
         n_steps, n_agents = actions.shape[:2]
         costs, several, card = _several(costs, (n_steps,), n_agents, card)
-        state = None if state is None else _floats("state", state, 2)
-        final_state = None if final_state is None else _floats("final_state", final_state, 2)
         _check_ends(ends, n_steps)
         _check_rows("observations", observations, n_steps)
-        _check_rows("state", state, n_steps)
         _check_rows("terminated", terminated, len(ends))
         _check_last("final_observations", final_observations, (len(ends), *observations.shape[1:]))
-        if state is not None and final_state is not None:
-            _check_last("final_state", final_state, (len(ends), *state.shape[1:]))
+        states = _whole_states(state, final_state, ends, n_steps)
         if rewards.ndim == 1:
             rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
-        states = None
-        if state is not None:
-            if final_state is None:
-                raise StoreError(
-                    "state was given without final_state; pass the global state each episode ended in, too."
-                )
-            states = np.insert(state, ends, final_state, axis=0)
         return cls(
             np.insert(observations, ends, final_observations, axis=0),
             actions,
@@ -563,6 +543,39 @@ def _check_ends(ends: np.ndarray, steps: int) -> None:
 def _check_rows(name: str, value: Any, rows: int) -> None:
     if value is not None and len(value) != rows:
         raise StoreError(f"from_steps got {len(value)} rows of {name}, it takes {rows}; see its docstring.")
+
+
+def _check_episodes(sizes: tuple[int, int, int], **arrays: np.ndarray | None) -> None:
+    """Refuse arrays of `from_episodes` that are not of (E, L, N) episodes, steps and agents, as the actions are."""
+    e, length, n = sizes
+    for name, value in arrays.items():
+        if value is None:
+            continue
+        entries = name in ("observations", "state")  # one more axis, of any size
+        expected = {
+            "observations": (e, length + 1, n),
+            "state": (e, length + 1),
+            "terminated": (e,),
+        }.get(name, sizes[: max(2, value.ndim)])
+        if value.shape[: len(expected)] != expected or value.ndim != len(expected) + int(entries):
+            wanted = ", ".join(map(str, expected)) + (", ..." if entries else "")
+            raise StoreError(
+                f"from_episodes got {name} of shape {value.shape}, the actions say {e} episodes of {length} steps "
+                f"and {n} agents; give ({wanted})."
+            )
+
+
+def _whole_states(state: Any, final_state: Any, ends: np.ndarray, n_steps: int) -> np.ndarray | None:
+    """(T + E, S) the states of all steps and of the ends, in order; None where there are none."""
+    state = None if state is None else _floats("state", state, 2)
+    final_state = None if final_state is None else _floats("final_state", final_state, 2)
+    if state is None:
+        return None
+    _check_rows("state", state, n_steps)
+    if final_state is None:
+        raise StoreError("state was given without final_state; pass the global state each episode ended in, too.")
+    _check_last("final_state", final_state, (len(ends), *state.shape[1:]))
+    return np.insert(state, ends, final_state, axis=0)
 
 
 def _check_last(name: str, value: np.ndarray, expected: tuple[int, ...]) -> None:

@@ -84,13 +84,26 @@ def read_bag(
         topics = bag.read({one.topics[role]: role for role in ROLES for one in asked if role in one.topics})
         start = bag.start(topics)
     robots = [_Robot.of(one, topics) for one in asked]
+    notes: list[str] = []
+    clock = _clock_of(path, robots, topics, start, stamps, notes)
+    return _table(path, robots, clock, twist, notes)
+
+
+def _clock_of(
+    path: Path, robots: list[_Robot], topics: dict[str, Topic], start: int, stamps: bool, notes: list[str]
+) -> Clock:
+    """The clock of all robots' rows, who must agree on frames and kinds of poses."""
     odometry = [robot.odom for robot in robots]
     poses = {topic.name for topic in odometry}
     others = [topic for name, topic in topics.items() if name not in poses]
-    notes: list[str] = []
     clock = _clock(path, odometry, others, start, stamps, notes)
     _frames(odometry, notes)
     _refuse_two_kinds(path, odometry)
+    return clock
+
+
+def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: list[str]) -> Bag:
+    """All robots' rows, one robot after another, and which columns are natural as state and action."""
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}

@@ -48,50 +48,90 @@ def resample(
     """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), (M, K) costs, onto steps of `dt` s.
     States are interpolated; actions, rewards and costs belong to the step that they are nearest to, and actions
     are held. A hole of more than `gap` s ends a segment."""
-    begins = np.ones(len(time), bool)
-    begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
-    first = np.flatnonzero(begins)
-    last = np.append(first[1:], len(time)) - 1
-    zero = np.full(recording.max() + 1, np.inf)
-    np.minimum.at(zero, recording, time)
-    origin = zero[recording[first]]
-    wanted = float(((time[last] - time[first]) / dt + 1).sum())
-    if not wanted <= FINEST * (len(time) + FINEST):
-        raise StoreError(
-            f"Steps of {dt:g} s would be {wanted:.3g} for {len(time):,} rows; give a larger dt (times are in seconds)."
-        )
-    low = np.ceil((time[first] - origin) / dt - EARLY).astype(np.int64)
-    high = np.floor((time[last] - origin) / dt + EARLY).astype(np.int64)
-    count = np.maximum(high - low + 1, 0)
-    segment = np.repeat(np.arange(len(first)), count)
-    step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + low[segment]
-
-    # All segments one after another on one axis, so that each is searched and interpolated in one call.
-    spans = time[last] - time[first]
-    shift = np.concatenate([[0.0], np.cumsum(spans + 1.0)[:-1]]) - time[first]
-    axis = time + shift[np.cumsum(begins) - 1]
-    at = np.clip(step * dt + (origin + shift)[segment], axis[first][segment], axis[last][segment])
-    # The last row in time: clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
-    inside = np.diff(time)[~begins[1:]]
-    late = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
-    row = np.searchsorted(axis, step * dt + (origin + shift)[segment] + late, "right") - 1
-    row = np.clip(row, first[segment], last[segment])
+    segments = _Segments.of(recording, agent, time, gap)
+    segment, step = segments.grid(dt)
+    at, row = segments.placed(segment, step, dt)
     fresh = np.ones(len(row), bool)
     fresh[1:] = segment[1:] != segment[:-1]
-    before = np.where(fresh, first[segment] - 1, np.concatenate([[0], row[:-1]]))
+    before = np.where(fresh, segments.first[segment] - 1, np.concatenate([[0], row[:-1]]))
     sums = np.concatenate([[0.0], np.cumsum(reward)])
-    bounds = np.stack([np.minimum(before + 1, row), row + 1], 1).ravel()
     return Tracks(
-        recording[first][segment],
-        agent[first][segment],
+        recording[segments.first][segment],
+        agent[segments.first][segment],
         segment,
         step,
-        np.stack([np.interp(at, axis, column) for column in state.T], 1),
+        np.stack([np.interp(at, segments.axis, column) for column in state.T], 1),
         action[row],
         sums[row + 1] - sums[before + 1],
-        np.maximum.reduceat(np.concatenate([cost, np.zeros((1, cost.shape[1]))]), bounds)[::2],
+        _largest_between(cost, before, row),
         dt,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """Rows (M,) in time, and the S pieces without a hole that they are of: one agent's each."""
+
+    time: np.ndarray  # (M,) s
+    begins: np.ndarray  # (M,) bool: the first row of a segment
+    first: np.ndarray  # (S,) index of rows
+    last: np.ndarray  # (S,)
+    origin: np.ndarray  # (S,) s: when the segment's recording begins
+
+    @classmethod
+    def of(cls, recording: np.ndarray, agent: np.ndarray, time: np.ndarray, gap: float) -> _Segments:
+        begins = np.ones(len(time), bool)
+        begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
+        first = np.flatnonzero(begins)
+        zero = np.full(recording.max() + 1, np.inf)
+        np.minimum.at(zero, recording, time)
+        return cls(time, begins, first, np.append(first[1:], len(time)) - 1, zero[recording[first]])
+
+    def grid(self, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """(segment, step) of every step of `dt` s that lies within a segment."""
+        begin = self.time[self.first]
+        end = self.time[self.last]
+        wanted = float(((end - begin) / dt + 1).sum())
+        if not wanted <= FINEST * (len(self.time) + FINEST):
+            raise StoreError(
+                f"Steps of {dt:g} s would be {wanted:.3g} for {len(self.time):,} rows; give a larger dt (times are in "
+                "seconds)."
+            )
+        low = np.ceil((begin - self.origin) / dt - EARLY).astype(np.int64)
+        high = np.floor((end - self.origin) / dt + EARLY).astype(np.int64)
+        count = np.maximum(high - low + 1, 0)
+        segment = np.repeat(np.arange(len(self.first)), count)
+        return segment, np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + low[segment]
+
+    @property
+    def shift(self) -> np.ndarray:
+        """(S,) s that puts all segments one after another on one axis, so that each is searched and interpolated in one
+        call."""
+        begin = self.time[self.first]
+        spans = self.time[self.last] - begin
+        return np.concatenate([[0.0], np.cumsum(spans + 1.0)[:-1]]) - begin
+
+    @property
+    def axis(self) -> np.ndarray:
+        """(M,) s of the rows on that axis."""
+        return self.time + self.shift[np.cumsum(self.begins) - 1]
+
+    def placed(self, segment: np.ndarray, step: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """(where steps are on that axis, the last row at or before each)."""
+        axis = self.axis
+        place = step * dt + (self.origin + self.shift)[segment]
+        # Clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
+        inside = np.diff(self.time)[~self.begins[1:]]
+        late = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
+        row = np.searchsorted(axis, place + late, "right") - 1
+        at = np.clip(place, axis[self.first][segment], axis[self.last][segment])
+        return at, np.clip(row, self.first[segment], self.last[segment])
+
+
+def _largest_between(cost: np.ndarray, before: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """(R, K) the largest cost (M, K) of the rows after `before` and up to `row`."""
+    bounds = np.stack([np.minimum(before + 1, row), row + 1], 1).ravel()
+    return np.maximum.reduceat(np.concatenate([cost, np.zeros((1, cost.shape[1]))]), bounds)[::2]
 
 
 def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int]:
