@@ -429,7 +429,7 @@ def test_logs_without_costs_and_odd_cards(played):
     assert not EpisodeStore.from_episodes(*arrays, None).costs.any()
     for card, said in (
         ({"hazard": "Separation"}, "hazard='Separation'; it must be a Separation, SpeedLimit"),
-        ({"action_low": [-1, -1]}, r"action_low=\[-1, -1\]; it must be one number"),
+        ({"action_low": [-1, None]}, r"action_low=\[-1, None\]; it must be one number"),
         (["task"], "card is a list"),
         ({"hazard": {"kind": "Separation", "radius": "big"}}, "radius='big'; it must be a number, 0 or more"),
         ({"hazard": {"kind": "SpeedLimit", "limit": -1.0}}, "limit=-1.0; it must be a number, 0 or more"),

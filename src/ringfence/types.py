@@ -19,6 +19,8 @@ Array = jax.Array
 Key = jax.Array
 PyTree = Any
 Metrics = dict[str, Array]
+# Of actions: one number for all entries, one of each entry (A,), or these of each agent (N, A); problem/bounds.py
+Bound = float | tuple[float, ...] | tuple[tuple[float, ...], ...]
 LARGEST_BOUND = 1e30  # of an action: the range still has a size in float32
 
 
@@ -43,8 +45,8 @@ class Spec:
     n_agents: int
     action_dim: int
     feature_names: tuple[str, ...]  # the entries of s̃_i, in order
-    action_low: float
-    action_high: float
+    action_low: Bound
+    action_high: Bound
     episode_length: int
     homogeneous: bool = False  # agents that share all that is learned: the spec of a team of one
     action_sizes: tuple[int, ...] | None = None  # entries that each agent's action has, where not all have action_dim
@@ -52,15 +54,22 @@ class Spec:
     @classmethod
     def of(cls, stored: Mapping[str, Any]) -> Spec:
         """What `to_dict` gave."""
-        values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}
+        values: dict[str, Any] = {k: as_tuples(v) for k, v in stored.items()}
         if foreign := sorted(values.keys() - {f.name for f in fields(cls)}):
             raise UserError(f"The spec has '{foreign[0]}', unknown to this version; use the one that wrote it.")
         return cls(**values)
 
     def __post_init__(self):
-        low, high = self.action_low, self.action_high
-        if not -LARGEST_BOUND <= low < high <= LARGEST_BOUND:  # NaN included
-            raise UserError(f"Actions from {low:g} to {high:g} are no range; give finite bounds, the lower first.")
+        shapes = ((), (self.action_dim,), (self.n_agents, self.action_dim))
+        low, high = np.asarray(self.action_low), np.asarray(self.action_high)
+        if low.shape not in shapes or high.shape not in shapes:
+            raise UserError(
+                f"Actions have bounds of shape {low.shape} and {high.shape}; give one number, or one of each of the "
+                f"{self.action_dim} entries."
+            )
+        if not ((-LARGEST_BOUND <= low) & (low < high) & (high <= LARGEST_BOUND)).all():  # NaN included
+            low, high = (f"{one:g}" if np.ndim(one) == 0 else str(one.tolist()) for one in (low, high))
+            raise UserError(f"Actions from {low} to {high} are no range; give finite bounds, the lower first.")
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON holds it; what is the same for nearly all data is left out."""
@@ -75,6 +84,11 @@ class Spec:
     @property
     def feature_dim(self) -> int:
         return len(self.feature_names)
+
+
+def as_tuples(value: Any) -> Any:
+    """Lists, as JSON holds them, also within lists, as tuples, which can be hashed."""
+    return tuple(as_tuples(one) for one in value) if isinstance(value, list | tuple) else value
 
 
 class Batch(NamedTuple):

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.algos.untrained import untrained
+from ringfence.problem.bounds import Bounds
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
@@ -23,8 +24,8 @@ class Rest(HadStart, eqx.Module):
 
     def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         s = self.spec
-        middle = (s.action_low + s.action_high) / 2
-        return carry, PolicyStep(jnp.full((observations.shape[0], s.n_agents, s.action_dim), middle), {})
+        shape = (observations.shape[0], s.n_agents, s.action_dim)
+        return carry, PolicyStep(jnp.full(shape, Bounds(s.action_low, s.action_high).middle, jnp.float32), {})
 
     def propose(
         self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World

@@ -265,8 +265,8 @@ def import_hdf5(
     task: str | None = None,
     agents: str | None = None,
     cost_limit: float | None = None,
-    action_low: float | None = None,
-    action_high: float | None = None,
+    action_low: tuple[float, ...] | None = None,
+    action_high: tuple[float, ...] | None = None,
 ) -> None:
     """Import an HDF5 file in DSRL's, D4RL's or Minari's layout, as the logs of one agent or of several.
 
@@ -276,7 +276,7 @@ def import_hdf5(
         task: a name for the data; that of the file or the data set by default.
         agents: who sees and moves which columns, as JSON or a JSON file: {"a": {"observation": [0, 1], "action": [0]}}.
         cost_limit: the cost per episode that reports call safe.
-        action_low: bound of every action entry; Minari's action space tells it by default, else -1.
+        action_low: bound of all action entries, or one of each; Minari's action space tells it by default, else -1.
         action_high: likewise, else 1.
     """
     from ringfence.datasets.importers.hdf5 import import_hdf5

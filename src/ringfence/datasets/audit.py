@@ -70,8 +70,7 @@ def _outcomes(store: EpisodeStore) -> dict[str, str]:
         **{f"constraint {name}": _of_constraint(store, name) for name in store.limits},
         "steps with cost": f"{100 * _cost_rate(store):.2f} %",
         "episodes with cost": f"{100 * (costs > 0).mean():.2f} %",
-        "actions": f"from {store.actions.min():.3f} to {store.actions.max():.3f}, bounds {card.action_low:g} to "
-        f"{card.action_high:g}",
+        "actions": f"from {store.actions.min():.3f} to {store.actions.max():.3f}, bounds {card.bounds}",
         "ended by": f"{int(store.terminated.sum()):,} terminations, {int(store.truncated.sum()):,} truncations",
     }
 

@@ -282,8 +282,8 @@ def from_store(store: EpisodeStore) -> Task:
         cost_limit=1.0 if card.cost_limit is None else float(card.cost_limit),
         transitions=store.steps,
         presets=("mujoco",) if robot else (),
-        action_low=float(card.action_low),
-        action_high=float(card.action_high),
+        action_low=card.bounds.low,
+        action_high=card.bounds.high,
         homogeneous=card.homogeneous,
     )
 
@@ -299,10 +299,8 @@ def _misfit(store: EpisodeStore, env: Env | NativeEnv) -> str:
     for what, here, there in sizes:
         if here != there:
             return f"has {here} {what}, its simulator {there}"
-    low = store.card.action_low
-    high = store.card.action_high
-    if (low, high) != (-1.0, 1.0):
-        return f"has actions from {low:g} to {high:g}, its simulator from -1 to 1"
+    if store.card.bounds != (-1.0, 1.0):
+        return f"has actions from {store.card.bounds}, its simulator from -1 to 1"
     names = store.card.state_names
     if names and list(names) != list(env.state_names):
         k = next(k for k, (a, b) in enumerate(zip(names, env.state_names)) if a != b)

@@ -12,7 +12,7 @@ from ringfence.envs.base import Env, NativeEnv
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
-from ringfence.types import Policy, Spec
+from ringfence.types import Bound, Policy, Spec
 
 Card = dict[str, Any]
 
@@ -65,8 +65,8 @@ class Task:
     transitions: int = 1_000_000  # of the full data set
     presets: tuple[str, ...] = ()  # of algorithms that have one of these: the one to take by default
     protocol: str = ""  # where a task exists with several limits: which one this is
-    action_low: float = -1.0
-    action_high: float = 1.0
+    action_low: Bound = -1.0
+    action_high: Bound = 1.0
     recipe: Recipe | None = None  # how its data sets are regenerated; None: they cannot be
     homogeneous: bool = False  # its agents are homogeneous and see for themselves (problem/homogeneous.py)
 

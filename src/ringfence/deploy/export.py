@@ -35,6 +35,7 @@ from ringfence.errors import UserError, unknown
 from ringfence.guards import Guarded
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
+from ringfence.problem.bounds import stored
 from ringfence.problem.homogeneous import agent_policy
 from ringfence.proposals.base import with_cost
 from ringfence.training import worlds
@@ -287,8 +288,8 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "n_agents": job.team,
         "names": {k: list(x) for k, (x, count) in names.items() if x is not None and len(x) == count},
         "constraints": _constraints(resolved.team),
-        "action_low": job.spec.action_low,
-        "action_high": job.spec.action_high,
+        "action_low": stored(job.spec.action_low),
+        "action_high": stored(job.spec.action_high),
         "inputs": [dataclasses.asdict(x) for x in step.inputs],
         "outputs": [dataclasses.asdict(x) for x in step.outputs],
         "initial": {name: _short(x) for name, x in step.initial.items()},

@@ -16,6 +16,7 @@ from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
 from ringfence.loading.controller import Controller
+from ringfence.problem.bounds import Bounds
 from ringfence.proposals.base import with_cost
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key
@@ -26,7 +27,6 @@ from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import renamed
 
 OLD_ARGUMENTS = {"longest": "max_episode_steps", "at_once": "num_envs"}
-BOUNDS_SLACK = 1e-4  # share of the range by which bounds may differ: they went through 32 bits
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
 
 
@@ -82,7 +82,7 @@ def play(
         _check_kept(player)
     max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
     envs = _made(make_env, min(num_envs, episodes))
-    _check_bounds(envs[0], player.task.action_low, player.task.action_high)
+    _check_bounds(envs[0], Bounds(player.task.action_low, player.task.action_high))
     begun = time.perf_counter()
     key = jax.random.key(seed)
     tables: list[Table] = []
@@ -135,22 +135,30 @@ def _check_kept(player: Player) -> None:
     writable(player.run.path / "results.json")
 
 
-def _check_bounds(env: Any, low: float, high: float) -> None:
+def _check_bounds(env: Any, bounds: Bounds) -> None:
     """Refuse a simulator whose action spaces, where it tells them, do not hold what the policy does."""
     space_of = getattr(env, "action_space", None)
     agents = list(getattr(env, "possible_agents", ()))
     if not callable(space_of) or len(set(map(str, agents))) < len(agents):  # refused when it begins
         return
-    for agent in agents:
+    for index, agent in enumerate(agents):
         space = space_of(agent)
         least, most = getattr(space, "low", None), getattr(space, "high", None)
         if least is None or most is None:
             continue
-        slack = BOUNDS_SLACK * (high - low)
-        if np.max(least) > low + slack or np.min(most) < high - slack:
+        mine = bounds.of_agent(index)
+        try:
+            narrower = (least > mine.low + mine.slack) | (most < mine.high - mine.slack)
+        except ValueError:
             raise UserError(
-                f"The action space of {agent} in {type(env).__name__} is from {np.max(least):g} to {np.min(most):g}, "
-                f"the policy acts from {low:g} to {high:g}; scale its actions in the simulator, or widen the space."
+                f"The action space of {agent} in {type(env).__name__} has shape {np.shape(least)}, and the policy is "
+                f"bounded by {mine}; give the simulator that the data is of."
+            ) from None
+        if narrower.any():
+            there = Bounds.of(np.ravel(least), np.ravel(most))
+            raise UserError(
+                f"The action space of {agent} in {type(env).__name__} is from {there}, the policy acts from {mine}; "
+                "scale its actions in the simulator, or widen the space."
             )
 
 

@@ -186,8 +186,8 @@ def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: S
         None,
         hazard,
         cost_limit=float(card.get("cost_limit", 1.0)),
-        action_low=card["action_low"],
-        action_high=card["action_high"],
+        action_low=spec.action_low,
+        action_high=spec.action_high,
         homogeneous=spec.homogeneous,
     )
 

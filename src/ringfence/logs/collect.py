@@ -14,6 +14,7 @@ import numpy as np
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
 from ringfence.errors import StoreError, UserError, known, whole_number
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.bounds import Bounds
 from ringfence.utils.files import writable
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
@@ -63,13 +64,13 @@ def collect(
     if kept is not None and _begun(kept) >= episodes:
         return kept
     rules = _Rules(
-        bounds=_bounds(env),
+        space=_space(env),
         shape=Shape(state=None if _has_state(env, seed) else 0),
         cost=cost,
         max_steps=max_episode_steps,
         early_ends=early_ends,
     )
-    keeper = _Keeper(env, rules.bounds, source, card, file, kept)
+    keeper = _Keeper(env, rules.space.bounds, source, card, file, kept)
     return _filled(keeper, player, rules, episodes, quiet)
 
 
@@ -95,7 +96,7 @@ class _Keeper:
     def __init__(
         self,
         env: Any,
-        bounds: _Bounds,
+        bounds: Bounds,
         source: dict[str, Any],
         card: dict | None,
         file: Path | None,
@@ -171,29 +172,27 @@ class _Player:
 
 
 @dataclass(frozen=True)
-class _Bounds:
-    """Of every agent's actions."""
+class _Space:
+    """Of the agents' actions."""
 
-    low: float
-    high: float
+    bounds: Bounds
     entries: int
 
     def clipped(self, actions: np.ndarray) -> np.ndarray:
         """Actions (N, A) within the bounds; more than a rounding outside is refused."""
-        slack = 1e-4 * (self.high - self.low)
-        if (actions < self.low - slack).any() or (actions > self.high + slack).any():
+        if self.bounds.outside(actions).any():
             raise UserError(
                 f"The policy gave actions from {actions.min():.4g} to {actions.max():.4g}, the action space is from "
-                f"{self.low:g} to {self.high:g}; clip or scale them."
+                f"{self.bounds}; clip or scale them."
             )
-        return np.clip(actions, self.low, self.high)
+        return np.clip(actions, self.bounds.low, self.bounds.high)
 
 
 @dataclass(frozen=True)
 class _Rules:
     """What holds for every episode."""
 
-    bounds: _Bounds
+    space: _Space
     shape: Shape
     cost: Cost | None
     max_steps: int
@@ -229,18 +228,18 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
     player.reset()
     chance = np.random.default_rng((first_seed, k))
     episode = Episode(env, rules.shape, first_seed + k, rules.max_steps, rules.early_ends)
-    bounds = rules.bounds
-    shape = (len(episode.agents), bounds.entries)
+    space = rules.space
+    shape = (len(episode.agents), space.entries)
     seen = [episode.seen]
     states = [episode.state]
     actions = []
     while episode.running:
         if player.act is None:
-            action = chance.uniform(bounds.low, bounds.high, shape)
+            action = chance.uniform(space.bounds.low, space.bounds.high, shape)
         else:
             state = episode.state
             action = player.act(episode.seen.copy(), None if state is None else state.copy())  # it may write there
-        actions.append(bounds.clipped(given_as("actions", action, shape)))
+        actions.append(space.clipped(given_as("actions", action, shape)))
         episode.step(actions[-1], rules.cost)
         if episode.skipped:
             return None
@@ -276,7 +275,7 @@ def _of_every_agent(costs: Sequence[float | np.ndarray], n_agents: int) -> np.nd
 
 
 def _store(
-    played: list[_Played], env: Any, bounds: _Bounds, source: dict[str, Any], card: dict | None, by_agent: bool
+    played: list[_Played], env: Any, bounds: Bounds, source: dict[str, Any], card: dict | None, by_agent: bool
 ) -> EpisodeStore:
     """The store of these episodes; costs are of each agent where episodes before were, or agents' costs differ."""
     simulator = source["simulator"]
@@ -340,7 +339,7 @@ def _has_state(env: Any, seed: int) -> bool:
     return True
 
 
-def _bounds(env: Any) -> _Bounds:
+def _space(env: Any) -> _Space:
     name = type(env).__name__
     spaces = [env.action_space(agent) for agent in env.possible_agents]
     if any(getattr(space, "low", None) is None or len(space.shape) != 1 for space in spaces):
@@ -353,6 +352,7 @@ def _bounds(env: Any) -> _Bounds:
     if len(widths) > 1 or not np.isfinite([low, high]).all():
         raise UserError(
             f"{name} has action spaces of {sorted(widths)} entries from {low:g} to {high:g}; they must "
-            "be alike for all agents, and bounded."
+            "be as wide for all agents, and bounded."
         )
-    return _Bounds(low, high, widths.pop())
+    bounds = Bounds.of(np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces]))
+    return _Space(bounds, widths.pop())

@@ -13,6 +13,9 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
+from ringfence.problem.bounds import Bounds
+from ringfence.problem.bounds import stored as stored_bound
+from ringfence.types import as_tuples
 from ringfence.utils import schemas, stored
 from ringfence.utils.renamed import deprecated
 
@@ -42,8 +45,8 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     task: str = "custom"
     simulator: str | None = None  # what the data was recorded in, with its version
     provenance: str = "user data"
-    action_low: float = -1.0
-    action_high: float = 1.0
+    action_low: float | list = -1.0  # of all entries, of each, or of each agent's entries (problem/bounds.py)
+    action_high: float | list = 1.0
     observation_names: list[str] | None = None
     state_names: list[str] | None = None
     hazard: dict[str, Any] = msgspec.field(default_factory=lambda: {"kind": "CostColumn"})
@@ -68,6 +71,11 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         values = {**self.extra, **own}
         names = dict.fromkeys([*self.written, *differ, *self.extra])
         return {name: copy.deepcopy(values[name]) for name in names}
+
+    @property
+    def bounds(self) -> Bounds:
+        """Of actions."""
+        return Bounds(as_tuples(self.action_low), as_tuples(self.action_high))
 
     def updated(self, **fields: Any) -> StoreCard:
         """The card with other fields, of any name."""
@@ -180,15 +188,9 @@ def _task_is_a_name(card: dict) -> None:
 
 
 def _action_bounds(card: dict) -> None:
-    for name in ("action_low", "action_high"):
-        if not _is_number(card[name]):
-            raise StoreError(f"The card has {name}={card[name]!r}; it must be one number, the bound of every entry.")
-        card[name] = float(card[name])
-    if not card["action_low"] < card["action_high"]:
-        raise StoreError(
-            f"The card has action_low={card['action_low']:g} and action_high={card['action_high']:g}; the first must "
-            "be the smaller one."
-        )
+    bounds = Bounds.of(card["action_low"], card["action_high"])
+    card["action_low"] = stored_bound(bounds.low)
+    card["action_high"] = stored_bound(bounds.high)
 
 
 def _cost_limit(card: dict) -> None:
@@ -448,12 +450,21 @@ def _constraints(store: Arrays) -> None:
 
 
 def _actions_within_bounds(store: Arrays) -> None:
-    low = store.card.action_low
-    high = store.card.action_high
-    slack = 1e-4 * (high - low)
-    outside = (store.actions < low - slack) | (store.actions > high + slack)
+    bounds = store.card.bounds
+    agents, entries = store.actions.shape[1:]
+    _demand(
+        bounds.fit(agents, entries),
+        f"The card bounds actions by {bounds}, and the data has {agents} agents with {entries} action entries each; "
+        "give one number, or one of each entry.",
+    )
+    _demand(
+        not (store.card.homogeneous and bounds.by_agent),
+        "The card has homogeneous=True and other action bounds of some agents; homogeneous agents have the same ones.",
+    )
+    outside = bounds.outside(store.actions)
     if outside.any():
         where = tuple(int(i) for i in np.argwhere(outside)[0])
+        low, high = bounds.of_entry(*where[1:])
         raise StoreError(
             f"actions{list(where)} is {store.actions[where]:.4g}, outside [{low:g}, {high:g}]; rescale the actions or "
             "set action_low and action_high in the card."

@@ -33,7 +33,7 @@ class WindowData:
         row = np.arange(store.steps) + episode
         last = store.episode_ends[episode] + episode
         seen = np.asarray(features(store.observations, store.state), np.float32)
-        actions = normalise.to_unit(jnp.asarray(store.actions), store.card.action_low, store.card.action_high)
+        actions = normalise.to_unit(jnp.asarray(store.actions), *store.card.bounds)
         scores = np.zeros(store.steps) if scores is None else scores
         self.steps = store.steps
         self.arrays = {

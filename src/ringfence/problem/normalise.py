@@ -12,13 +12,13 @@ Both maps are affine in the rows, differentiable, and inverted exactly.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.types import Array
+from ringfence.types import Array, Bound
 
 Coordinates = Literal["displacement", "state"]
 ROUNDING = 1e-5  # of an entry's size: less variation is rounding, and the entry is centred and left alone
@@ -91,12 +91,22 @@ def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> N
     )
 
 
-def to_unit(action: Array, low: float, high: float) -> Array:
-    """Actions within [low, high], in units of [−1, 1], where weights, noise and searches mean the same in any bounds.
-    Those bounded so anyway are left as they are, to the last bit."""
-    return (action - (high + low) / 2) / ((high - low) / 2)
+def to_unit(action: Array, low: Bound, high: Bound) -> Array:
+    """Actions (..., N, A) within [low, high], in units of [−1, 1], where weights, noise and searches mean the same in
+    any bounds. Those bounded so anyway are left as they are, to the last bit."""
+    middle, half = _middle_and_half(low, high)
+    return (action - middle) / half
 
 
-def from_unit(action: Array, low: float, high: float) -> Array:
+def from_unit(action: Array, low: Bound, high: Bound) -> Array:
     """Inverse of `to_unit`."""
-    return (high + low) / 2 + (high - low) / 2 * action
+    middle, half = _middle_and_half(low, high)
+    return middle + half * action
+
+
+def _middle_and_half(low: Bound, high: Bound) -> tuple[Any, Any]:
+    """The middle of the bounds and half of their range: numbers, or float32 arrays of each entry."""
+    if isinstance(low, int | float) and isinstance(high, int | float):
+        return (high + low) / 2, (high - low) / 2
+    least, greatest = np.asarray(low), np.asarray(high)
+    return ((greatest + least) / 2).astype(np.float32), ((greatest - least) / 2).astype(np.float32)

@@ -8,6 +8,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from ringfence.problem import normalise
 from ringfence.problem.features import FeatureMap, translation
@@ -61,8 +62,10 @@ class Constant(HadStart, eqx.Module):
         s = self.spec
         shape = (observations.shape[0], s.n_agents, s.action_dim)
         if self.random:
-            return carry, PolicyStep(jax.random.uniform(key, shape, minval=s.action_low, maxval=s.action_high), {})
-        return carry, PolicyStep(jnp.zeros(shape), {})
+            low, high = jnp.asarray(s.action_low, jnp.float32), jnp.asarray(s.action_high, jnp.float32)
+            return carry, PolicyStep(jax.random.uniform(key, shape, minval=low, maxval=high), {})
+        nothing = np.clip(0.0, s.action_low, s.action_high)  # where the bounds leave 0 out, what is nearest to it
+        return carry, PolicyStep(jnp.full(shape, nothing, jnp.float32), {})
 
 
 def held(action: Array, rows: int) -> Array:

@@ -26,6 +26,7 @@ Few = Annotated[int, msgspec.Meta(ge=1, le=100_000)]  # agents, entries: what lo
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Interval = tuple[float, float]
 Scalar = bool | int | float | str | None
+Bound = float | list[float | list[float]]  # of actions (problem/bounds.py)
 Limits = Annotated[
     dict[Name, Annotated[float, msgspec.Meta(ge=0, le=1e12)]], msgspec.Meta(max_length=100)
 ]  # of constraints
@@ -40,8 +41,8 @@ class Spec(TypedDict, total=False):
     n_agents: Few
     action_dim: Few
     feature_names: list[str]
-    action_low: float
-    action_high: float
+    action_low: Bound
+    action_high: Bound
     episode_length: Positive
     homogeneous: bool
     alike: bool  # of 0.1.0: homogeneous
@@ -67,8 +68,8 @@ class Data(TypedDict, total=False):
     constraints: Limits | None
     team: Few | None
     cost_limit: Annotated[float, msgspec.Meta(ge=0)] | None
-    action_low: float
-    action_high: float
+    action_low: Bound
+    action_high: Bound
     agents: list[str] | None
     observation_names: list[str] | None
     state_names: list[str] | None

@@ -92,7 +92,7 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
-    content = [validate.VERSION, cause_search.VERSION, store.content, features.to_dict(map)]
+    content = [validate.VERSION, cause_search.VERSION, store.content, features.to_dict(map), *_bounds(store)]
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     file = parts.file("world", list(PARTS), content)
@@ -120,6 +120,7 @@ def _fitted(
     out = held_out(store, parts.seed, unsafe_of(labels) if labels else None)
     logged = Logged.of(store, map, out, labels)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
+    moved += "".join(_bounds(store))
 
     world = blank_world(map, spec, settings)
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
@@ -246,6 +247,12 @@ def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
     content = [moved, cause_search.VERSION, _digest(logged.label)]
     found = parts.json("causes", content, Found, lambda: search.result[0])
     return found if found.explained >= EXPLAINED else Found()
+
+
+def _bounds(store: EpisodeStore) -> list[str]:
+    """Within which actions are learned, where these are not the usual ones: the same arrays are other logs then."""
+    bounds = store.card.bounds
+    return [] if bounds == (-1.0, 1.0) else [repr(tuple(bounds))]
 
 
 def _digest(array: np.ndarray) -> str:

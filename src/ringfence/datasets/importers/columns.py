@@ -83,14 +83,14 @@ def check(path: Path, columns: Columns, observations: int, actions: int) -> None
         )
 
 
-def take(joint: np.ndarray, indices: list[list[int]], fill: float = 0.0) -> np.ndarray:
-    """(T, D) -> (T, N, W), W the most columns of an agent; what an agent has not is `fill`."""
+def take(joint: np.ndarray, indices: list[list[int]], fill: float | np.ndarray = 0.0) -> np.ndarray:
+    """(T, D) -> (T, N, W), W the most columns of an agent; what an agent has not is `fill`, of all or (N, W)."""
     sizes = np.array([len(k) for k in indices])
     there = np.arange(sizes.max()) < sizes[:, None]  # (N, W)
     table = np.zeros(there.shape, int)
     table[there] = np.concatenate(indices)
     taken = joint[:, table]
-    taken[:, ~there] = fill
+    taken[:, ~there] = np.broadcast_to(fill, there.shape)[~there]
     return taken
 
 

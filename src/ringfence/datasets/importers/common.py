@@ -6,13 +6,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from ringfence.datasets.importers import columns
 from ringfence.errors import StoreError
-from ringfence.logs.schema import complete_card
+from ringfence.problem.bounds import Bounds
 
 PACKED = 100  # times its size that a compressed file may unpack to; columns of zeros pack well
 
@@ -22,8 +23,8 @@ class Asked:
     """What the caller says of the file."""
 
     agents: columns.Columns | None
-    low: float | None
-    high: float | None
+    low: Any  # bounds of actions, as a card takes them
+    high: Any
 
 
 @dataclass(frozen=True)
@@ -37,32 +38,45 @@ class Logs:
     costs: np.ndarray | None  # (T,), None where nothing is recorded
     ends: np.ndarray  # (E,)
     terminated: np.ndarray  # (E,) bool
-    bounds: tuple[float, float]
+    bounds: Bounds
     notes: list[str]
     name: str  # of the data
     names: list[str] | None = None  # of the observation entries
     simulator: str | None = None
 
 
-def bounds_of(space: tuple[float, float] | None, asked: Asked) -> tuple[float, float]:
+def bounds_of(space: Bounds | None, asked: Asked, entries: int) -> Bounds:
+    """Within what the entries of one stream's actions lie: as asked, else as the action space says, else −1 and 1."""
     low, high = space or (-1.0, 1.0)
-    given = {
-        "action_low": low if asked.low is None else asked.low,
-        "action_high": high if asked.high is None else asked.high,
-    }
-    card = complete_card(given)
-    return card.action_low, card.action_high
-
-
-def within(path: Path, name: str, actions: np.ndarray, bounds: tuple[float, float]) -> None:
-    low, high = bounds
-    slack = 1e-4 * (high - low)  # the store's
-    outside = ((actions < low - slack) | (actions > high + slack)).any(1)
-    if outside.any():
+    bounds = Bounds.of(low if asked.low is None else asked.low, high if asked.high is None else asked.high)
+    if bounds.by_agent or not bounds.fit(1, entries):
         raise StoreError(
-            f"'{path}' has '{name}' from {actions.min():.4g} to {actions.max():.4g}, row {int(outside.argmax())} first "
-            f"outside [{low:g}, {high:g}]; pass action_low and action_high (--action-low, --action-high)."
+            f"Actions are bounded by {bounds}, and the file has {entries} action entries in a row; give action_low "
+            "and action_high one number, or one of each entry."
         )
+    return bounds
+
+
+def within(path: Path, name: str, actions: np.ndarray, bounds: Bounds) -> None:
+    outside = bounds.outside(actions)
+    if outside.any():
+        row, entry = (int(k) for k in np.argwhere(outside)[0])
+        low, high = bounds.of_entry(0, entry)
+        raise StoreError(
+            f"'{path}' has '{name}' from {actions.min():.4g} to {actions.max():.4g}, row {row} first outside "
+            f"[{low:g}, {high:g}]; pass action_low and action_high (--action-low, --action-high)."
+        )
+
+
+def of_agents(bounds: Bounds, indices: list[list[int]]) -> Bounds:
+    """The bounds of a stream's entries, shared out among agents by the entries that each has. An entry that an agent
+    lacks is bounded as that of an agent who has it."""
+    if not np.ndim(bounds.low) and not np.ndim(bounds.high):
+        return bounds
+    widest = max(indices, key=len)
+    places = [[*own, *widest[len(own) :]] for own in indices]
+    of_each = [np.broadcast_to(one, sum(map(len, indices)))[places] for one in bounds]
+    return Bounds.of(*of_each)
 
 
 def numbers(path: Path, name: str, array: h5py.Dataset, rows: int | None = None) -> np.ndarray:

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -53,16 +53,16 @@ def import_hdf5(
     task: str | None = None,
     agents: dict | str | os.PathLike | None = None,
     cost_limit: float | None = None,
-    action_low: float | None = None,
-    action_high: float | None = None,
+    action_low: float | Sequence[float] | None = None,
+    action_high: float | Sequence[float] | None = None,
 ) -> EpisodeStore:
     """The store of a DSRL, D4RL or Minari file, of a folder with Minari's main_data.hdf5, or of a Minari data set that
     is on this machine, by its name (needs the extra `minari`). The layout is recognised by the names in the file.
 
     `agents` shares the columns out (see `columns.py`): a dictionary, JSON text or a JSON file's path; one agent by
     default. `task` defaults to the name of the file or the data set. `cost_limit` is the cost per episode that reports
-    call safe. Actions are bounded by `action_low` and `action_high`, by default by Minari's action space, else by −1
-    and 1. `StoreError` names what does not fit, with the row of the file.
+    call safe. Actions are bounded by `action_low` and `action_high`, one number for all entries or one of each, by
+    default by Minari's action space, else by −1 and 1. `StoreError` names what does not fit, with the row of the file.
     """
     known = {"task": task, "cost_limit": cost_limit}
     known = {key: value for key, value in known.items() if value is not None}
@@ -86,7 +86,8 @@ def import_hdf5(
 
 def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: dict) -> EpisodeStore:
     """The steps, shared out."""
-    (low, high), notes = log.bounds, list(log.notes)
+    bounds = log.bounds
+    notes = list(log.notes)
     seen, done = log.observations[:, None], log.actions[:, None]
     card: dict[str, Any] = {"agents": ["agent0"]}
     if agents is not None:
@@ -94,7 +95,9 @@ def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: 
         rows = len(log.observations) * widest["observation"] + len(log.actions) * widest["action"]
         arrays.fits(path, 4 * rows * len(agents))
         seen = columns.take(log.observations, [a["observation"] for a in agents.values()])
-        done = columns.take(log.actions, [a["action"] for a in agents.values()], 0.5 * (low + high))
+        own = [a["action"] for a in agents.values()]
+        bounds = common.of_agents(bounds, own)
+        done = columns.take(log.actions, own, bounds.middle)
         card = {"agents": list(agents), "columns": agents}
         sizes = [len(a["action"]) for a in agents.values()]
         card |= {"action_sizes": sizes} if len({*sizes}) > 1 else {}
@@ -110,8 +113,8 @@ def _store(path: Path, log: common.Logs, agents: columns.Columns | None, known: 
         "task": _task_name(log.name),
         "simulator": log.simulator,
         "provenance": f"imported from {log.layout}'s layout in '{path}'",
-        "action_low": low,
-        "action_high": high,
+        "action_low": bounds.low,
+        "action_high": bounds.high,
         "observation_names": names,
         "warnings": notes,
         **known,
@@ -222,7 +225,7 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     common.continuous(path, "actions", found["actions"])
     if asked.agents is not None:
         columns.check(path, asked.agents, seen, acted)
-    bounds = common.bounds_of(None, asked)
+    bounds = common.bounds_of(None, asked, acted)
     arrays.affordable(path, sum(array.nbytes for array in found.values()), common.PACKED)
 
     terminals, timeouts = (common.flags(path, name, found[name], rows) for name in ("terminals", "timeouts"))

@@ -22,6 +22,7 @@ import numpy as np
 
 from ringfence.datasets.importers import columns, common
 from ringfence.errors import StoreError
+from ringfence.problem.bounds import Bounds
 from ringfence.utils import arrays, schemas
 
 NAMES = ("observations", "actions", "rewards", "terminations", "truncations")
@@ -46,7 +47,7 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     notes: list[str] = []
     if isinstance(count := metadata.get("total_episodes"), int | np.integer) and count != len(episodes):
         raise StoreError(f"'{path}' holds {len(episodes)} episodes, its metadata tells of {count}; copy it again.")
-    bounds = common.bounds_of(_action_space(path, metadata, asked, notes), asked)
+    space = _action_space(path, metadata, asked)
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
     for name, shapes in found.items():
@@ -62,6 +63,7 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
         raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
     if asked.agents is not None:
         columns.check(path, asked.agents, seen, acted)
+    bounds = common.bounds_of(space, asked, acted)
     arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
 
     if empty := [name for name, shapes in found.items() if not shapes.steps]:
@@ -232,13 +234,13 @@ def _metadata(path: Path, f: h5py.File) -> dict:
     return metadata
 
 
-def _action_space(path: Path, metadata: dict, asked: common.Asked, notes: list[str]) -> tuple[float, float] | None:
-    """The bounds of Minari's action space, the widest of any entry; None where it has none or they are not asked."""
+def _action_space(path: Path, metadata: dict, asked: common.Asked) -> Bounds | None:
+    """The bounds of Minari's action space, of each entry; None where it has none or they are not asked."""
     if "action_space" not in metadata or (asked.low is not None and asked.high is not None):
         return None
     try:
         boxes = list(_boxes(path, json.loads(metadata["action_space"])))
-        low, high = (np.concatenate([np.asarray(box[k], np.float64).ravel() for box in boxes]) for k in ("low", "high"))
+        low, high = (np.concatenate([_of_entries(box, name) for box in boxes]) for name in ("low", "high"))
     except StoreError:
         raise
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
@@ -248,18 +250,23 @@ def _action_space(path: Path, metadata: dict, asked: common.Asked, notes: list[s
         ) from None
     if not len(low) or not (np.isfinite(low).all() and np.isfinite(high).all()):
         return None
-    if np.ptp(low) or np.ptp(high):
-        notes.append("entries of the action space have bounds of their own; the card holds the widest for all of them")
-    return float(low.min()), float(high.max())
+    return Bounds.of(low, high)
+
+
+def _of_entries(box: dict, name: str) -> np.ndarray:
+    """A bound of each entry of a Box, which may be told as one number."""
+    told = np.asarray(box[name], np.float64).ravel()
+    return np.repeat(told, math.prod(box.get("shape", (1,)))) if len(told) == 1 else told
 
 
 def _boxes(path: Path, space: dict) -> Iterator[dict]:
+    """The boxes of a space, in the order in which `_leaves` reads their arrays."""
     kind = space["type"]
     if kind == "Box":
         yield space
     elif kind in ("Dict", "Tuple"):
         parts = space["subspaces"]
-        for part in parts.values() if isinstance(parts, dict) else parts:
+        for part in [parts[name] for name in sorted(parts, key=_place)] if isinstance(parts, dict) else parts:
             yield from _boxes(path, part)
     else:
         raise StoreError(

@@ -136,7 +136,7 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
             warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
         costs = costs[:, 0]
     actions = _actions(motion, episodes)[episodes.leaves]
-    bound = float(np.abs(actions).max(initial=0.0)) or 1.0
+    bound = _largest(actions, of_each=bool(schema.action))
     facts = {
         "task": "table",
         "observation_names": episodes.names,
@@ -158,6 +158,14 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         "final_observations": episodes.observations[episodes.last],
         "card": {**facts, **card},
     }
+
+
+def _largest(actions: np.ndarray, of_each: bool) -> np.ndarray:
+    """The largest size of actions (T, N, A), 1 where there is none; `of_each` entry by itself, since commands are of
+    several kinds: a speed is bounded by speeds and not by how fast something turned."""
+    largest = np.abs(actions).max((0, 1), initial=0.0)
+    largest = largest if of_each else largest.max(keepdims=True)
+    return np.where(largest > 0, largest, 1.0)
 
 
 def _of_team(costs: np.ndarray, homogeneous: bool) -> bool:
