@@ -68,7 +68,7 @@ def test_a_result_says_what_the_policy_does(run, logs, world):
     beside = worlds.fit(other, seed=1, **QUICK_WORLD)
     how = {"evaluation_world": beside, "guard": "shield", "world": guarded, "correction_steps": 1, **QUICK}
     result = ringfence.ope(run, other, **how)
-    assert not result.trained_on and result.logs.episodes == 40
+    assert result.trained_on and result.episodes_trained_on == result.logs.episodes == 40
     safety = result.safety
     behaviour = result.behaviour
     shares = (safety.predicted_violation_rate, safety.margin_violation_rate, behaviour.ood_rate)
@@ -150,6 +150,22 @@ def test_a_policy_is_played_as_long_as_the_logs(uneven):
     found = ringfence.ope(run, store, evaluation_world=world, **QUICK | {"rollout_steps": 30, "rollout_episodes": 40})
     assert found.rollout.returns_of_logs == 17.5
     assert abs(found.rollout.returns.mean - 17.5) < 4
+
+
+def test_episodes_that_were_trained_on_are_counted(uneven):
+    """Half of its own training logs counted as new."""
+    from ringfence.evaluation.ope.estimate import _trained_on
+
+    store, run, world = uneven
+    new = dataclasses.replace(store, observations=store.observations + 1)
+    half = store.select(np.arange(store.episodes) < 20)
+    assert _trained_on(run, store) == 40 and _trained_on(run, new) == 0
+    assert _trained_on(run, half) == 20 == _trained_on(run, new.followed_by(half))
+    found = ringfence.ope(run, store, evaluation_world=world, **QUICK | {"rollout_episodes": 0})
+    part = dataclasses.replace(found, episodes_trained_on=20).summary()[0]
+    assert "by 40 logged episodes, of which it was trained on 20: leave these out" in part
+    (run.path / "episodes.json").unlink()  # as runs of before are
+    assert _trained_on(run, store) == 40 and _trained_on(run, new) is None
 
 
 def test_returns_that_do_not_vary_are_not_explained(uneven):

@@ -143,6 +143,13 @@ class EpisodeStore:
         """Digest of all arrays: other steps have another."""
         return self.digest(*ARRAYS, *OPTIONAL)
 
+    @property
+    def digests_of_episodes(self) -> list[str]:
+        """Of what was seen and done in each episode, so that it is known again among others."""
+        rows = np.split(self.observations, np.cumsum(self.lengths + 1)[:-1])
+        steps = np.split(self.actions, self.episode_ends[:-1])
+        return [digest_of((("observations", seen), ("actions", done))) for seen, done in zip(rows, steps)]
+
     def digest(self, *names: str) -> str:
         """Of some of the arrays."""
         arrays = ((name, getattr(self, name)) for name in names)

@@ -409,6 +409,7 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
             )
     else:  # the config last: a folder without one is begun anew
         write_json(run.path / "env.json", environment())
+        write_json(run.path / "episodes.json", data.digests_of_episodes)
         write_json(run.path / "config.json", mine)
 
 

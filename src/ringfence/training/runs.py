@@ -2,6 +2,7 @@
 
 config.json     algorithm, preset, config, task, spec, hazard, seed, data card
 env.json        versions, hardware, git commit
+episodes.json   digest of every episode that was trained on
 metrics.jsonl   one line per logged chunk of updates
 ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
 results.json    what `ringfence eval` measured, one entry per variant
@@ -63,6 +64,13 @@ class Run:
         file = self.path / "results.json"
         remedy = "holds a damaged results.json; delete that file and evaluate the run again"
         return stored.results(schemas.read(file, schemas.Results, remedy)) if file.exists() else {}
+
+    @property
+    def episodes(self) -> set[str] | None:
+        """Digests of the episodes that it was trained on; None of runs of before, which do not tell."""
+        file = self.path / "episodes.json"
+        remedy = "holds a damaged episodes.json; delete that file"
+        return set(schemas.read(file, list[str], remedy)) if file.exists() else None
 
     @property
     def metrics(self) -> list[dict]:

@@ -55,10 +55,11 @@ def ope(
     """What logs say of a policy: a run as `ringfence.load` plays it (guard, barrier, execution, world, ...).
 
     store: logs of the run's task, best those that it was not trained on (`trained_on` of the result says whether it
-    was). `evaluation_world` is the World that predicts (default: fitted to these logs with seed + 1). The policy is
-    asked in `states` logged states; fitted Q evaluation learns from `transitions` logged steps, by `num_ensemble`
-    networks on resampled episodes, whose 95 % interval is Student's; `compare` evaluates what the logs did, too.
-    Policies are asked with an empty memory: plans under way and adapted margins are not there.
+    was on any of them, `episodes_trained_on` on how many). `evaluation_world` is the World that predicts (default:
+    fitted to these logs with seed + 1). The policy is asked in `states` logged states; fitted Q evaluation learns from
+    `transitions` logged steps, by `num_ensemble` networks on resampled episodes, whose 95 % interval is Student's;
+    `compare` evaluates what the logs did, too. Policies are asked with an empty memory: plans under way and adapted
+    margins are not there.
 
     In `rollout_episodes` of up to `rollout_steps` steps it is played in that World, with its memory (0 episodes: not).
     `ahead` is how many steps are predicted from each logged state.
@@ -110,7 +111,8 @@ def ope(
         algorithm=job.algorithm.name,
         guard=spec.guard,
         logs=LogsRead(logs.episodes, logs.steps, store.content),
-        trained_on=run.config["data"].get("content") == store.content,
+        trained_on=bool(_trained_on(run, store)),
+        episodes_trained_on=_trained_on(run, store),
         discount=discount,
         ahead=ahead,
         behaviour=behaviour(logs, asked, responses, world),
@@ -119,6 +121,14 @@ def ope(
         values=values,
         values_of_logs=values_of_logs,
     )
+
+
+def _trained_on(run: Run, store: EpisodeStore) -> int | None:
+    """How many of these episodes the run was trained on; None where it does not tell."""
+    if run.config["data"].get("content") == store.content:
+        return store.episodes
+    known = run.episodes
+    return None if known is None else sum(digest in known for digest in store.digests_of_episodes)
 
 
 def check_sizes(states: int, transitions: int, updates: int, seed: int) -> None:

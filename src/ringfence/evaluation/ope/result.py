@@ -116,7 +116,7 @@ class OPEResult:
     algorithm: str
     guard: str
     logs: LogsRead
-    trained_on: bool  # whether the policy was trained on these logs
+    trained_on: bool  # whether the policy was trained on any of these episodes
     discount: float
     ahead: int  # predicted steps
     behaviour: Behaviour
@@ -124,6 +124,7 @@ class OPEResult:
     rollout: ModelRollout | None  # None where it was not played
     values: Values
     values_of_logs: Values | None
+    episodes_trained_on: int | None = None  # of these; None where a run of before does not tell
 
     def summary(self) -> list[str]:
         """Lines for a person."""
@@ -146,7 +147,11 @@ class OPEResult:
 
     def _headline(self) -> str:
         line = f"{self.algorithm} under guard={self.guard}, by {self.logs.episodes:,} logged episodes"
-        return line + " that it was trained on: the best case" if self.trained_on else line
+        if not self.trained_on:
+            return line
+        if self.episodes_trained_on in (None, self.logs.episodes):
+            return line + " that it was trained on: the best case"
+        return line + f", of which it was trained on {self.episodes_trained_on:,}: leave these out"
 
     def _values_lines(self) -> list[str]:
         lines = []
