@@ -16,6 +16,7 @@ from ringfence.world.card import BarrierScores, Card, Data, PredictionError, Ver
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.cells import Cells
 from ringfence.world.logged import held_out
+from tests.quick import QUICK_WORLD
 
 N, STEPS = 3, 40
 NAMES = ["own.x", "own.y", "own.v", "goal.dx", "goal.dy"] + [f"other{j}.d{c}" for j in range(N - 1) for c in "xy"]
@@ -175,14 +176,14 @@ def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
 
 
 def test_networks_on_all_entries_are_a_setting():
-    plain = fit(store_of(60), **QUICK, barrier_updates=50, causes=False)
+    plain = fit(store_of(60), **QUICK_WORLD, causes=False)
     assert plain.card.causes == {"": causes.Found()} and not plain.barrier.causes and plain.barrier.label
 
 
 @pytest.mark.verdicts
 def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     chance = np.random.default_rng(3)
-    world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK, barrier_updates=50)
+    world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK_WORLD)
     assert world.card.verdict.word == "unfit"
     still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
     with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
