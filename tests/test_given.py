@@ -8,7 +8,7 @@ import pytest
 import ringfence
 from ringfence import world as world_files
 from ringfence.envs.episode import Episode, Shape
-from ringfence.errors import NoSafeAction, UserError
+from ringfence.errors import Interrupted, NoSafeAction, UserError
 from ringfence.logs.collect import collect
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
@@ -240,9 +240,13 @@ def test_ctrl_c_keeps_what_was_collected(tmp_path):
             raise KeyboardInterrupt
         return np.zeros((2, 2))
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="interrupted; 2 of 6 episodes were finished and are in"):
         collect(Reusing, policy, episodes=6, out=tmp_path / "s.h5")
     assert EpisodeStore.load(tmp_path / "s.h5").episodes == 2
+    played.clear()
+    with pytest.raises(Interrupted) as stopped:
+        collect(Reusing, policy, episodes=6)
+    assert stopped.value.finished.episodes == 2
 
 
 @pytest.fixture(scope="module")
@@ -263,6 +267,37 @@ def test_playing_keeps_what_was_finished(pilot):
     assert cut["episodes"] == 6 and cut["cut_episodes"] == 2 and cut["steps_mean"] == (4 * 4 + 2 * 3) / 6
     skipped = ringfence.play(pilot, Leaving, episodes=6, num_envs=4, early_ends="skip")
     assert skipped["episodes"] == 4 and skipped["skipped_episodes"] == 2 and skipped["steps_mean"] == 4
+
+
+def test_ctrl_c_keeps_what_was_played(pilot):
+    """All of 250 finished episodes were lost, with those that ended beside the one that was interrupted."""
+
+    class Stopped(Reusing):
+        def reset(self, seed=None):
+            self.seed = seed % 10
+            return super().reset(seed)
+
+        def step(self, actions):
+            observations, rewards, terminations, truncations, infos = super().step(actions)
+            if self.seed == 4 and self.t == 2:
+                raise KeyboardInterrupt
+            over = dict.fromkeys(self.possible_agents, self.seed == 3)  # at its first step
+            return observations, rewards, over if self.seed == 3 else terminations, truncations, infos
+
+    with pytest.raises(Interrupted, match="3 of 6 episodes were finished") as stopped:
+        ringfence.play(pilot, Stopped, episodes=6, num_envs=2)
+    assert stopped.value.finished["episodes"] == 3 and "cost_interval" in stopped.value.finished
+
+
+class Unplayed(Reusing):
+    def step(self, actions):
+        raise KeyboardInterrupt
+
+
+def test_ctrl_c_before_anything_was_played(pilot):
+    with pytest.raises(Interrupted, match="0 of 6 episodes were finished") as stopped:
+        ringfence.play(pilot, Unplayed, episodes=6, num_envs=1)
+    assert stopped.value.finished is None
 
 
 @pytest.mark.parametrize("flag", ["False", None, [], {}])

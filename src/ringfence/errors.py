@@ -27,6 +27,15 @@ class NoSafeAction(UserError):
         self.last_action = last_action
 
 
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C while episodes were played. `finished` is what was made of those that had ended: a summary, or a store;
+    None where none had."""
+
+    def __init__(self, message: str, finished: Any = None):
+        super().__init__(message)
+        self.finished = finished
+
+
 class StoreError(UserError):
     """An episode store breaks its contract."""
 

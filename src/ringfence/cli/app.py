@@ -19,7 +19,7 @@ from ringfence.cli.console import Refusals, complain
 from ringfence.cli.doctor import doctor
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
 from ringfence.cli.renamed import rewritten
-from ringfence.errors import UserError, whole_number
+from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import lines, terminal
 from ringfence.utils.files import writable
@@ -264,7 +264,14 @@ def play(
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
-            table.add_row(*_played(run, run_play(run, make, **given)))
+            try:
+                table.add_row(*_played(run, run_play(run, make, **given)))
+            except Interrupted as stopped:
+                if stopped.finished:
+                    table.add_row(*_played(run, stopped.finished))
+                if table.row_count:
+                    out.print(table)
+                raise
     _say(table, refusals, len(found))
 
 
@@ -460,8 +467,9 @@ def main(arguments: list[str] | None = None) -> None:
     except UserError as error:
         complain(str(error))
         sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+    except KeyboardInterrupt as stopped:
+        said = str(stopped) or "interrupted; the same command goes on from the last checkpoint"
+        print(said, file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(1)

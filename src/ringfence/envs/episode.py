@@ -97,6 +97,11 @@ class Episode:
         """The last step has no cost yet."""
         return len(self.costs) < len(self.rewards)
 
+    @property
+    def over(self) -> bool:
+        """It has ended, and nothing is missing of its last step."""
+        return not self.running and (self.skipped or not self.lacks_cost)
+
     def charge(self, cost: float) -> None:
         """Set the cost of the last step, if nothing has."""
         if self.lacks_cost:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
-from ringfence.errors import LAST_SEED, UserError, known, whole_number
+from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
@@ -49,14 +49,15 @@ def play(
     """Returns, costs and their intervals over `episodes` episodes of a simulator.
 
     run: a run, or a policy of anybody's under guard (`ringfence.guard`). `make_env()` makes a PettingZoo `ParallelEnv`
-    whose agents, in the order of `possible_agents`, are those of the data, and who begin and end together.
-    `num_envs` of them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed
-    7 000 001 + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
+    whose agents, in the order of `possible_agents`, are those of the data, and who begin and end together. `num_envs`
+    of them are stepped side by side, so that one compiled call acts in all. Episode k is reset with the seed 7 000 001
+    + k, on the split "validation", for choosing settings, with 9 000 001 + k; one that has not ended after
     `max_episode_steps` (twenty times the longest logged one, at least 10 000) is refused; `seed` moves the policy's
     noise. `early_ends` says what becomes of an episode that an agent leaves before its team: it is refused, cut there
     (`cut_episodes` counts them), or skipped (`skipped_episodes`). A refusal's `finished` is the summary of the episodes
-    that were finished before. `planner` and `options` (guard, barrier, execution, world, ...) are as in
-    `ringfence.load`. `keep` adds the result to the run's results.json, as `ringfence eval` does, for reports.
+    that were finished before, and so is that of a Ctrl-C (`errors.Interrupted`). `planner` and `options` (guard,
+    barrier, execution, world, ...) are as in `ringfence.load`. `keep` adds the result to the run's results.json, as
+    `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -86,17 +87,19 @@ def play(
     begun = time.perf_counter()
     key = jax.random.key(seed)
     tables: list[Table] = []
-    with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
-        for first in range(0, episodes, len(envs)):
-            resets = [rollout.RESETS[split] + k for k in range(first, min(first + len(envs), episodes))]
-            try:
+    try:
+        with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
+            for first in range(0, episodes, len(envs)):
+                resets = [rollout.RESETS[split] + k for k in range(first, min(first + len(envs), episodes))]
                 beginning = zip(envs, resets)
-                table = Table(player, [Episode(env, player.shape, r, max_steps, early_ends) for env, r in beginning])
-                key = table.play(cost, key)
-            except UserError as error:
-                raise _with_finished(error, player, tables) from error
-            tables.append(table)
-            bar.advance(len(resets))
+                begun_now = [Episode(env, player.shape, r, max_steps, early_ends) for env, r in beginning]
+                tables.append(Table(player, begun_now))
+                key = tables[-1].play(cost, key)
+                bar.advance(len(resets))
+    except UserError as error:
+        raise _with_finished(error, player, tables) from error
+    except KeyboardInterrupt as stopped:
+        raise _interrupted(player, tables, episodes) from stopped
     summary = _summary(player, tables)
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
     if keep and isinstance(player, RunPlayer):
@@ -118,13 +121,26 @@ class PlayInterrupted(UserError):
 
 def _with_finished(error: UserError, player: Player, tables: list[Table]) -> UserError:
     """The refusal, with what was finished before."""
-    done = [episode for table in tables for episode in table.episodes if not episode.skipped]
+    done = _done(tables)
     if not done:
         return error
-    message = (
-        f"{str(error).rstrip('.')} ({len(done)} episodes were finished; the refusal's `finished` has their summary)."
-    )
+    message = f"{str(error).rstrip('.')} ({done} episodes were finished; the refusal's `finished` has their summary)."
     return PlayInterrupted(message, _summary(player, tables))
+
+
+def _interrupted(player: Player, tables: list[Table], episodes: int) -> Interrupted:
+    """Ctrl-C, with what was finished before."""
+    done = _done(tables)
+    message = f"interrupted; {done} of {episodes} episodes were finished, and nothing was added to results.json"
+    finished = None
+    if done:
+        finished = {k: v for k, v in _summary(player, tables).items() if k not in OF_A_BENCHMARK} | player.about
+    return Interrupted(message, finished)
+
+
+def _done(tables: list[Table]) -> int:
+    """Episodes that were played to their end."""
+    return sum(episode.over and not episode.skipped for table in tables for episode in table.episodes)
 
 
 def _check_kept(player: Player) -> None:
@@ -212,8 +228,11 @@ class Table:
         running = np.array([e.running for e in self.episodes])
         for name in rollout.COUNTED:
             if name in info:
-                before = self.counts.get(name, np.zeros(len(self.episodes)))
-                self.counts[name] = before + (np.asarray(info[name]) & running)
+                self.counts[name] = self.counted(name) + (np.asarray(info[name]) & running)
+
+    def counted(self, name: str) -> np.ndarray:
+        """(B,) steps of which a guard said so."""
+        return self.counts.get(name, np.zeros(len(self.episodes)))
 
     def _charge_by_formula(self) -> None:
         """The last step costs 1 where the run's hazard calls the state unsafe."""
@@ -237,12 +256,13 @@ class Table:
 
 def _summary(player: Player, tables: list[Table]) -> dict[str, Any]:
     """The protocol's numbers of all episodes."""
-    every = [episode for table in tables for episode in table.episodes]
-    counted = np.array([not episode.skipped for episode in every])
+    begun = [episode for table in tables for episode in table.episodes]
+    every = [episode for episode in begun if episode.over]
+    counted = np.array([episode.over and not episode.skipped for episode in begun])
     played = [episode for episode in every if not episode.skipped]
     if not played:
         raise UserError(f"All {len(every)} episodes were skipped, since agents left them; pass early_ends='cut'.")
-    counts = {k: np.concatenate([t.counts[k] for t in tables])[counted] for k in tables[0].counts}
+    counts = {k: np.concatenate([t.counted(k) for t in tables])[counted] for k in tables[0].counts}
     arrays = _arrays(played) | counts
     summary = protocol.summarise(arrays, player.task, np.array([e.unsafe_start for e in played]))
     if cut := sum(episode.was_cut for episode in played):

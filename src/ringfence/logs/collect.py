@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
-from ringfence.errors import StoreError, UserError, known, whole_number
+from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.utils.files import writable
@@ -83,7 +83,10 @@ def _filled(keeper: _Keeper, player: _Player, rules: _Rules, episodes: int, quie
             for k in range(begun, episodes):
                 keeper.add(_played(keeper.env, player, rules, keeper.source["first_seed"], k))
                 bar.advance(1)
-        finally:  # a refusal or an interruption costs no episode that was finished
+        except KeyboardInterrupt as stopped:
+            keeper.keep()
+            raise Interrupted(keeper.said(episodes), keeper.kept) from stopped
+        finally:  # a refusal costs no episode that was finished
             keeper.keep()
     if keeper.kept is None:
         raise UserError(f"All {episodes} episodes of {simulator} were skipped: agents leave each; cut them.")
@@ -131,6 +134,12 @@ class _Keeper:
             self.kept = replace(self.kept, card=self.kept.card.updated(skipped_episodes=self.skipped))
         if self.kept is not None and self.file is not None:
             self.kept.save(self.file)
+
+    def said(self, episodes: int) -> str:
+        """What an interruption leaves."""
+        done = 0 if self.kept is None else self.kept.episodes
+        where = f" and are in '{self.file}'; the same call goes on from there" if self.file and done else ""
+        return f"interrupted; {done} of {episodes} episodes were finished{where}"
 
 
 def _begun(store: EpisodeStore | None) -> int:
