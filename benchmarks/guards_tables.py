@@ -5,6 +5,7 @@ python benchmarks/guards_tables.py
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -93,6 +94,7 @@ def main() -> None:
     put("docs/guard.md", "own", table("own-sight", OWN, short))
     put("docs/guard.md", "own-robots", table("own-sight-mujoco", OWN_ROBOTS, long))
     put("docs/guard.md", "barrier", barrier())
+    put("docs/guard.md", "proving", proving())
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
@@ -197,6 +199,29 @@ def other_simulator() -> str:
         part[-1] += f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
         out.append("| " + " | ".join([*part, r["episodes"]]) + " |")
     return "\n".join(out)
+
+
+def proving() -> str:
+    """Systems that chose no setting, from results/proving."""
+    heads = ["system", "verdict", "causes found", "clone", "entries", "shield", "oracle", "naive", "shield", "oracle"]
+    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    for file in sorted((RESULTS / "proving").glob("proving-*.json")):
+        found = json.loads(file.read_text())
+        rows = found["rows"]
+        cells = [f"`{found['task'].removeprefix('proving-')}`", found["verdict"], "; ".join(found["causes"]) or "none"]
+        beside = "shield learned, networks on all entries"
+        for name in ("bc none", f"bc {beside}", "bc shield learned", "bc shield oracle"):
+            cells.append(_share_and_return(rows.get(name)))
+        for name in ("naive none", "naive shield learned", "naive shield oracle"):
+            cells.append(_share_and_return(rows.get(name)))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _share_and_return(row: dict | None) -> str:
+    if row is None or "refused" in row:
+        return "–"
+    return f"{100 * row['violation_rate']:.0f} %, {row['return_mean']:.2f}"
 
 
 def barrier() -> str:

@@ -1,12 +1,12 @@
 """The proving ground in one seed and few episodes: is danger learned from a cost column alone, and kept?
 
-    python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 100]
+    python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 100] [--beside]
 
 For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
-of a clone and of the naive driver: alone, under `shield` by what was learned, the same with networks on all entries in
-the place of causes (`causes=False`, the one difference), and by the oracle, which knows dynamics and distances. The
-clone is also played with other horizons. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`.
-`ringfence bench proving-ground` plays all rows with 500 episodes.
+of a clone and of the naive driver: alone, under `shield` by what was learned, and by the oracle, which knows dynamics
+and distances. With `--beside` also what differs in one thing: networks on all entries in the place of causes
+(`causes=False`), and other horizons. Rows that a file holds already are not played again. Other tasks have the rows
+that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench proving-ground` plays all with 500 episodes.
 """
 
 import argparse
@@ -25,14 +25,14 @@ from ringfence.training import worlds
 
 COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
 LEARNED = {"guard": "shield", "anyway": True}
-# What a clone and the naive driver are played by; the World of `all` is fitted without a search for causes.
+# What a clone and the naive driver are played by.
 ROWS = {
     "none": {},
     "shield learned": LEARNED,
-    "shield learned, networks on all entries": LEARNED | {"world": "all"},
     "shield oracle": {"guard": "shield", "barrier": "oracle"},
 }
-# What a clone alone is played by, too: how far the guard looks.
+# What differs in one thing; the World of `all` is fitted without a search for causes.
+BESIDE = {"shield learned, networks on all entries": LEARNED | {"world": "all"}}
 HORIZONS = {f"shield learned, {rows} rows": LEARNED | {"horizon": rows} for rows in (3, 15, 30)}
 
 
@@ -57,18 +57,19 @@ def described(card) -> dict:
     }
 
 
-def system(task: str, runs: Path, episodes: int) -> dict:
+def system(task: str, runs: Path, episodes: int, beside: bool, file: Path) -> dict:
     begun = time.perf_counter()
     store, _ = make(TASKS[task])
-    drivers = {"bc": ROWS | HORIZONS}
+    drivers = {"bc": ROWS | (BESIDE | HORIZONS if beside else {})}
     if isinstance(TASKS[task].env, System):
-        drivers["naive"] = ROWS
+        drivers["naive"] = ROWS | (BESIDE if beside else {})
     trained = {name: ringfence.train(name, store, out=str(runs), quiet=True)[0] for name in drivers}
     fitted = time.perf_counter()
     card = worlds.fit(store, seed=0).card
     seconds = {"made and trained": fitted - begun, "fitted": time.perf_counter() - fitted}
     found = {
         "task": task,
+        "episodes": episodes,
         "logs": {
             "return_mean": float(store.returns.mean()),
             "violation_rate": float((store.episode_costs > 0).mean()),
@@ -76,18 +77,32 @@ def system(task: str, runs: Path, episodes: int) -> dict:
         },
         **described(card),
         "seconds": {name: round(value, 1) for name, value in seconds.items()},
-        "rows": {},
+        "rows": rows_of(file, card, episodes),
     }
-    every = worlds.fit(store, seed=0, causes=False)
-    found["networks on all entries"] = described(every.card)
+    every = worlds.fit(store, seed=0, causes=False) if beside else None
+    if every is not None:
+        found["networks on all entries"] = described(every.card)
     for name, rows in drivers.items():
         for label, options in rows.items():
+            if f"{name} {label}" in found["rows"]:
+                continue
             given = options | {"world": every} if "world" in options else options
             try:
                 found["rows"][f"{name} {label}"] = played(trained[name], given, episodes)
             except UserError as error:
                 found["rows"][f"{name} {label}"] = {"refused": str(error)}
+            file.write_text(json.dumps(found, indent=1) + "\n")
     return found
+
+
+def rows_of(file: Path, card, episodes: int) -> dict:
+    """What a file holds of the same World and as many episodes."""
+    if not file.exists():
+        return {}
+    kept = json.loads(file.read_text())
+    told = json.loads(json.dumps(described(card)))
+    same = kept.get("episodes") == episodes and all(kept.get(name) == value for name, value in told.items())
+    return kept["rows"] if same else {}
 
 
 def main() -> None:
@@ -95,12 +110,12 @@ def main() -> None:
     reader.add_argument("out", type=Path)
     reader.add_argument("--tasks", nargs="*", default=[f"proving-{name}" for name in TEST], choices=sorted(TASKS))
     reader.add_argument("--episodes", type=int, default=100)
+    reader.add_argument("--beside", action="store_true")
     reader.add_argument("--runs", type=Path, default=Path("runs"))
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     for task in given.tasks:
-        found = system(task, given.runs, given.episodes)
-        (given.out / f"{task}.json").write_text(json.dumps(found, indent=1) + "\n")
+        found = system(task, given.runs, given.episodes, given.beside, given.out / f"{task}.json")
         print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
         for label, row in found["rows"].items():
             print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
