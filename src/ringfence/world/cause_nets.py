@@ -170,12 +170,10 @@ def fit_causes(
 
 
 def _fixed(net: Score, begun: Score) -> Score:
-    """The score with what is not learned as it was: statistics, a network's gain, and bounds where the logs end."""
-    if isinstance(net, CauseNet) and isinstance(begun, CauseNet):
-        return eqx.tree_at(lambda n: (n.mean, n.scale, n.log_gain), net, (begun.mean, begun.scale, begun.log_gain))
-    assert isinstance(net, Distance) and isinstance(begun, Distance)
-    bounds = jnp.where(np.array(net.edge.unseen), begun.bounds, net.bounds)
-    return eqx.tree_at(lambda n: (n.scale, n.bounds), net, (begun.scale, bounds))
+    """The score with what is not learned as it was: a network's statistics and gain, and all of a distance."""
+    if not isinstance(net, CauseNet) or not isinstance(begun, CauseNet):
+        return begun
+    return eqx.tree_at(lambda n: (n.mean, n.scale, n.log_gain), net, (begun.mean, begun.scale, begun.log_gain))
 
 
 def _standardised(net: Score, cells: Cells) -> Score:

@@ -45,7 +45,8 @@ from ringfence.world.storage import blank_barrier, blank_world, load, save
 from ringfence.world.verdict import judge
 
 FORMAT = 5  # of what is fitted: what is cached of another is made again
-EXPLAINED = 0.7  # share of the unsafe steps that causes have to tell, or networks read all entries
+EXPLAINED = 0.3  # share of the unsafe steps that causes have to tell, or networks read all entries
+ENOUGH = 0.95  # recall of causes, below which networks on all entries are tried, too
 STATES = 20_000  # steps that a barrier's features are standardised by
 
 # Parts of a World: the settings that each depends on, and the other parts that it reads.
@@ -126,8 +127,11 @@ def _fitted(
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
     searches = {name: _Search(logged.by(name), parts.seed) for name in labels}
-    found_by = {name: _causes(search, moved, parts) for name, search in searches.items()}
-    each = [_barrier(search, moved, acts, found_by[name], parts, quiet) for name, search in searches.items()]
+    told = {name: _told(search, moved, acts, parts, quiet) for name, search in searches.items()}
+    found_by = {name: found for name, (found, _) in told.items()}
+    each = [
+        _with_future(told[name][1], search, moved, found_by[name], parts, quiet) for name, search in searches.items()
+    ]
     barrier = None
     if each:
         barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
@@ -259,22 +263,47 @@ def _digest(array: np.ndarray) -> str:
     return hashlib.blake2b(array.tobytes(), digest_size=8).hexdigest()
 
 
-def _barrier(
+def _told(
+    search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool
+) -> tuple[Found, cbf.Barrier]:
+    """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out
+    steps say that these tell more."""
+    found = _causes(search, moved, parts)
+    label = _labelled(search, moved, acts, found, parts, quiet)
+    if not found.causes:
+        return found, label
+    recall = validate.recall(label, search.logged)
+    if not recall < ENOUGH:
+        return found, label
+    plain = _labelled(search, moved, acts, Found(), parts, quiet)
+    if validate.recall(plain, search.logged) > recall:
+        return Found(), plain
+    return found, label
+
+
+def _labelled(
     search: _Search, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts, quiet: bool
+) -> cbf.Barrier:
+    """ℓ of one constraint."""
+    content = _about(search, moved, found)
+    template = eqx.filter_eval_shape(blank_barrier, search.logged.map, parts.settings, found)
+    return parts.get("label", content, template, lambda key: _label(search, acts, parts.settings, found, key, quiet))
+
+
+def _about(search: _Search, moved: str, found: Found) -> list[Any]:
+    """What a barrier is made of, beside its settings."""
+    return [moved, _digest(search.logged.label), cause_search.VERSION, msgspec.to_builtins(found)]
+
+
+def _with_future(
+    label: cbf.Barrier, search: _Search, moved: str, found: Found, parts: _Parts, quiet: bool
 ) -> cbf.Barrier:
     """ℓ and V of one constraint."""
     settings = parts.settings
     logged = search.logged
-    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
-    content = [moved, _digest(logged.label), cause_search.VERSION, msgspec.to_builtins(found)]
     steps = logged.fitted_steps
 
-    def fit_label(key: Key) -> cbf.Barrier:
-        return _label(search, acts, settings, found, key, quiet)
-
-    label = parts.get("label", content, template, fit_label)
-
-    def fit_future(key: Key) -> cbf.Barrier:
+    def fit(key: Key) -> cbf.Barrier:
         return cbf.fit_future(
             label,
             logged.arrays,
@@ -287,7 +316,8 @@ def _barrier(
             quiet=quiet,
         )
 
-    return parts.get("future", content, template, fit_future)
+    template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
+    return parts.get("future", _about(search, moved, found), template, fit)
 
 
 def _label(

@@ -252,6 +252,16 @@ def _barrier_scores(
     return scores, unit
 
 
+def recall(barrier: Barrier, logged: Logged) -> float:
+    """Share of the held-out unsafe steps that are found with FALSE_ALARMS; UNKNOWN where one kind is lacking."""
+    steps = logged.held_steps[:STEPS]
+    unsafe = logged.unsafe[steps]
+    if unsafe.all() or not unsafe.any():
+        return UNKNOWN
+    now, _ = _scored(barrier, logged, steps)
+    return float((now[unsafe] < np.quantile(now[~unsafe], FALSE_ALARMS)).mean())
+
+
 def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """ℓ of steps and V of where they lead, each (W,), of the agent in most danger."""
     x = logged.arrays["features"]

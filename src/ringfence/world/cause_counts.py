@@ -1,0 +1,181 @@
+"""How often steps are unsafe when somebody is in a cell: what the search for causes counts, and what it gains.
+
+Every episode is in one of FOLDS parts. What is told of a step is counted on the other parts, so that a cause gains
+nothing by steps that it knows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ringfence.world.causes import Cause, told_of
+from ringfence.world.cells import CELLS, Cells
+
+UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
+SAFE_STEPS = 120_000  # likewise
+FOLDS = 3
+SUFFICIENT = 0.3  # share of unsafe steps, beyond what others explain, at which a cell is dangerous
+PRIOR = 2.0  # safe visits that every cell is taken to have had
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """Some of the logged steps."""
+
+    x: np.ndarray  # (T, N, D) where they led to
+    unsafe: np.ndarray  # (T,) of the team or (T, N)
+    fold: np.ndarray  # (T,) the part that its episode is in
+    episode: np.ndarray  # (T,)
+    low: np.ndarray  # (D,) of nearly all that was seen
+    high: np.ndarray  # (D,)
+    seen: dict[Cause, tuple[np.ndarray, np.ndarray, int, np.ndarray]]  # ranges, cells along an axis, cells of steps
+
+    def cells(self, cause: Cause) -> tuple[np.ndarray, np.ndarray, int, np.ndarray]:
+        """(low, high, cells along each axis, (T, N, J) cell of each thing); remembered."""
+        if cause not in self.seen:
+            low, high = _range(self, cause)
+            bins = _bins(cause, len(self.x) * self.x.shape[1])
+            self.seen[cause] = low, high, bins, _cell(cause, self.x, low, high, bins).astype(np.int32)
+        return self.seen[cause]
+
+    def picked(self, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
+        """((T, P) cells of the agents and things that a cause is about, (P,) whose they are); those of a cause of all
+        are remembered."""
+        cell = self.cells(told_of(cause, ()))[-1]
+        agents, things = np.nonzero(cause.holds(cell.shape[1]))
+        return cell[:, agents, things], agents
+
+    @property
+    def each(self) -> bool:
+        """Whether every agent has a cost of its own."""
+        return self.unsafe.ndim == 2
+
+
+@dataclass(frozen=True, eq=False)
+class Counted:
+    """Cells of a cause, and what they say of each step without having counted its part."""
+
+    cells: Cells  # of all steps
+    safe: np.ndarray  # (T,) or (T, N) log P(safe) by this cause
+    called: np.ndarray  # (T,) or (T, N) bool: called unsafe as the cause is scored later, also where nobody was
+    gain: float = 0.0  # log likelihood of a step, beyond what was explained
+    error: float = 0.0  # standard error of the gain over episodes
+
+    @property
+    def cause(self) -> Cause:
+        return self.cells.cause
+
+
+def some_steps(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.random.Generator) -> Steps:
+    """As many of the steps as are needed."""
+    bad = unsafe if unsafe.ndim == 1 else np.asarray(unsafe.any(1))
+    some = _sampled(bad, rng) if len(x) > SAFE_STEPS // 2 else np.arange(len(x))
+    x = np.asarray(x[some], np.float32)
+    flat = x.reshape(-1, x.shape[-1])
+    flat = flat[:: max(1, len(flat) // 200_000)]
+    low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
+    fold = rng.permutation(int(episode.max()) + 1) % FOLDS
+    return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {})
+
+
+def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Rows of steps, in order: UNSAFE_STEPS of the unsafe ones at most, and the same share of the safe ones, at least
+    as many and at most SAFE_STEPS."""
+    rows = np.flatnonzero(bad)
+    rows = rng.choice(rows, min(len(rows), UNSAFE_STEPS), replace=False)
+    fine = np.flatnonzero(~bad)
+    share = len(rows) / max(bad.sum(), 1)
+    count = min(len(fine), SAFE_STEPS, max(int(share * len(fine)), UNSAFE_STEPS))
+    return np.sort(np.concatenate([rows, rng.choice(fine, count, replace=False)]))
+
+
+def counted(steps: Steps, cause: Cause, explained: np.ndarray) -> Counted:
+    """The cause, by what others leave unexplained: `explained` is log P(safe) of the steps by them."""
+    low, high, bins, _ = steps.cells(told_of(cause, ()))
+    cell, agents = steps.picked(cause)
+    size = bins**cause.width
+    left = np.exp(explained) * steps.unsafe
+    of = agents if steps.each else np.zeros(len(agents), int)
+    place = (cell + size * steps.fold[:, None]).ravel()
+    bad = np.bincount(place, _by(left, of).ravel(), FOLDS * size).reshape(FOLDS, size)
+    fine = np.bincount(place, _by(~steps.unsafe, of).ravel().astype(float), FOLDS * size).reshape(FOLDS, size)
+    usual = left.sum() / max(left.sum() + (~steps.unsafe).sum(), 1.0)
+    all_bad, all_fine = bad.sum(0), fine.sum(0)
+    cells = Cells(cause, low, high, bins, all_bad + all_fine, _danger(all_bad, all_fine, usual))
+    others = _danger(all_bad - bad, all_fine - fine, usual)  # (FOLDS, size)
+    if not others.any():
+        nothing = np.zeros(steps.unsafe.shape)
+        return Counted(cells, nothing, nothing > 0)
+    safe = _worst(steps, np.log1p(-others)[steps.fold[:, None], cell], agents)
+    called = safe < np.log(0.5)
+    if not cause.length:
+        seen = all_bad + all_fine - bad - fine > 0
+        called |= _worst(steps, np.where(seen, 0.0, -1.0)[steps.fold[:, None], cell], agents) < 0
+    gained = gain(steps, explained, safe)
+    return Counted(cells, safe, called, *gained)
+
+
+def _by(values: np.ndarray, of: np.ndarray) -> np.ndarray:
+    """(T, P) of values (T,) of the team or (T, N): those of the agents `of`."""
+    return values.reshape(len(values), -1)[:, of]
+
+
+def _danger(bad: np.ndarray, fine: np.ndarray, usual: float) -> np.ndarray:
+    """Probability that being in a cell makes a step unsafe; 0 where it is not clearly dangerous."""
+    share = bad / (bad + fine + PRIOR)
+    error = np.sqrt(np.maximum(share * (1 - share), 0.0) / (bad + fine + PRIOR))
+    beyond = np.clip((share - error - usual) / (1 - usual), 0.0, 1.0)  # the rest comes of other causes
+    return np.where(beyond > SUFFICIENT, np.clip((share - usual) / (1 - usual), 0.0, 0.999), 0.0)
+
+
+def _worst(steps: Steps, each: np.ndarray, agents: np.ndarray) -> np.ndarray:
+    """(T,) or (T, N) of values (T, P) of these agents' things: the least, of all agents where costs are the team's."""
+    if not steps.each:
+        return each.min(1)
+    found = np.zeros(steps.unsafe.shape)
+    for agent in np.unique(agents):
+        found[:, agent] = each[:, agents == agent].min(1)
+    return found
+
+
+def gain(steps: Steps, explained: np.ndarray, safe: np.ndarray) -> tuple[float, float]:
+    """(log likelihood that a cause adds to a step, its standard error over episodes)."""
+    more = likelihood(steps, np.minimum(explained, safe)) - likelihood(steps, explained)
+    totals = np.bincount(steps.episode, more)
+    totals = totals[np.bincount(steps.episode) > 0]
+    error = totals.std() * np.sqrt(len(totals)) / len(more)
+    return float(more.mean()), float(error)
+
+
+def likelihood(steps: Steps, safe: np.ndarray) -> np.ndarray:
+    """(T,) log likelihood of the steps; what no cause explains is as frequent as in all."""
+    open_ = safe > -1e-6
+    leak = np.clip(steps.unsafe[open_].mean() if open_.any() else 0.0, 1e-4, 1 - 1e-4)
+    chance = np.clip(1 - np.exp(safe) * (1 - leak), 1e-4, 1 - 1e-4)
+    each = np.where(steps.unsafe, np.log(chance), np.log1p(-chance))
+    return each if each.ndim == 1 else each.sum(1)
+
+
+def _range(steps: Steps, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
+    entries = np.array(cause.things)
+    if not cause.length:
+        return steps.low[entries].min(0), steps.high[entries].max(0)
+    some = cause.of(steps.x[:: max(1, len(steps.x) // 20_000)])
+    return np.zeros(1), np.quantile(some, 0.9995, axis=tuple(range(some.ndim - 1)))
+
+
+def _bins(cause: Cause, samples: int) -> int:
+    most = CELLS[cause.width]
+    return int(np.clip((samples / 20) ** (1 / cause.width), 6, most))
+
+
+def _cell(cause: Cause, x: np.ndarray, low: np.ndarray, high: np.ndarray, bins: int) -> np.ndarray:
+    """(T, N, J) the cell of each thing."""
+    scaled = (cause.of(x) - low) / np.maximum(high - low, 1e-9) * bins
+    places = np.clip(scaled, 0, bins - 1).astype(np.int64)
+    cell = places[..., 0]
+    for k in range(1, cause.width):
+        cell = cell * bins + places[..., k]
+    return cell
