@@ -33,6 +33,7 @@ TINY = {  # all that learn; the naive driver of the proving ground does not
     "icbf": dict(num_updates=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8,
                  inverse_width=16, horizon=4, diffusion_steps=20, barrier_start=0.0, barrier_full=0.2),
     "madiff": dict(num_updates=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20),
+    "flow": dict(num_updates=12, batch=16, width=16, depth=2, drivers=4, condition="return"),
     "mpc": dict(num_updates=12),
     "bc": dict(num_updates=12, batch=32, width=16, depth=1),
     "bc-safe": dict(num_updates=12, batch=32, width=16, depth=1),

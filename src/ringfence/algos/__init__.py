@@ -7,6 +7,7 @@ from typing import Any
 
 from ringfence.algos.bc import BC, BC_SAFE
 from ringfence.algos.fisor import FISOR
+from ringfence.algos.flow import FLOW
 from ringfence.algos.icbf import ICBF, MADIFF
 from ringfence.algos.mpc import MPC
 from ringfence.algos.naive import NAIVE
@@ -20,7 +21,7 @@ from ringfence.utils.config import build_config, fields_of
 from ringfence.utils.renamed import renamed
 
 _BC, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
-ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, MPC, NAIVE, *_BC, *_CRITICS)}
+ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, FLOW, MPC, NAIVE, *_BC, *_CRITICS)}
 
 
 def get(name: str) -> Algorithm:

@@ -66,7 +66,8 @@ def train(
     """Train an algorithm on a task or on a store of your own; an interrupted run is resumed by the same command.
 
     Args:
-        algorithm: icbf, madiff, mpc, bc, bc-safe, bc-best, bc-return, ma-td3bc, ma-td3bc-lag, omar, ma-cql or fisor.
+        algorithm: icbf, madiff, flow, mpc, bc, bc-safe, bc-best, bc-return, ma-td3bc, ma-td3bc-lag,
+            omar, ma-cql or fisor.
         data: a task (its data set is regenerated if need be) or a store's file.
         seeds: how many, starting with first_seed.
         first_seed: the first one.

@@ -18,8 +18,7 @@ from ringfence.loading import oracle, run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
-from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
-from ringfence.proposals.planner import Planner
+from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
@@ -60,7 +59,7 @@ class Resolved:
     @property
     def plan_options(self) -> PlanOptions | None:
         """How plans are drawn, by who draws some."""
-        return self.proposal.options if isinstance(self.proposal, Planner) else None
+        return self.proposal.options if isinstance(self.proposal, TakesPlanOptions) else None
 
     @property
     def guard(self) -> Guard | None:
@@ -98,7 +97,7 @@ def resolve(spec: PolicySpec) -> Resolved:
     job = load_job(run, spec.agents)
     world = run_worlds.of_run(run) if job.reads_world else None
     step, policy = _trained(run, job, world, spec)
-    plans = isinstance(policy, Planner)
+    plans = isinstance(policy, TakesPlanOptions)
     if spec.guarded and spec.barrier == oracle.ORACLE:
         team = team_policy(policy, job.team, job.task.homogeneous)
         policy = oracle.guarded(team, job.task, spec.guard, dict(spec.guard_options))

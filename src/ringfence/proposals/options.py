@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 from ringfence.errors import UserError
 from ringfence.proposals import diffusion
@@ -31,8 +31,18 @@ class PlanOptions:
             raise UserError(f"persist={self.persist} is read by nothing that was asked for; set value_guidance.")
 
 
+@runtime_checkable
+class TakesPlanOptions(Protocol):
+    """A policy that draws plans or actions as these options say."""
+
+    options: PlanOptions
+
+
 def plan_defaults(config) -> dict:
-    """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone."""
+    """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, and a flow
+    needs few steps."""
+    if hasattr(config, "drivers"):
+        return {"sampling_steps": 2}
     return {"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {}
 
 

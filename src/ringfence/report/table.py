@@ -29,6 +29,7 @@ NAMES = {
     "fisor": "FISOR",
     "ma-cql": "MA-CQL",
     "omar": "OMAR",
+    "flow": "joint flow",
     "madiff": "MADIFF (no barrier)",
     "icbf": "ICBF-Diffuser",
     "mpc": "MPC from a zero proposal",

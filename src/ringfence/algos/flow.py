@@ -1,0 +1,236 @@
+"""Joint flow matching for logs of many drivers.
+
+A pooled log holds several policies. A clone of all of them answers with a mean that none would do; a generator that
+draws anew at every step changes its mind at every step. Here the drivers are found first, without labels, and an
+episode is played as one of them:
+
+    L^E  episodes are shared among C joint clones μ_c by who explains a window best, with every clone used equally
+         (expectation–maximisation with the balance of Cuturi 2013 and Caron et al. 2020)
+         r_c ∝ exp(−Σ_t ‖a_t − μ_c(s_t)‖² / 2σ²),   L^E = E Σ_c r_c ‖a_t − μ_c(s_t)‖²
+    L^Q  who drives, given a state and the return: a categorical q(c | s, y), from which an episode's driver is drawn
+    L^F  a rectified flow from noise to the joint action, told the driver c ~ r (Lipman et al. 2023; Liu et al. 2023)
+         a_τ = (1 − τ) ε + τ a,   L^F = E ‖a − â(a_τ, τ, s, c, y)‖²
+
+The network answers with the clean action, from which the velocity (â − a_τ)/(1 − τ) follows; one step from noise is the
+driver's mean. That is the behaviour flow of flow Q-learning (Park et al. 2025), for teams and told who drives. The
+return y is optional, dropped with probability p for classifier-free guidance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+
+from ringfence.algos import actor_critic as ac
+from ringfence.errors import UserError
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import NOT_ARRIVED, WindowData
+from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.nets.residual import ResidualMLP
+from ringfence.problem import features
+from ringfence.problem.constraints import BoundHazard
+from ringfence.proposals import conditions
+from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action, driver_scores
+from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
+from ringfence.utils.config import (
+    AtLeastOne,
+    BatchSize,
+    Count,
+    Depth,
+    Natural,
+    NonNegative,
+    Positive,
+    Rows,
+    Share,
+    Width,
+)
+from ringfence.world import World
+
+
+@dataclass(frozen=True)
+class Config:
+    """Every choice, one line each."""
+
+    view: features.View = "pruned"  # what s̃_i is; everybody's is read at once
+    history: Natural = 8  # rows before the present that tell who drives
+    horizon: Rows = 9  # rows from the present on that do
+    drivers: AtLeastOne = 8  # C; more than there are costs little, fewer mixes some
+    sigma_first: Positive = 0.5  # σ of the shares at the first update, in units of action
+    sigma: Positive = 0.15  # and when `settled`
+    settled: Share = 0.3  # of training: σ falls until then
+    condition: Literal["none", "return", "advantage"] = "none"  # what y is
+    condition_dropout: Share = 0.25  # p, share of windows that are not told y
+    discount: Share = 0.9  # of what y scores
+    width: Width = 384  # units of each hidden layer, of either network
+    depth: Depth = 3  # hidden layers
+    num_updates: Count = 10_000  # updates
+    batch: BatchSize = 32  # windows per update
+    lr: Positive = 1e-3  # Adam, after warm-up, before cosine decay to a tenth
+    warmup: Natural = 100  # updates
+    grad_clip: NonNegative = 1.0  # global norm, per network; 0: no bound
+    ema: Share = 0.998  # of the parameters; the policy uses the averages
+
+
+PRIOR_WIDTH = 64  # units of who drives, given a state
+SINKHORN = 6  # rounds that balance the shares of a batch
+
+
+def init(
+    key: Key,
+    spec: Spec,
+    config: Config,
+    data: WindowData | None,
+    feature_map: features.FeatureMap,
+    hazard: BoundHazard,
+    world: World | None = None,
+) -> PyTree:
+    """Parameters, their averages, optimiser state, the normaliser; without data, zeros stand for its statistics."""
+    kc, kf, kp, kw = jax.random.split(key, 4)
+    seen = spec.n_agents * spec.feature_dim
+    acts = spec.n_agents * spec.action_dim
+    told = seen + acts + 2 * WAVES + config.drivers + 2
+
+    def networks() -> dict:
+        params = {
+            "clones": ResidualMLP(kc, seen, config.drivers * acts, config.width, config.depth),
+            "flow": ResidualMLP(kf, told, acts, config.width, config.depth, 0.1),
+            "prior": ResidualMLP(kp, seen + 2, config.drivers, PRIOR_WIDTH, 2, 0.1),
+        }
+        return fresh(_optimiser(config), params, "ema")
+
+    return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
+
+
+def check(config: Config, hazard: BoundHazard) -> None:
+    """Refuse settings that cannot work, before anything is computed."""
+    if config.drivers > config.batch:
+        raise UserError(
+            f"drivers={config.drivers} share {config.batch} windows equally, which are too few; raise batch or lower "
+            "drivers."
+        )
+
+
+def make_windows(
+    store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None
+) -> WindowData:
+    """Windows, with their scores where the flow is told those."""
+    if config.condition == "none":
+        return WindowData(store, feature_map)
+    seen = None
+    values = None
+    if config.condition == "advantage" and world is not None:
+        seen = jnp.asarray(feature_map(store.observations, store.state), jnp.float32)
+        values = world.values
+    scores = conditions.scores_of(store, config.condition, config.horizon, config.discount, values, seen)
+    return WindowData(store, feature_map, scores)
+
+
+def world_settings(config: Config) -> dict | None:
+    """Values alone score an advantage."""
+    return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
+
+
+def steps_there(batch: Batch) -> Array:
+    """(B, T) which steps of the windows are the episode's own: neither before its start nor past its end."""
+    first = batch.costs == NOT_ARRIVED  # rows before the start repeat the first one
+    return batch.valid[:, 1:] & ~(first[:, :-1] & first[:, 1:])
+
+
+def balanced(explained: Array) -> Array:
+    """Shares (B, C) of windows in drivers, by log-likelihoods (B, C): rows add up to 1, columns nearly to B/C."""
+    for _ in range(SINKHORN):
+        explained = explained - jax.nn.logsumexp(explained, 0, keepdims=True)
+        explained = explained - jax.nn.logsumexp(explained, 1, keepdims=True)
+    return jax.nn.softmax(explained, -1)
+
+
+def spread(config: Config, step: Array) -> Array:
+    """σ at an update: it falls from `sigma_first` to `sigma`, geometrically."""
+    settled = jnp.clip(step / jnp.maximum(config.settled * config.num_updates, 1.0), 0.0, 1.0)
+    return config.sigma_first * (config.sigma / config.sigma_first) ** settled
+
+
+def make_loss(config: Config):
+    """loss(params, normaliser, batch, step, key) -> (L^E + L^F + L^Q, metrics)."""
+
+    def loss(params: PyTree, normaliser, batch: Batch, step: Array, key: Key) -> tuple[Array, Metrics]:
+        k_driver, k_noise, k_time, k_keep = jax.random.split(key, 4)
+        windows, steps = batch.actions.shape[:2]
+        there = steps_there(batch)
+        seen = normaliser.state(batch.features[:, :-1]).reshape(windows * steps, -1)
+        actions = batch.actions.reshape(windows * steps, -1)
+
+        clones = params["clones"](seen).reshape(windows * steps, config.drivers, -1)
+        errors = ((clones - actions[:, None]) ** 2).sum(-1).reshape(windows, steps, -1) * there[..., None]
+        explained = -errors.sum(1) / (2 * spread(config, step) ** 2)
+        shares = balanced(jax.lax.stop_gradient(explained))
+        count = jnp.maximum(there.sum(), 1)
+        clone_loss = (shares[:, None] * errors).sum() / count
+
+        driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
+        told = jnp.repeat(jax.nn.one_hot(driver, config.drivers), steps, 0)
+        score = jnp.repeat(batch.score, steps)
+        kept = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,)) & (config.condition != "none")
+        noise = jax.random.normal(k_noise, actions.shape)
+        tau = jax.random.uniform(k_time, (windows * steps,))
+        noised = (1.0 - tau)[:, None] * noise + tau[:, None] * actions
+        clean = clean_action(params["flow"], seen, noised, tau, told, score, jnp.repeat(kept, steps))
+        flow_loss = (((clean - actions) ** 2).sum(-1) * there.reshape(-1)).sum() / count
+
+        guess = driver_scores(params["prior"], seen, score, jnp.repeat(kept, steps))
+        surprise = -(jnp.repeat(shares, steps, 0) * jax.nn.log_softmax(guess)).sum(-1)
+        prior_loss = (surprise * there.reshape(-1)).sum() / count
+        metrics = {"loss/clones": clone_loss, "loss/flow": flow_loss, "loss/prior": prior_loss}
+        return clone_loss + flow_loss + prior_loss, metrics | {"drivers/sure": shares.max(-1).mean()}
+
+    return loss
+
+
+def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
+    """update(state, batch, key) -> state, metrics; pure, one Adam step on both networks."""
+    loss, opt = make_loss(config), _optimiser(config)
+
+    def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
+        normaliser = state["frozen"]["normaliser"]
+        grads, metrics = jax.grad(loss, has_aux=True)(state["params"], normaliser, batch, state["step"], key)
+        params, moments, norms = opt.update(grads, state["opt"], state["params"])
+        ema = average(state["ema"], params, config.ema, state["step"])
+        return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, metrics | norms
+
+    return update
+
+
+def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options) -> FlowPolicy:
+    """The flow on the averaged parameters; `options` are the evaluation-time choices."""
+    return FlowPolicy(
+        networks={name: state["ema"][name] for name in ("flow", "prior")},
+        normaliser=state["frozen"]["normaliser"],
+        drivers=config.drivers,
+        conditioned=config.condition != "none",
+        spec=spec,
+        feature_map=feature_map,
+        options=options,
+    )
+
+
+def _optimiser(config: Config) -> Optimiser:
+    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
+
+
+FLOW = Algorithm(
+    "flow",
+    Config,
+    check,
+    init,
+    make_update,
+    ac.no_diagnosis,
+    make_policy,
+    {"default": {}, "return": {"condition": "return"}},
+    cost_source=lambda config: "nothing",
+    make_windows=make_windows,
+    world_settings=world_settings,
+    from_world=lambda world, config: {},
+)

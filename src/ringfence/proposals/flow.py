@@ -1,0 +1,143 @@
+"""Joint actions by a rectified flow, of a driver that is drawn once for an episode, where it begins, and kept.
+
+noise ε (N·A) ──┐
+state, driver ──┼─► clean action â(a_τ, τ)   a_τ+Δ = a_τ + Δ (â − a_τ)/(1 − τ)    τ = 0 .. 1 in 1 to 4 steps
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from ringfence.errors import UserError
+from ringfence.problem.features import FeatureMap
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals.base import from_unit, rolled
+from ringfence.proposals.options import PlanOptions
+from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
+from ringfence.world import World
+
+WAVES = 4  # sines and cosines of τ
+UNREAD = ("sampler", "value_guidance", "persist", "reconcile", "replan", "execution")  # options of plans of states
+
+
+def time_entries(tau: Array) -> Array:
+    """(...,) τ in [0, 1] -> (..., 2 · WAVES)."""
+    angle = tau[..., None] * (jnp.pi / 2 * 2.0 ** jnp.arange(WAVES))
+    return jnp.concatenate([jnp.sin(angle), jnp.cos(angle)], -1)
+
+
+def clean_action(net: Any, seen: Array, action: Array, tau: Array, driver: Array, score: Array, keep: Array) -> Array:
+    """â (B, N·A) of a noised action (B, N·A) at τ (B,): `seen` (B, N·D) standardised, `driver` (B, C) one of C, `score`
+    (B,) the condition y where `keep` (B,) says so."""
+    return net(jnp.concatenate([seen, action, time_entries(tau), driver, _asked(seen, score, keep)], -1))
+
+
+def driver_scores(net: Any, seen: Array, score: Array, keep: Array) -> Array:
+    """Logits (B, C) of who drives at standardised states (B, N·D), given y (B,) where `keep` (B,) says so."""
+    return net(jnp.concatenate([seen, _asked(seen, score, keep)], -1))
+
+
+def _asked(seen: Array, score: Array, keep: Array) -> Array:
+    """(B, 2): y and whether it is told."""
+    return jnp.stack([jnp.where(keep, score, 0.0), keep.astype(seen.dtype)], -1)
+
+
+class FlowPolicy(eqx.Module):
+    """Follows one of the drivers that the logs were found to hold; which one is drawn when an episode begins."""
+
+    networks: dict[str, Any]  # flow, prior
+    normaliser: Normaliser
+    drivers: int = eqx.field(static=True)
+    conditioned: bool = eqx.field(static=True)  # whether it learned to read the return
+    spec: Spec = eqx.field(static=True)
+    feature_map: FeatureMap = eqx.field(static=True)
+    options: PlanOptions = eqx.field(static=True)
+
+    def __check_init__(self):
+        usual = PlanOptions()
+        for name in UNREAD:
+            if getattr(self.options, name) != getattr(usual, name):
+                raise UserError(
+                    f"{name}={getattr(self.options, name)} is about plans of states, and flow draws joint actions; "
+                    "leave it out."
+                )
+        for name in ("target_return", "cfg_scale"):
+            if not self.conditioned and getattr(self.options, name) != getattr(usual, name):
+                raise UserError(
+                    f"{name}={getattr(self.options, name)} is read by nothing, because the run was trained with "
+                    "condition='none'; train with the preset return."
+                )
+
+    def start(self, batch: int) -> PyTree:
+        return {"driver": jnp.zeros(batch, jnp.int32), "age": jnp.zeros((), jnp.int32)}
+
+    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+        """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds."""
+        x = self.feature_map(observations, state)
+        memory, key = self._with_driver(memory, x, key)
+        action = self.draw(x, memory["driver"], key)
+        return memory, PolicyStep(from_unit(action, self.spec), {"driver": memory["driver"]})
+
+    def propose(
+        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
+        """(memory, actions (B, `count`, `rows`, N, A) in [−1, 1], info) along the rows that the World foresees: the
+        first of the episode's own driver, the others of drivers in turn."""
+        memory, key = self._with_driver(memory, self.feature_map(observations, state), key)
+        batch = observations.shape[0]
+        driver = (memory["driver"][:, None] + jnp.arange(count)) % self.drivers
+        driver = driver.reshape(-1)
+
+        def act(x: Array) -> Array:
+            return self.draw(x, driver, key)
+
+        seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
+        actions = rolled(act, self.feature_map, world, seen, present, rows)
+        return memory, actions.reshape(batch, count, *actions.shape[2:]), {"driver": memory["driver"]}
+
+    def draw(self, x: Array, driver: Array, key: Key) -> Array:
+        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,)."""
+        o, s = self.options, self.spec
+        batch = x.shape[0]
+        seen = self.normaliser.state(x).reshape(batch, -1)
+        which = jax.nn.one_hot(driver, self.drivers)
+
+        def clean(action: Array, tau: Array) -> Array:
+            def told(score: Array, keep: Array) -> Array:
+                return clean_action(self.networks["flow"], seen, action, tau, which, score, keep)
+
+            return self._guided(told, batch)
+
+        action = o.temperature * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
+        for k in range(o.sampling_steps):
+            tau = k / o.sampling_steps
+            action = action + (clean(action, jnp.full(batch, tau)) - action) / (o.sampling_steps - k)
+        return s.own(jnp.clip(action, -1.0, 1.0).reshape(batch, s.n_agents, s.action_dim))
+
+    def _guided(self, told: Callable[[Array, Array], Array], batch: int) -> Array:
+        """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y, whether it is told)."""
+        o = self.options
+        score, everyone = jnp.full(batch, o.target_return), jnp.ones(batch, bool)
+        if not self.conditioned:
+            return told(score, ~everyone)
+        asked = told(score, everyone)
+        if o.cfg_scale == 1.0:
+            return asked
+        free = told(score, ~everyone)
+        return free + o.cfg_scale * (asked - free)
+
+    def _with_driver(self, memory: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
+        """The memory with this episode's driver, drawn at its first features x (B, N, D), and a key for the rest."""
+        k1, k2 = jax.random.split(key)
+        batch = x.shape[0]
+        seen = self.normaliser.state(x).reshape(batch, -1)
+        logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
+        drawn = jnp.argmax(logits + jax.random.gumbel(k1, logits.shape), -1).astype(jnp.int32)
+        driver = jnp.where(memory["age"] == 0, drawn, memory["driver"])
+        return {"driver": driver, "age": memory["age"] + 1}, k2

@@ -1,0 +1,126 @@
+"""Logs of many drivers: found without labels, and followed one at a time."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence.algos import flow
+from ringfence.errors import UserError
+from ringfence.loading.resolve import load
+from ringfence.logs.store import EpisodeStore
+from ringfence.logs.windows import WindowData, at
+from ringfence.training import loop, worlds
+from tests.quick import QUICK_WORLD
+
+EPISODES, LENGTH = 200, 10
+SMALL = dict(num_updates=400, batch=64, width=32, depth=2, drivers=2, history=4, horizon=5, lr=3e-3, ema=0.95)
+
+
+@pytest.fixture(scope="module")
+def two_drivers():
+    """Two agents that both push as one of two drivers does: up, or down; nothing in a state tells which."""
+    rng = np.random.default_rng(0)
+    driver = np.arange(EPISODES) % 2
+    seen = rng.normal(size=(EPISODES, LENGTH + 1, 2, 3)).astype(np.float32)
+    push = np.where(driver, 0.7, -0.7)[:, None, None, None]
+    actions = np.clip(push + 0.1 * rng.normal(size=(EPISODES, LENGTH, 2, 1)), -1, 1).astype(np.float32)
+    rewards = np.broadcast_to(driver[:, None], (EPISODES, LENGTH)).astype(np.float32)
+    costs = np.zeros((EPISODES, LENGTH), np.float32)
+    costs[::7, 3] = 1.0
+    return EpisodeStore.from_episodes(seen, actions, rewards, costs, card={"task": "two-drivers"})
+
+
+@pytest.fixture(scope="module")
+def run(two_drivers, tmp_path_factory):
+    out = tmp_path_factory.mktemp("flow")
+    return loop.train("flow", two_drivers, out=out, changes={**SMALL, "condition": "return"}, quiet=True)[0]
+
+
+def played(policy, steps: int = 3, batch: int = 64) -> np.ndarray:
+    """Actions (B, steps, N) at the same kind of states."""
+    memory = policy.start(batch)
+    out = []
+    for t in range(steps):
+        seen = jax.random.normal(jax.random.key(t), (batch, 2, 3))
+        memory, step = policy.act(memory, seen, None, jax.random.key(10 + t))
+        out.append(np.asarray(step.action)[..., 0])
+    return np.stack(out, 1)
+
+
+def test_an_episode_is_played_as_one_driver(run):
+    """Neither their mean nor a change of mind: all agents and steps of an episode push one way, and both ways occur."""
+    acts = played(load(run, cfg_scale=1.0, target_return=0.0)[1])
+    assert (np.abs(acts) > 0.4).mean() > 0.95
+    up = (acts > 0).reshape(len(acts), -1)
+    assert (up.all(1) | (~up).all(1)).mean() > 0.9
+    assert 0.2 < up.mean() < 0.8
+
+
+def test_drivers_are_found_without_labels(run, two_drivers):
+    assert run.metrics[-1]["drivers/sure"] > 0.95
+    store = two_drivers
+    policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
+    first = np.asarray(policy.draw(jnp.zeros((2, 2, 3)), jnp.arange(2), jax.random.key(0)))[:, 0, 0]
+    assert first.min() < -0.4 and first.max() > 0.4, "one driver each"
+    assert store.card.extra == {}, "nobody said who drives"
+
+
+def test_steps_outside_an_episode_are_left_out(two_drivers):
+    data = WindowData(two_drivers, lambda seen, state: seen)
+    batch = at(data.arrays, jnp.array([0, 4, LENGTH - 1, LENGTH]), 5, 4)
+    there = np.asarray(flow.steps_there(batch))
+    np.testing.assert_array_equal(there.sum(1), [4, 8, 5, 4])
+    assert not there[0, :4].any() and there[0, 4:].all() and there[2, :5].all() and not there[2, 5:].any()
+
+
+def test_shares_are_balanced():
+    """Rows add up to one; a driver who explains all windows a little better does not get them all."""
+    explained = jax.random.normal(jax.random.key(0), (40, 4)) + jnp.array([5.0, 0.0, 0.0, 0.0])
+    shares = np.asarray(flow.balanced(explained))
+    np.testing.assert_allclose(shares.sum(1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(shares.sum(0), 10.0, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"replan": 2}, "replan=2 is about plans of states"),
+        ({"sampler": "ddpm"}, "sampler=ddpm is about plans of states"),
+        ({"planner": "value_guided"}, "value_guidance=100.0 is about plans of states"),
+    ],
+)
+def test_options_of_plans_of_states_are_refused(run, options, said):
+    with pytest.raises(UserError, match=said):
+        load(run, **options)
+
+
+def test_a_target_that_nothing_reads_is_refused(two_drivers, tmp_path):
+    run = loop.train("flow", two_drivers, out=tmp_path, changes={**SMALL, "num_updates": 4}, quiet=True)[0]
+    with pytest.raises(UserError, match="the run was trained with condition='none'"):
+        load(run, target_return=2.0)
+    load(run)
+
+
+def test_more_drivers_than_windows_are_refused(two_drivers, tmp_path):
+    with pytest.raises(UserError, match="drivers=65 share 64 windows"):
+        loop.train("flow", two_drivers, out=tmp_path, changes={**SMALL, "drivers": 65}, quiet=True)
+
+
+def test_the_return_chooses_who_drives(run):
+    """Whoever pushes up earns all there is to earn: that driver is drawn for a high return, the other for a low one."""
+    much, little = (played(load(run, target_return=y)[1]) for y in (0.7, -0.7))
+    assert (much > 0).mean() > 0.9 and (little < 0).mean() > 0.9
+
+
+def test_proposals_are_of_several_drivers(run, two_drivers):
+    world = worlds.fit(two_drivers, **QUICK_WORLD)
+    policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
+    seen = jnp.zeros((5, 2, 3))
+    memory, actions, _ = policy.propose(policy.start(5), seen, None, jax.random.key(0), 3, 2, world)
+    assert actions.shape == (5, 3, 2, 2, 1)
+    own = np.asarray(actions)[:, 0, 0, 0, 0]
+    other = np.asarray(actions)[:, 1, 0, 0, 0]
+    assert (np.sign(own) != np.sign(other)).mean() > 0.9
