@@ -84,6 +84,18 @@ def test_shares_are_balanced():
     np.testing.assert_allclose(shares.sum(0), 10.0, rtol=0.05)
 
 
+def test_drivers_that_nobody_needs_are_left(two_drivers, tmp_path):
+    """With six for two, balance alone would give each a sixth: two explain all windows, and only they are drawn."""
+    config = flow.Config(num_updates=100, drivers=4, settled=0.5)
+    explained = jnp.zeros((40, 4)).at[:, 0].set(9.0)
+    early, late = (np.asarray(flow.shares_of(config, explained, step)).mean(0) for step in (0, 60))
+    np.testing.assert_allclose(early, 0.25, atol=0.02)
+    np.testing.assert_allclose(late, [1.0, 0.0, 0.0, 0.0], atol=0.01)
+    run = loop.train("flow", two_drivers, out=tmp_path, changes={**SMALL, "drivers": 6}, quiet=True)[0]
+    acts = played(load(run)[1])
+    assert (np.abs(acts) > 0.4).mean() > 0.9
+
+
 @pytest.mark.parametrize(
     "options, said",
     [

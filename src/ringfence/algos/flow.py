@@ -4,8 +4,9 @@ A pooled log holds several policies. A clone of all of them answers with a mean 
 draws anew at every step changes its mind at every step. Here the drivers are found first, without labels, and an
 episode is played as one of them:
 
-    L^E  episodes are shared among C joint clones μ_c by who explains a window best, with every clone used equally
-         (expectation–maximisation with the balance of Cuturi 2013 and Caron et al. 2020)
+    L^E  windows are shared among C joint clones μ_c by who explains them best (expectation–maximisation). At first all
+         clones get equal shares (the balance of Cuturi 2013 and Caron et al. 2020), so that none takes everything;
+         later those that nobody needs are left with nothing
          r_c ∝ exp(−Σ_t ‖a_t − μ_c(s_t)‖² / 2σ²),   L^E = E Σ_c r_c ‖a_t − μ_c(s_t)‖²
     L^Q  who drives, given a state and the return: a categorical q(c | s, y), from which an episode's driver is drawn
     L^F  a rectified flow from noise to the joint action, told the driver c ~ r (Lipman et al. 2023; Liu et al. 2023)
@@ -60,7 +61,7 @@ class Config:
     drivers: AtLeastOne = 8  # C; more than there are costs little, fewer mixes some
     sigma_first: Positive = 0.5  # σ of the shares at the first update, in units of action
     sigma: Positive = 0.15  # and when `settled`
-    settled: Share = 0.3  # of training: σ falls until then
+    settled: Share = 0.3  # of training: σ falls until then, and drivers are used equally
     condition: Literal["none", "return", "advantage"] = "none"  # what y is
     condition_dropout: Share = 0.25  # p, share of windows that are not told y
     discount: Share = 0.9  # of what y scores
@@ -147,6 +148,12 @@ def balanced(explained: Array) -> Array:
     return jax.nn.softmax(explained, -1)
 
 
+def shares_of(config: Config, explained: Array, step: Array) -> Array:
+    """Shares (B, C) at an update: balanced until `settled`, then what each driver explains."""
+    early = step < config.settled * config.num_updates
+    return jnp.where(early, balanced(explained), jax.nn.softmax(explained, -1))
+
+
 def spread(config: Config, step: Array) -> Array:
     """σ at an update: it falls from `sigma_first` to `sigma`, geometrically."""
     settled = jnp.clip(step / jnp.maximum(config.settled * config.num_updates, 1.0), 0.0, 1.0)
@@ -166,7 +173,7 @@ def make_loss(config: Config):
         clones = params["clones"](seen).reshape(windows * steps, config.drivers, -1)
         errors = ((clones - actions[:, None]) ** 2).sum(-1).reshape(windows, steps, -1) * there[..., None]
         explained = -errors.sum(1) / (2 * spread(config, step) ** 2)
-        shares = balanced(jax.lax.stop_gradient(explained))
+        shares = shares_of(config, jax.lax.stop_gradient(explained), step)
         count = jnp.maximum(there.sum(), 1)
         clone_loss = (shares[:, None] * errors).sum() / count
 
