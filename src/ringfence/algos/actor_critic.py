@@ -36,7 +36,8 @@ class Critics(eqx.Module):
 
     def __init__(self, key: Key, agents: int, heads: int, state: int, action: int, width: int):
         ks, ka, kh, ko = jax.random.split(key, 4)
-        g, gain = agents * heads, (2.0 / (state + action)) ** 0.5
+        g = agents * heads
+        gain = (2.0 / (state + action)) ** 0.5
         self.of_state = jax.random.normal(ks, (g, state, width)) * gain
         self.of_action = jax.random.normal(ka, (g, action, width)) * gain
         self.bias = jnp.zeros((g, 1, width))
@@ -50,7 +51,9 @@ class Critics(eqx.Module):
         several = action.ndim == 4
         actions = action if several else action[:, :, None]
         b, n, s, a = actions.shape
-        product, width, heads = jax.lax.batch_matmul, self.hidden.shape[-1], len(self.hidden) // n
+        product = jax.lax.batch_matmul
+        width = self.hidden.shape[-1]
+        heads = len(self.hidden) // n
         states = jnp.repeat(jnp.moveaxis(x, 1, 0), heads, 0)  # (G, B, D)
         actions = jnp.repeat(jnp.moveaxis(actions, 1, 0).reshape(n, b * s, a), heads, 0)
         read = product(states, self.of_state) + self.bias
@@ -135,7 +138,8 @@ def fit_states(data: WindowData | None, spec: Spec, key: Key) -> normalise.Norma
     """Mean and deviation of states; blank without data. It stands for the batch normalisation of OMAR's networks, and
     cloning reads states the same way."""
     if data is None:
-        one, step = jnp.zeros(spec.feature_dim), jnp.zeros((1, spec.feature_dim))
+        one = jnp.zeros(spec.feature_dim)
+        step = jnp.zeros((1, spec.feature_dim))
         return normalise.Normaliser(one, one, step, step, 0, "displacement")
     some = jax.random.randint(key, (min(8192, 4 * data.steps),), 0, data.steps)
     windows = at(data.arrays, some, 2)

@@ -88,7 +88,9 @@ def init(
 ) -> PyTree:
     """Values, critics, actors, target critics, optimiser state, the normaliser and the scale of rewards."""
     kr, kh, kv, kw, ka, kn = jax.random.split(key, 6)
-    n, d, a = spec.n_agents, spec.feature_dim, spec.action_dim
+    n = spec.n_agents
+    d = spec.feature_dim
+    a = spec.action_dim
 
     def networks() -> dict:
         value = lambda k: MLP(k, (d, config.width, config.width, 1), groups=n)  # noqa: E731
@@ -118,10 +120,12 @@ def proposed(actor: MLP, x: Array, noisy: Array, k: Array) -> Array:
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; one Adam step on every network."""
-    opt, alpha_bar = optimiser(config), diffusion.cosine_schedule(config.diffusion_steps)
+    opt = optimiser(config)
+    alpha_bar = diffusion.cosine_schedule(config.diffusion_steps)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
-        frozen, target = state["frozen"], state["target"]
+        frozen = state["frozen"]
+        target = state["target"]
         t = ac.transitions(batch, frozen["normaliser"])
         unsafe, _ = hazard.labels(batch.features[:, 1], batch.costs[:, 1])
         danger = jnp.where(unsafe, DANGER, -1.0).T  # (N, B)
@@ -131,7 +135,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
         def loss(p: PyTree) -> tuple[Array, Metrics]:
             value = lambda name, x: p[name](x)[..., 0].T  # noqa: E731  (N, B)
-            v_reward, v_danger = value("reward_value", t.x), value("danger_value", t.x)
+            v_reward = value("reward_value", t.x)
+            v_danger = value("danger_value", t.x)
             ahead_reward = jax.lax.stop_gradient(value("reward_value", t.ahead))
             ahead_danger = jax.lax.stop_gradient(value("danger_value", t.ahead))
             ahead_danger = jnp.where(alive > 0, ahead_danger, danger)  # a terminal state stays what it is
@@ -201,7 +206,8 @@ class Proposer(HadStart, eqx.Module):
 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard, options=None) -> Proposer:
     """The averaged actors and danger critics."""
-    target, bar = state["target"], diffusion.cosine_schedule(config.diffusion_steps)
+    target = state["target"]
+    bar = diffusion.cosine_schedule(config.diffusion_steps)
     norm = state["frozen"]["normaliser"]
     return Proposer(target["actor"], target["danger"], norm, spec, feature_map, tuple(bar.tolist()), config.candidates)
 

@@ -164,7 +164,9 @@ def init(
     """Parameters, their averages, optimiser state, the normaliser, and what is read of the World, which no checkpoint
     holds; without data, zeros stand for statistics, which is all that a checkpoint's template needs."""
     kd, kb, ki, _, ks = jax.random.split(key, 5)  # the fourth was forward dynamics': others start as they always did
-    n, d, rows = spec.n_agents, spec.feature_dim, config.horizon + config.history
+    n = spec.n_agents
+    d = spec.feature_dim
+    rows = config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
 
     def networks() -> dict:
@@ -180,7 +182,8 @@ def init(
         return fresh(optimiser(config), params, "ema")
 
     if data is None:
-        one, moved = jnp.zeros(d), jnp.zeros((config.horizon - 1, d))
+        one = jnp.zeros(d)
+        moved = jnp.zeros((config.horizon - 1, d))
         norm = normalise.Normaliser(one, one, moved, moved, config.history, config.coordinates)
     else:
         norm = fit_normaliser(config, data, jax.random.split(ks)[0])
@@ -283,7 +286,8 @@ def carries_own(config: Config, feature_map: features.FeatureMap) -> bool:
 
 def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndarray:
     """(H, D) bool: entries of a window that the denoiser reads and writes; the present is always read whole."""
-    rows, d = config.history + config.horizon, len(feature_map.names)
+    rows = config.history + config.horizon
+    d = len(feature_map.names)
     carried = np.ones((rows, d), bool)
     if carries_own(config, feature_map) and feature_map.own is not None:
         carried[config.history + 1 :] = np.isin(np.arange(d), feature_map.own)
@@ -312,7 +316,8 @@ def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, k
     """L^P = E ‖a_i − f_φi(s̃_i,t, s̃_i,t+1)‖² on data pairs, summed over the action and averaged over agents."""
     now = config.history
     last = min(now + INVERSE_STEPS, batch.features.shape[1] - 1)
-    before, after = batch.features[:, now:last], batch.features[:, now + 1 : last + 1]
+    before = batch.features[:, now:last]
+    after = batch.features[:, now + 1 : last + 1]
     valid = batch.valid[:, now + 1 : last + 1, None].astype(jnp.float32)
     inferred = infer_action(params["inverse"], norm, before, after, key, config.inverse_noise)
     error = ((inferred - batch.actions[:, now:last]) ** 2).sum(-1)
@@ -341,7 +346,8 @@ def generated(
 ) -> Generated:
     """s̃^θ at the configured gradient depth."""
     kind, n = gradient_depth(config.gradient)
-    ret, bar = retention(config), alpha_bar
+    ret = retention(config)
+    bar = alpha_bar
     etas = jnp.asarray(ret.eta(bar), jnp.float32)
     if kind == "x0":
         m = config.barrier_batch
@@ -349,8 +355,11 @@ def generated(
         weight = weight if config.weigh_by_signal else jnp.ones_like(weight)
         return Generated(norm.invert(clean[:m]), batch.valid[:m], etas[noised.k[:m]][:, None, None], weight)
     b = min(config.gradient_batch, clean.shape[0])
-    mask, known, valid = mask[:b], norm.apply(batch.features)[:b], batch.valid[:b]
-    one, zero = jnp.ones((b, 1, 1)), jnp.zeros((b, 1, 1))
+    mask = mask[:b]
+    known = norm.apply(batch.features)[:b]
+    valid = batch.valid[:b]
+    one = jnp.ones((b, 1, 1))
+    zero = jnp.zeros((b, 1, 1))
 
     def inpaint(x: Array) -> Array:
         return jnp.where(mask, known, x)
@@ -371,7 +380,8 @@ def generated(
         k = top - i
         x = inpaint(x)
         x0 = inpaint(predict(x, jnp.full(b, k)))
-        a, before = bars[k], bars[k - 1]
+        a = bars[k]
+        before = bars[k - 1]
         ratio = a / before
         mean = jnp.sqrt(before) * (1 - ratio) / (1 - a) * x0 + jnp.sqrt(ratio) * (1 - before) / (1 - a) * x
         deviation = jnp.sqrt((1 - before) / (1 - a) * (1 - ratio))
@@ -397,7 +407,8 @@ def followed(barrier: Barrier, made: Generated, config: Config) -> tuple[Array, 
 
 def barrier_share(config: Config, step: Array) -> Array:
     """λ at an update: 0 until `barrier_start`, `barrier_weight` from `barrier_full` on, linear between."""
-    progress, width = step / max(config.num_updates, 1), config.barrier_full - config.barrier_start
+    progress = step / max(config.num_updates, 1)
+    width = config.barrier_full - config.barrier_start
     if width <= 0:
         return config.barrier_weight * (progress >= config.barrier_start)
     return config.barrier_weight * jnp.clip((progress - config.barrier_start) / width, 0.0, 1.0)
@@ -405,7 +416,8 @@ def barrier_share(config: Config, step: Array) -> Array:
 
 def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
     """loss(params, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
-    alpha_bar, carried = schedule(config), carried_entries(config, feature_map)
+    alpha_bar = schedule(config)
+    carried = carried_entries(config, feature_map)
 
     def loss(params, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
         kd, kp, _, kg = jax.random.split(key, 4)
@@ -438,7 +450,8 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; pure, one Adam step on every network."""
-    loss, opt = make_loss(config, feature_map, hazard), optimiser(config)
+    loss = make_loss(config, feature_map, hazard)
+    opt = optimiser(config)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         (_, metrics), grads = jax.value_and_grad(loss, has_aux=True)(
@@ -476,7 +489,8 @@ def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, 
             grads = jax.grad(of)(state["params"]["denoiser"])
             return jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(grads)))
 
-        denoise, shaping = pull((1.0, 0.0)), pull((0.0, 1.0))
+        denoise = pull((1.0, 0.0))
+        shaping = pull((0.0, 1.0))
         return {
             "gradient/denoising": denoise,
             "gradient/shaping": shaping,

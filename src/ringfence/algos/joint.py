@@ -25,13 +25,16 @@ def joint_losses(
     net: MLP, norm: Normaliser, batch: Batch, made: Any, retention: Retention, config: Any, hazard: BoundHazard
 ) -> tuple[Array, Metrics]:
     """(L^C, metrics) of generated plans `made`, labelled by the formula; on logged windows h is only looked at."""
-    now, m = config.history, config.barrier_batch
-    x, rows = made.features[:, now:], made.valid[:, now:, None]
+    now = config.history
+    m = config.barrier_batch
+    x = made.features[:, now:]
+    rows = made.valid[:, now:, None]
     unsafe, safe = hazard.labels(jax.lax.stop_gradient(x))
     terms = retention, made.eta, config.delta, config.scaled_margin
     on_made = hinges(barrier_on(net, norm, x), unsafe, safe, rows, *terms, made.weight)
     loss = on_made.safe + on_made.unsafe + on_made.retention
-    data_x, data_rows = batch.features[:m, now:], batch.valid[:m, now:, None]
+    data_x = batch.features[:m, now:]
+    data_rows = batch.valid[:m, now:, None]
     unsafe, safe = hazard.labels(data_x, batch.costs[:m, now:])
     looked = barrier_on(jax.lax.stop_gradient(net), norm, data_x)
     on_data = hinges(looked, unsafe, safe, data_rows, retention, 0.0, config.delta, config.scaled_margin)
@@ -69,7 +72,8 @@ def hinges(
     with margin δ as printed, or (1 − α) δ when scaled. `eta` (B, 1, 1) or a number; `weight` (B, 1, 1).
     """
     margin = (1.0 - retention.m + eta) * delta if scaled_margin else delta
-    safe, unsafe = safe & valid, unsafe & valid
+    safe = safe & valid
+    unsafe = unsafe & valid
     pair = safe[:, :-1] & valid[:, 1:]
     slack = h[:, 1:] - retention.decay(h[:, :-1], eta)
     return Hinges(

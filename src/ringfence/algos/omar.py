@@ -140,7 +140,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         ku, kp, kn, ks = jax.random.split(key, 4)
         t = ac.transitions(batch, state["frozen"]["normaliser"])
-        params, target = state["params"], state["target"]
+        params = state["params"]
+        target = state["target"]
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
             t.ahead, ac.act(target["actor"], t.ahead)
         ).min(1)
@@ -159,7 +160,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
         def critic_loss(critic, x, asked, goal, densities) -> tuple[Array, Metrics]:
             q = critic(x, asked)  # (N, 2, B, 1 + S)
-            logged, others = q[..., 0], q[..., 1:] - jnp.moveaxis(densities, 0, 1)[:, None]
+            logged = q[..., 0]
+            others = q[..., 1:] - jnp.moveaxis(densities, 0, 1)[:, None]
             error = ((logged - goal.T[:, None]) ** 2).mean(2).sum()
             conservative = (jax.nn.logsumexp(others, -1) - logged).mean(2).sum()
             loss = error + config.cql_weight * conservative

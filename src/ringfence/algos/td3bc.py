@@ -117,7 +117,9 @@ def init(
 ) -> PyTree:
     """Actors, twin critics, their targets, optimiser state and the normaliser."""
     ka, kq, kc, kw = jax.random.split(key, 4)
-    n, d, a = spec.n_agents, spec.feature_dim, spec.action_dim
+    n = spec.n_agents
+    d = spec.feature_dim
+    a = spec.action_dim
     sizes = (n, 2, n * d, n * a) if config.centralised_critic else (n, 2, d, a)
 
     def networks() -> dict:
@@ -133,7 +135,8 @@ def init(
 
 def threshold(config: Config, spec: Spec) -> float:
     """d: what a discounted cost value may be if `limit` is spread evenly over an episode."""
-    g, t = config.discount, spec.episode_length
+    g = config.discount
+    t = spec.episode_length
     if g == 1:  # Σ γ^t / T is then 1
         return config.limit
     return config.limit * (1 - g**t) / ((1 - g) * t)
@@ -150,13 +153,15 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         t = ac.transitions(batch, state["frozen"]["normaliser"])
-        params, target = state["params"], state["target"]
+        params = state["params"]
+        target = state["target"]
         next_action = ac.act(target["actor"], t.ahead)
         if config.target_noise > 0:
             bound = config.target_noise_clip
             noise = jnp.clip(config.target_noise * jax.random.normal(key, next_action.shape), -bound, bound)
             next_action = jnp.clip(next_action + noise, -1.0, 1.0)
-        here, there = critic_inputs(t.x, t.action), critic_inputs(t.ahead, next_action)
+        here = critic_inputs(t.x, t.action)
+        there = critic_inputs(t.ahead, next_action)
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](*there).min(1)
 
         def critic_loss(p: PyTree) -> tuple[Array, Metrics]:
@@ -177,12 +182,14 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             own = ac.act(actor, t.x)
             x = t.x
             if config.centralised_critic:
-                x, acted = ac.joint(t.x), ac.joint_actions(t.action, own)
+                x = ac.joint(t.x)
+                acted = ac.joint_actions(t.action, own)
             else:
                 acted = own
             q = critics["critic"].first(spec.n_agents)(x, acted)[:, 0]  # (N, B)
             size = lambda v: jax.lax.stop_gradient(jnp.abs(v).mean(1, keepdims=True))  # noqa: E731
-            merit, excess = q / size(q), jnp.zeros(spec.n_agents)
+            merit = q / size(q)
+            excess = jnp.zeros(spec.n_agents)
             if config.lagrange:
                 c = jax.nn.relu(critics["cost"](x, acted).max(1))  # (N, B)
                 merit = (merit - scale[:, None] * c / jnp.maximum(size(c), allowed)) / (1.0 + scale[:, None])

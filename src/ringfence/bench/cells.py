@@ -104,7 +104,8 @@ class Cell:
 
     def missing(self, out: Path, episodes: int) -> list[tuple[str, str]]:
         """Evaluations that the folder does not hold yet."""
-        known, config = Run(self.folder(out)).results, dataclasses.asdict(self.config)
+        known = Run(self.folder(out)).results
+        config = dataclasses.asdict(self.config)
 
         def there(variant: str, name: str) -> bool:
             r = known.get(variant, {})
@@ -186,7 +187,8 @@ class Grid:
 
     def references(self) -> dict[str, int | None]:
         """Tasks whose reference rows are not there yet, with the size of their data."""
-        sizes, folder = {c.task: c.transitions for c in self.cells}, self.out / "reference"
+        sizes = {c.task: c.transitions for c in self.cells}
+        folder = self.out / "reference"
         return {t: n for t, n in sizes.items() if not reference.there(registry.get(t), folder, self.episodes, n)}
 
     def open(self) -> None:
@@ -280,8 +282,10 @@ def make_grid(
         raise unknown("suite", suite, SUITES)
     chosen = SUITES[suite]
     episodes = chosen.episodes if episodes is None else episodes
-    seeds, episodes = whole_number("seeds", seeds, 1, 10_000), whole_number("episodes", episodes, 1, 10**7)
-    names, only = tuple(only_tasks) or chosen.tasks, tuple(only)
+    seeds = whole_number("seeds", seeds, 1, 10_000)
+    episodes = whole_number("episodes", episodes, 1, 10**7)
+    names = tuple(only_tasks) or chosen.tasks
+    only = tuple(only)
     for name in names:
         if name not in chosen.tasks:
             raise unknown(f"task of the suite {suite}", name, chosen.tasks)
@@ -310,7 +314,8 @@ def make_grid(
 def make_grids(held: Mapping[str, Iterable[str]], root: Path, only: Iterable[str] = (), **sizes: Any) -> list[Grid]:
     """The grids of several suites' tasks `held`, each in its folder of `root`; an entry that one suite alone knows is
     made there. `sizes`: arguments of `make_grid`."""
-    known, only = {suite: entry_names(suite) for suite in held}, list(only)
+    known = {suite: entry_names(suite) for suite in held}
+    only = list(only)
     for name in only:
         if not any(name in k for k in known.values()):
             raise unknown("entry", name, set().union(*known.values()))
@@ -329,7 +334,8 @@ def collected(name: str, only_tasks: Iterable[str] = ()) -> dict[str, list[str]]
 
 def narrowed(held: Mapping[str, Iterable[str]], only: Iterable[str], of: str) -> dict[str, list[str]]:
     """The tasks of several suites, or those named; a name that no suite of the collection `of` holds is refused."""
-    only, known = list(only), set().union(*held.values())
+    only = list(only)
+    known = set().union(*held.values())
     for task in only:
         if task not in known:
             raise unknown(f"task of {of}", task, known)

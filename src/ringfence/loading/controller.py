@@ -150,12 +150,16 @@ class _TrainedRun:
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
         """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
-        view, last = self.job.feature_map, int(self.job.feature_map.plus.max())
-        name, there = "observations", seen.shape[-1]
+        view = self.job.feature_map
+        last = int(self.job.feature_map.plus.max())
+        name = "observations"
+        there = seen.shape[-1]
         if view.source == "state":
-            name, there = "state", last + 1 if state is None else len(state)
+            name = "state"
+            there = last + 1 if state is None else len(state)
         elif state is not None:
-            name, there = "observations and state", there + len(state)
+            name = "observations and state"
+            there = there + len(state)
         if last >= there:
             raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
 

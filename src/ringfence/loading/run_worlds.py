@@ -84,7 +84,8 @@ def _of_data(run: Run, execution: str | None, quiet: bool) -> World:
 def _of_same(run: Run, world: World, execution: str) -> None:
     """Refuse a World of other data, or of another execution."""
     config = run.config
-    here, there = config["data"].get("content"), world.card.data
+    here = config["data"].get("content")
+    there = world.card.data
     apart = config["task"] != there.task or (here is not None and here != there.content)
     if apart:
         raise UserError(

@@ -71,7 +71,8 @@ def _attend(z: Array, p: dict[str, Array], n: int) -> Array:
     """Multi-head attention over the n agents of each plan; z (B·n, W)."""
     q, k = jnp.split(z @ p["query_key"], 2, -1)
     v = z @ p["value"]
-    b, w = z.shape[0] // n, v.shape[-1]
+    b = z.shape[0] // n
+    w = v.shape[-1]
     q, k = (t.reshape(b, n, HEADS, -1) for t in (q, k))
     v = v.reshape(b, n, HEADS, -1)
     if n <= SMALL_TEAM:

@@ -44,7 +44,8 @@ class MLP(eqx.Module):
         return out if self.spec is None else self.spec.own(out)
 
     def _told(self, x: Array) -> Array:
-        shape, groups = x.shape, self.weights[0].shape[0]
+        shape = x.shape
+        groups = self.weights[0].shape[0]
         if groups == 1:
             x = first = x.reshape(-1, shape[-1])
             for n, (w, b) in enumerate(zip(self.weights, self.biases)):

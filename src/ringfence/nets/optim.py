@@ -40,7 +40,10 @@ class Optimiser:
         self, grads: dict[str, PyTree], moments: dict[str, PyTree], params: dict[str, PyTree]
     ) -> tuple[dict[str, PyTree], dict[str, PyTree], Metrics]:
         """New parameters, new moments and the gradient norm of every network before clipping."""
-        adam, new, kept, norms = self._adam(), {}, {}, {}
+        adam = self._adam()
+        new = {}
+        kept = {}
+        norms = {}
         for name, p in params.items():
             step, kept[name] = adam.update(grads[name], moments[name], p)
             new[name] = optax.apply_updates(p, step)
@@ -94,7 +97,8 @@ def regress(
 
         return jax.lax.fori_loop(start, stop, step, carry)
 
-    carry, chunk = (net, adam.init(net)), max(1, updates // CHUNKS)
+    carry = (net, adam.init(net))
+    chunk = max(1, updates // CHUNKS)
     with Progress(label, updates, quiet=not label) as bar:
         for start in range(0, updates, chunk):
             stop = min(start + chunk, updates)

@@ -348,11 +348,14 @@ def _pruned_map(
     shared = [] if state is None else [np.broadcast_to(state[:, d : d + 1], (m, n)) for d in range(state.shape[1])]
     known: set[int] = set()
     if view == "centralized":
-        columns, names = shared, state_names
+        columns = shared
+        names = state_names
     elif view == "decentralized" or state is None:
-        columns, names = own, observation_names
+        columns = own
+        names = observation_names
     else:
-        columns, names = own + shared, observation_names + state_names
+        columns = own + shared
+        names = observation_names + state_names
         known = {width + d for d in _observed_too(observations, state, keep, state_names)}
     kept = _telling(columns, known)
     if not kept:

@@ -45,7 +45,8 @@ class Normaliser(eqx.Module):
         """(..., H, N, D) features -> diffusion coordinates."""
         if self.coordinates == "state":
             return self.state(plan)
-        past, future = plan[..., : self.now + 1, :, :], plan[..., self.now + 1 :, :, :]
+        past = plan[..., : self.now + 1, :, :]
+        future = plan[..., self.now + 1 :, :, :]
         moved = future - plan[..., self.now : self.now + 1, :, :]
         x = (moved - self.step_mean[:, None]) / self.step_scale[:, None]
         return jnp.concatenate([self.state(past), x], axis=-3)
@@ -70,15 +71,18 @@ def varying(scale, size):
 
 def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> Normaliser:
     """Statistics of windows (M, H, N, D) with `valid` (M, H); padded rows are left out."""
-    h, d = windows.shape[1], windows.shape[-1]
+    h = windows.shape[1]
+    d = windows.shape[-1]
     rows = windows[:, now].reshape(-1, d).astype(np.float64)
-    means, scales = [], []
+    means = []
+    scales = []
     for s in range(now + 1, h):
         moved = (windows[:, s] - windows[:, now])[valid[:, s]].reshape(-1, d).astype(np.float64)
         means.append(moved.mean(0) if len(moved) else np.zeros(d))
         scales.append(moved.std(0) if len(moved) else np.ones(d))
 
-    mean, scale = rows.mean(0), rows.std(0)
+    mean = rows.mean(0)
+    scale = rows.std(0)
 
     as_array = lambda x: jnp.asarray(np.asarray(x), jnp.float32)  # noqa: E731
     return Normaliser(
@@ -108,5 +112,6 @@ def _middle_and_half(low: Bound, high: Bound) -> tuple[Any, Any]:
     """The middle of the bounds and half of their range: numbers, or float32 arrays of each entry."""
     if isinstance(low, int | float) and isinstance(high, int | float):
         return (high + low) / 2, (high - low) / 2
-    least, greatest = np.asarray(low), np.asarray(high)
+    least = np.asarray(low)
+    greatest = np.asarray(high)
     return ((greatest + least) / 2).astype(np.float32), ((greatest - least) / 2).astype(np.float32)

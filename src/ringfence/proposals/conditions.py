@@ -21,11 +21,13 @@ def scores_of(
     """(T,) the score of the window that begins at each step; the advantage needs values and features (M, N, D)."""
     episode = store.episode_of_step
     starts = np.concatenate([[0], store.episode_ends[:-1]])
-    step, team = np.arange(store.steps), store.rewards.mean(1)
+    step = np.arange(store.steps)
+    team = store.rewards.mean(1)
     if condition == "advantage":
         if values is None:
             raise ValueError("an advantage needs the values of a World")
-        row, last = step + episode, store.episode_ends[episode] + episode
+        row = step + episode
+        last = store.episode_ends[episode] + episode
         value = values_of(values.critic, features)
         return normal_scores(advantages(value, team, row, last, horizon, discount))
     return return_scores(returns_to_go(team, store.lengths, discount), step - starts[episode])
@@ -67,7 +69,9 @@ def return_scores(returns_to_go: np.ndarray, time: np.ndarray) -> np.ndarray:
     """
     order = np.argsort(time, kind="stable")
     counts = np.bincount(time)
-    edges, start, out = [], 0, np.zeros(len(returns_to_go))
+    edges = []
+    start = 0
+    out = np.zeros(len(returns_to_go))
     for count in np.cumsum(counts):
         if count - start >= MIN_COHORT or count == len(returns_to_go):
             edges.append((start, count))

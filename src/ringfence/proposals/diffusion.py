@@ -152,7 +152,8 @@ def refine(
 ) -> Array:
     """Denoise x from levels[0] down the given decreasing diffusion steps and on to the clean plan."""
     bar = np.concatenate([alpha_bar[levels], [1.0]])
-    signal, noise = np.sqrt(bar), np.sqrt(1.0 - bar)
+    signal = np.sqrt(bar)
+    noise = np.sqrt(1.0 - bar)
     if sampler not in SAMPLERS:
         raise unknown("sampler", sampler, SAMPLERS)
     eta = 1.0 if sampler == "ddpm" else eta
