@@ -9,12 +9,12 @@ import numpy as np
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task, first_rows
 from ringfence.errors import UserError
+from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
-COARSE = 0.01  # of an entry's deviation: the distance of neighbouring numbers above which it is coarse
 
 
 class Audit(NamedTuple):
@@ -37,7 +37,7 @@ def audit(store: EpisodeStore) -> Audit:
     else:
         danger, warnings = _danger(store, task)
         facts |= danger
-    warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *_coarse(store), *_odd_ends(store)]
+    warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
     return Audit(facts, warnings, list(store.card.warnings))
 
 
@@ -131,24 +131,6 @@ def _odd_observations(store: EpisodeStore) -> list[str]:
     constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
     if len(constant):
         warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
-    return warnings
-
-
-def _coarse(store: EpisodeStore) -> list[str]:
-    """Entries of observations and state that single precision is too coarse for, such as coordinates of a map."""
-    warnings = []
-    for what, array in (("Observation", store.observations), ("State", store.state)):
-        if array is None:
-            continue
-        flat = array.reshape(-1, array.shape[-1])
-        spread = flat.std(0, dtype=np.float64)
-        gap = np.spacing(np.abs(flat).max(0).astype(np.float32))
-        coarse = np.flatnonzero((spread > 0) & (gap > COARSE * spread))
-        if len(coarse):
-            warnings.append(
-                f"{what} entries {', '.join(map(str, coarse))} are so far from 0 that single precision tells their "
-                "values apart poorly; subtract an origin before making the store."
-            )
     return warnings
 
 

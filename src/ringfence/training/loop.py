@@ -24,6 +24,7 @@ import numpy as np
 from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.logs.provenance import other_data, regenerated
+from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, draw
 from ringfence.training import worlds
@@ -88,6 +89,7 @@ def train(
             raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
     if tensorboard:
         _summary_writer()
+    require_resolved(data)
     task = registry.from_store(data)
     job = make_job(algorithm, task, preset, changes or {}, logs := task.logs(data), world)
     lessons = _Lessons(job, logs, quiet)

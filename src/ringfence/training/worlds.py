@@ -7,6 +7,7 @@ from pathlib import Path
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
 from ringfence.utils.compilation import keep_programs
@@ -74,6 +75,7 @@ def fit(
     if not isinstance(store, EpisodeStore):
         raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
     seed = whole_number("seed", seed, 0, LAST_SEED)
+    require_resolved(store)
     task = task or registry.from_store(store)
     settings, store = settings_for(store, task, **changes), task.logs(store)
     map = task.feature_map(settings.view, store)
