@@ -92,14 +92,16 @@ def import_table(
     cost: list[str] = [],  # noqa: B006
     limits: list[float] = [],  # noqa: B006
     goal: list[str] = [],  # noqa: B006
-    layout: Literal["highd", "interaction"] | None = None,
+    rename: list[str] = [],  # noqa: B006
+    wide: str | None = None,
+    layout: Literal["highd", "interaction", "sumo", "obsmat"] | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
     task: str | None = None,
 ) -> None:
-    """Import a CSV or Parquet file with a row per agent and time; needs the extra `ringfence[tables]`.
+    """Import a table with a row per agent and time; CSV and Parquet need the extra `ringfence[tables]`.
 
     Args:
-        file: fleet.csv or fleet.parquet.
+        file: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml or an obsmat.txt.
         out_file: the store to write.
         time: column of times, s (or of dates).
         agent: column that tells agents apart.
@@ -110,6 +112,8 @@ def import_table(
         cost: column of danger since its row before, 0 or above; several are constraints of these names.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
         goal: columns of where it is to go, as many as its position has.
+        rename: what columns are called in the file and here, e.g. position_x=x position_y=y.
+        wide: how a file with columns for every agent calls them, e.g. {agent}_{column} of leader_x and follower_x.
         layout: names of columns of a published format, instead of the options above.
         episodes: how rows become episodes.
         task: a name for the data; that of the store's file by default.
@@ -123,12 +127,23 @@ def import_table(
         "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **_limits_of(cost, limits)},
     }
     if layout is not None:
-        if state or action or reward or goal or episode:
+        if state or action or reward or goal or episode or rename or wide:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
         return imported(EpisodeStore.from_layout(file, layout, **options), kept)
     options |= {"time": time, "agent": agent, "episode": episode, "state": state}
-    options |= {"action": action, "reward": reward, "goal": goal}
+    options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
     imported(EpisodeStore.from_table(file, **options), kept)
+
+
+def _pairs(rename: list[str]) -> dict[str, str]:
+    """Our names by the file's."""
+    pairs = {}
+    for pair in rename:
+        theirs, equals, ours = pair.rpartition("=")
+        if not (theirs and equals and ours) or theirs in pairs:
+            raise UserError(f"--rename {pair} must be THEIRS=OURS, each of theirs once, such as position_x=x.")
+        pairs[theirs] = ours
+    return pairs
 
 
 def _limits_of(cost: list[str], limits: list[float]) -> dict[str, Any]:
@@ -183,6 +198,49 @@ def import_bag(
         notes=bag.notes,
         card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
         **episodes.options(),
+    )
+    imported(store, kept)
+
+
+def import_lerobot(
+    folder: Positional[Path],
+    out_file: Out,
+    arms: list[str] = [],  # noqa: B006
+    state: list[str] = ["observation.state"],  # noqa: B006
+    min_episode_steps: int = 5,
+    max_episode_steps: int | None = None,
+    task: str | None = None,
+) -> None:
+    """Import a LeRobot data set of version 2 or 3; needs the extra `ringfence[tables]`.
+
+    Args:
+        folder: the one that holds meta/info.json and data.
+        out_file: the store to write.
+        arms: prefixes of entries' names, an agent each, e.g. left right; these two by default, if every action begins
+            with one of them.
+        state: columns of what an arm knows of itself, e.g. observation.state observation.velocity.
+        min_episode_steps: steps of an episode, at least.
+        max_episode_steps: steps of an episode, at most; longer ones are cut.
+        task: a name for the data; that of the store's file by default.
+    """
+    from ringfence.logs.io.lerobot import read_lerobot
+    from ringfence.logs.store import EpisodeStore
+
+    kept = writable(out_file)
+    read = read_lerobot(folder, arms, state)
+    store = EpisodeStore.from_table(
+        read.columns,
+        time="time",
+        agent="agent",
+        episode="episode",
+        state=read.state,
+        action=read.action,
+        reward=read.reward,
+        dt=read.dt,
+        min_episode_steps=min_episode_steps,
+        max_episode_steps=max_episode_steps,
+        notes=read.notes,
+        card={"task": task or kept.stem, "provenance": f"LeRobot {folder.resolve().name}"},
     )
     imported(store, kept)
 
@@ -335,6 +393,7 @@ COMMANDS = {
     "make": make,
     "import-table": import_table,
     "import-bag": import_bag,
+    "import-lerobot": import_lerobot,
     "import-omar": import_omar,
     "import-ogmarl": import_ogmarl,
     "import-madiff": import_madiff,

@@ -1,10 +1,10 @@
-"""Columns of a table: of a data frame, a dictionary of arrays, a CSV or a Parquet file."""
+"""Columns of a table: of a data frame, a dictionary of arrays, or a file of a known kind."""
 
 from __future__ import annotations
 
 import importlib
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from numbers import Number
 from pathlib import Path
 from types import ModuleType
@@ -13,9 +13,19 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
+from ringfence.logs.io.jsonlines import read_json_lines
+from ringfence.logs.io.obsmat import read_obsmat
+from ringfence.logs.io.sumo import read_fcd
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
 Columns = dict[str, np.ndarray]
+READERS: dict[str, Callable[[Path], Columns]] = {
+    ".jsonl": read_json_lines,
+    ".ndjson": read_json_lines,
+    ".xml": read_fcd,
+    ".txt": read_obsmat,
+}
+KINDS = (".csv", ".parquet", ".pq", *READERS)
 
 
 def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
@@ -28,11 +38,18 @@ def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
     else:
         frame = _frame(table)
         found = {name: frame[name].to_numpy() for name in _known(wanted, frame.columns)}
-    lengths = {len(column) if column.ndim == 1 else -1 for column in found.values()}
+    lengths = {len(column) if column.ndim in (1, 2) else -1 for column in found.values()}
     if len(lengths) != 1 or not lengths - {-1, 0}:
         shapes = ", ".join(f"{name} {column.shape}" for name, column in found.items())
         raise StoreError(f"The columns are not of one length above 0 ({shapes}); give one entry per row.")
     return found
+
+
+def names_of(table: Table) -> list[str]:
+    """The names of all its columns."""
+    if isinstance(table, str | Path):
+        return list(_read_file(Path(table), None))
+    return [str(name) for name in (table if isinstance(table, Mapping) else _frame(table).columns)]
 
 
 def seconds(columns: Columns, name: str) -> np.ndarray:
@@ -141,23 +158,38 @@ def _needs(module: str) -> ModuleType:
         ) from None
 
 
-def _read_file(path: Path, wanted: list[str]) -> Columns:
-    """Columns of a CSV or Parquet file."""
-    if not path.is_file():
-        raise StoreError(f"'{path}' is no file; give a .csv or .parquet file.")
+def _read_file(path: Path, wanted: list[str] | None) -> Columns:
+    """The wanted columns of a file; all of them where nothing is wanted."""
     kind = path.suffix.lower()
-    if kind not in (".csv", ".parquet", ".pq"):
-        raise StoreError(f"'{path}' ends in '{kind}'; give a .csv or .parquet file.")
+    if not path.is_file():
+        raise StoreError(f"'{path}' is no file; give a {_or(KINDS)} file.")
+    if kind not in KINDS:
+        raise StoreError(f"'{path}' ends in '{kind}'; give a {_or(KINDS)} file.")
+    if kind in READERS:
+        try:
+            return READERS[kind](path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise StoreError(f"'{path}' is no table that can be read ({error}).") from None
+    return _read_by_arrow(path, wanted)
+
+
+def _or(kinds: Iterable[str]) -> str:
+    *first, last = kinds
+    return f"{', '.join(first)} or {last}"
+
+
+def _read_by_arrow(path: Path, wanted: list[str] | None) -> Columns:
+    """Columns of a CSV or Parquet file."""
     pyarrow = _needs("pyarrow")
     try:
-        table = _read_csv(path) if kind == ".csv" else _read_parquet(path, wanted)
+        table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_parquet(path, wanted)
         names = table.column_names
         twice = [name for name, times in Counter(names).items() if times > 1]
         if twice:
             raise StoreError(
                 f"'{path}' has the column '{twice[0]}' twice, or no header; give every column its own name."
             )
-        return {name: table.column(name).to_numpy() for name in _known(wanted, names)}
+        return {name: table.column(name).to_numpy() for name in (names if wanted is None else _known(wanted, names))}
     except UserError:
         raise
     except (pyarrow.ArrowException, OSError, ValueError, TypeError) as error:  # a header that is no UTF-8 among them
@@ -175,7 +207,7 @@ def _read_csv(path: Path) -> Any:
     return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=separator))
 
 
-def _read_parquet(path: Path, wanted: list[str]) -> Any:
+def _read_parquet(path: Path, wanted: list[str] | None) -> Any:
     """An Arrow table; a file that claims to unpack to far more than it holds is refused unread."""
     from pyarrow import parquet
 
@@ -185,8 +217,10 @@ def _read_parquet(path: Path, wanted: list[str]) -> Any:
         if size > 100 * path.stat().st_size + 2**28:
             raise StoreError(f"'{path}' claims {size / 2**20:.0f} MiB and holds far less; write it again.")
         there = set(file.schema_arrow.names)
-        _affordable(path, file.metadata.num_rows, len(set(wanted) & there))
-        return file.read(wanted) if set(wanted) <= there else file.read()
+        if wanted is None or not set(wanted) <= there:
+            return file.schema_arrow.empty_table()  # for its names
+        _affordable(path, file.metadata.num_rows, len(set(wanted)))
+        return file.read(wanted)
 
 
 def _affordable(path: Path, rows: int, columns: int) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.logs.io.angles import angle_of
 from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
@@ -28,6 +29,9 @@ def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] |
     names: list[str] = list(fields.get("observation_names") or ())
     columns = {name: np.asarray(column, np.float64) for name, column in state.items()}
     goals = {name: np.asarray(column, np.float64) for name, column in (goal or {}).items()}
+    for name in [name for name in columns if f"own.cos_{name}" in names]:
+        angle = angle_of(name, columns[name])
+        columns |= {f"cos_{name}": np.cos(angle), f"sin_{name}": np.sin(angle)}
     shapes = {column.shape for column in (*columns.values(), *goals.values())}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")

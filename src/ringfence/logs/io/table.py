@@ -1,5 +1,4 @@
-"""Tables of logs, a row per agent and time, as an episode store: data frames, CSV and Parquet files, dictionaries of
-arrays.
+"""Tables of logs, a row per agent and time, as an episode store: data frames, files, dictionaries of arrays.
 
 What agents see is made of the columns of their state: their own entries (`own.x`), where the goal is (`goal.dx`), and
 where others are and how they move relative to them (`other0.dx`, `other0.dvx`), named so that a World knows what
@@ -15,11 +14,15 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.logs.io.columns import Table, numbers, read_columns, seconds
+from ringfence.logs.io.angles import without_angles
+from ringfence.logs.io.columns import Columns, Table, numbers, read_columns, seconds
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
+from ringfence.logs.io.lerobot import entry_names
+from ringfence.logs.io.lists import expanded
 from ringfence.logs.io.rows import Clock, Rows, Values, clock_of, doubts, refuse_jumps, sorted_rows, values_of
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, resample
+from ringfence.logs.io.wide import read_wide
 from ringfence.problem.constraints import CostColumn
 
 
@@ -45,6 +48,9 @@ LAYOUTS = {
     ),
     # INTERACTION (Zhan et al. 2019), vehicle_tracks_xxx.csv.
     "interaction": Layout({"time": "timestamp_ms", "agent": "track_id"}, 1e-3),
+    # What the readers of these files call time, agent, x, y, vx and vy.
+    "sumo": Layout({}, 1.0),
+    "obsmat": Layout({}, 1.0),
 }
 
 
@@ -58,14 +64,15 @@ def read_table(
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
     names the first row that cannot be (counted from 0, without a header).
     """
-    columns = read_columns(table, schema.columns)
+    columns, schema = _columns_of(table, schema)
+    columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
     values = values_of(columns, rows, schema)
     refuse_jumps(rows, values, schema)
     clock = clock_of(rows, schema)
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
-    warnings = [*notes, *doubts(rows, values, clock, schema), *_made_of(schema), *episodes.notes]
+    warnings = [*notes, *angles, *doubts(rows, values, clock, schema), *_made_of(schema), *episodes.notes]
     return _steps(motion, episodes, warnings, card or {})
 
 
@@ -95,6 +102,18 @@ def read_layout(
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
     return read_table(columns, schema, notes=notes, card=card)
+
+
+def _columns_of(table: Table, schema: TableSchema) -> tuple[Columns, TableSchema]:
+    """The schema's columns under our names, and the schema with the entries of its lists."""
+    theirs = {ours: their for their, ours in schema.rename.items()}
+    if schema.wide is not None:
+        columns = read_wide(table, schema, theirs)
+    else:
+        read = read_columns(table, [theirs.get(name, name) for name in schema.columns])
+        columns = {name: read[theirs.get(name, name)] for name in schema.columns}
+    names = entry_names(table)
+    return expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
 
 
 def _on_clock(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Tracks:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,9 @@ class TableSchema:
     agent, who sees the k nearest others within `sensing_radius` m; such agents are homogeneous, and a policy plays any
     number of them. Episodes have `min_episode_steps` to `max_episode_steps` steps. `max_speed` m/s is more than
     anything there can do.
+
+    `rename` has our names by the table's, for all that is named above. A table with columns for every agent says by
+    `wide` how these are called: "{agent}_{column}" reads leader_x as x of `leader`, and `agent` is a name of our own.
     """
 
     time: str
@@ -58,6 +61,8 @@ class TableSchema:
     max_episode_steps: int | None = None
     max_speed: float = 100.0
     danger: Hazard | None = None
+    rename: Mapping[str, str] = field(default_factory=dict)
+    wide: str | None = None
 
     def __post_init__(self):
         if isinstance(self.cost, str):
@@ -70,7 +75,7 @@ class TableSchema:
     @classmethod
     def of(cls, options: Mapping[str, Any]) -> TableSchema:
         """The schema of options by name."""
-        names = [field.name for field in fields(cls)]
+        names = [each.name for each in fields(cls)]
         for name in options:
             if name not in names:
                 raise unknown("option of a table", name, names)
@@ -178,6 +183,20 @@ def _danger(schema: TableSchema) -> None:
         raise UserError("cost and danger both say what a step costs; give one of them.")
 
 
+def _rename(schema: TableSchema) -> None:
+    ours = list(schema.rename.values())
+    twice = [name for name in ours if ours.count(name) > 1]
+    if twice:
+        raise UserError(f"rename calls two columns '{twice[0]}'; give each a name of its own.")
+
+
+def _wide(schema: TableSchema) -> None:
+    if schema.wide is not None and not (schema.wide.count("{agent}") == schema.wide.count("{column}") == 1):
+        raise UserError(
+            f"wide='{schema.wide}' must hold {{agent}} and {{column}} once; write it as '{{agent}}_{{column}}'."
+        )
+
+
 def _action(schema: TableSchema) -> None:
     if not schema.action and not schema.axes:
         raise UserError(
@@ -195,4 +214,6 @@ RULES: tuple[Callable[[TableSchema], None], ...] = (
     _position,
     _danger,
     _action,
+    _rename,
+    _wide,
 )

@@ -1,0 +1,336 @@
+"""Logs in the formats that people bring: each is written by the format's own library and read as it is."""
+
+from __future__ import annotations
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+from ringfence.cli import app
+from ringfence.errors import UserError
+from ringfence.logs.io.lerobot import read_lerobot
+from ringfence.logs.io.observe import observe
+from ringfence.logs.store import EpisodeStore
+from tests.test_tables import NAMES, entry, fleet
+
+JOINTS = ["waist", "elbow", "gripper"]
+
+
+# --- JSON lines ---
+def test_json_lines_are_read_with_their_objects_and_lists(tmp_path):
+    table = fleet()
+    file = tmp_path / "fleet.jsonl"
+    with file.open("w") as out:
+        for k in range(len(table["t"])):
+            row = {name: column[k].item() for name, column in table.items()}
+            row["pose"] = {"at": [row.pop("x"), row.pop("y")]}
+            out.write(json.dumps(row) + "\n\n")
+    state = ["pose.at", "vx", "vy"]
+    rename = {"pose.at": "at"}
+    store = EpisodeStore.from_table(file, **NAMES | {"state": ["at", "vx", "vy"]}, rename=rename)
+    whole = EpisodeStore.from_table(table, **NAMES)
+    assert store.card.observation_names[2:4] == ["own.at.0", "own.at.1"]
+    np.testing.assert_allclose(entry(store, "own.at.1"), entry(whole, "own.y"))
+    np.testing.assert_array_equal(store.actions, whole.actions)
+    assert EpisodeStore.from_table(file, **NAMES | {"state": state}).card.observation_names[2] == "own.pose.at.0"
+    rename |= {"at.0": "x", "at.1": "y"}
+    places = EpisodeStore.from_table(file, **NAMES | {"state": ["at", "vx", "vy"]}, rename=rename)
+    assert places.content == whole.content and "other0.dx" in places.card.observation_names
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('{"t": 1}\n{"t": \n', "Line 2 of .* is no JSON"),
+        ("[1, 2]\n", "Line 1 of .* is no object"),
+        ('{"t": 1, "t": 2}\n', "Line 1 of .* names a field twice"),
+        ('{"a":' * 9 + "1" + "}" * 9, "objects in objects 8 deep"),
+        ("[" * 10**5, "Line 1 of .* is no JSON"),
+        ('{"t": 1, "id": 1, "x": 2}\n{"t": 2, "id": 1}\n', "row 1: x is 'None', no number"),
+        ('{"t": 1, "id": 1, "x": [1, 2]}\n{"t": 2, "id": 1, "x": [1]}\n', r"row 1: x is no list of 2 numbers"),
+        ('{"t": 1, "id": 1, "x": [1, "a"]}\n{"t": 2, "id": 1, "x": [1, 3]}\n', "row 0: x.1 is 'a', no number"),
+        ('{"t": 1, "id": 1, "x": [[1]]}\n', "row 0: x is no list"),
+        ("", "column of the table"),
+    ],
+)
+def test_json_lines_that_cannot_be_are_refused(tmp_path, text, said):
+    (tmp_path / "a.jsonl").write_text(text)
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_table(tmp_path / "a.jsonl", time="t", agent="id", state=["x"], action=["t"])
+
+
+# --- names ---
+def wide() -> dict[str, np.ndarray]:
+    """Columns of a leader and a follower, who is there from the fourth row on."""
+    rng = np.random.default_rng(4)
+    table = {"stamp": 0.2 * np.arange(30), "crash": (rng.random(30) < 0.3).astype(float)}
+    for agent in ("leader", "follower"):
+        velocity = rng.uniform(-1, 1, (30, 2))
+        place = np.cumsum(velocity, 0) * 0.2
+        table |= {f"{agent}_{name}": column for name, column in zip(("X", "Y"), place.T)}
+        table |= {f"{agent}_{name}": column for name, column in zip(("vx", "vy"), velocity.T)}
+    for name in ("X", "Y", "vx", "vy"):
+        table[f"follower_{name}"][:3] = np.nan
+    return table
+
+
+def test_wide_tables_and_other_names(tmp_path):
+    import pandas as pd
+
+    table = wide()
+    pd.DataFrame(table).to_csv(tmp_path / "pair.csv", index=False)
+    command = ["data", "import-table", str(tmp_path / "pair.csv"), "--out", str(tmp_path / "pair.h5")]
+    command += ["--state", "x", "y", "vx", "vy", "--cost", "hit", "--wide", "{agent}_{column}"]
+    app.main([*command, "--rename", "stamp=time", "X=x", "Y=y", "crash=hit"])
+    store = EpisodeStore.load(tmp_path / "pair.h5")
+    assert (store.n_agents, store.steps) == (2, 26)
+    np.testing.assert_allclose(entry(store, "own.x")[:, 1], table["leader_X"][3:], atol=1e-5)  # in the names' order
+    np.testing.assert_allclose(entry(store, "own.y")[:, 0], table["follower_Y"][3:], atol=1e-5)
+    np.testing.assert_array_equal(store.costs, table["crash"][4:])
+    names = dict(time="stamp", agent="who", state=["X", "vx"], rename={}, wide="{agent}_{column}")
+    assert EpisodeStore.from_table(table, **names).n_agents == 2
+
+
+def test_the_longest_name_says_whose_a_column_is():
+    table = {"t": np.arange(20.0)}
+    for agent in ("a", "b"):
+        table |= {f"{agent}{name}": np.arange(20.0) for name in ("x", "vx")}
+    store = EpisodeStore.from_table(table, time="t", agent="who", state=["x", "vx"], wide="{agent}{column}")
+    assert store.n_agents == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"wide": "{agent}"}, "must hold {agent} and {column} once"),
+        ({"wide": "{agent}-{column}"}, "fits no column of x, y"),
+        ({"state": ["x", "y", "z"], "wide": "{agent}_{column}"}, "The agent 'leader' has no column 'leader_z'"),
+        ({"rename": {"X": "x", "Y": "x"}}, "rename calls two columns 'x'"),
+        ({"rename": {"XX": "x"}, "agent": "leader_X"}, "column of the table.*XX"),
+    ],
+)
+def test_names_that_cannot_be_are_refused(options, said):
+    table = wide() | {"follower_z": np.zeros(30)}
+    usual = dict(time="stamp", agent="who", state=["x", "y"], rename={"X": "x", "Y": "y"})
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_table(table, **usual | options)
+
+
+def test_pairs_of_names_on_the_command_line(tmp_path, capsys):
+    for pair in ("x", "=x", "x=", "x=y"):
+        with pytest.raises(SystemExit):
+            app.main(["data", "import-table", "f.csv", "--out", str(tmp_path / "f.h5"), "--rename", "x=z", pair])
+        assert "THEIRS=OURS" in capsys.readouterr().err
+
+
+# --- SUMO ---
+def fcd(kind: str = "vehicle", steps: int = 20, **left_out: None) -> ElementTree.Element:
+    """Two cars, one east and one north, at 10 and 5 m/s."""
+    root = ElementTree.Element("fcd-export")
+    for k in range(steps):
+        step = ElementTree.SubElement(root, "timestep", time=f"{0.5 * k:.2f}")
+        cars = {"east": (5.0 * k, 0.0, 90.0, 10.0), "north": (0.0, 2.5 * k, 0.0, 5.0)}
+        for name, (x, y, angle, speed) in cars.items():
+            given = dict(id=name, x=x, y=y, angle=angle, type="DEFAULT_VEHTYPE", speed=speed, pos=1.0, lane="a_0")
+            given = {key: str(value) for key, value in given.items() if key not in left_out}
+            ElementTree.SubElement(step, kind, given)
+    return root
+
+
+@pytest.mark.parametrize("kind", ["vehicle", "person"])
+def test_sumos_output_is_read_as_it_is(tmp_path, kind):
+    root = fcd(kind)
+    if kind == "vehicle":  # a passenger is where the car is
+        for step in root:
+            ElementTree.SubElement(step, "person", id="p", x="0", y="0", angle="0", speed="0")
+    ElementTree.ElementTree(root).write(tmp_path / "fcd.xml", encoding="UTF-8", xml_declaration=True)
+    command = ["data", "import-table", str(tmp_path / "fcd.xml"), "--layout", "sumo", "--separation", "3"]
+    app.main([*command, "--out", str(tmp_path / "fcd.h5")])
+    store = EpisodeStore.load(tmp_path / "fcd.h5")
+    assert (store.n_agents, store.steps, store.card.dt) == (2, 19, 0.5)
+    np.testing.assert_allclose(entry(store, "own.vx"), np.tile([10.0, 0.0], (20, 1)), atol=1e-5)
+    np.testing.assert_allclose(entry(store, "own.vy"), np.tile([0.0, 5.0], (20, 1)), atol=1e-5)
+    assert not store.actions.any() and not any("times what" in note for note in store.card.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("<fcd-export><timestep", "is truncated or no XML"),
+        ("<routes/>", "begins with <routes>"),
+        ("<fcd-export/>", "holds no vehicle"),
+        ('<fcd-export><vehicle id="a"/></fcd-export>', "outside of any <timestep>"),
+        ('<fcd-export><timestep time="a"/></fcd-export>', "time='a', which is no number"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><fcd-export/>', "declares a document type"),
+        (ElementTree.tostring(fcd(angle=None), "unicode"), "vehicles without angle"),
+        (ElementTree.tostring(fcd(), "unicode").replace('"10.0"', '"fast"'), "no number"),
+    ],
+)
+def test_xml_that_cannot_be_is_refused(tmp_path, text, said):
+    (tmp_path / "fcd.xml").write_text(text)
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_layout(tmp_path / "fcd.xml", "sumo")
+
+
+# --- pedestrians ---
+def test_pedestrians_have_a_line_every_two_fifths_of_a_second(tmp_path):
+    rows = []
+    for k in range(12):
+        for who, speed in ((1, 1.25), (2, -1.0)):
+            rows.append([780 + 6 * k, who, 0.4 * k * speed, 0, who, speed, 0, 0])
+    np.savetxt(tmp_path / "obsmat.txt", rows)
+    command = ["data", "import-table", str(tmp_path / "obsmat.txt"), "--layout", "obsmat", "--neighbours", "1"]
+    app.main([*command, "--out", str(tmp_path / "people.h5")])
+    store = EpisodeStore.load(tmp_path / "people.h5")
+    assert (store.episodes, store.card.dt) == (2, 0.4) and not store.actions.any()
+    np.testing.assert_allclose(entry(store, "own.vx")[:12, 0], 1.25, atol=1e-6)
+    assert not any("times what" in note for note in store.card.warnings)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 2 3\n4 5 6\n", "2 lines of 3 numbers"),
+        ("", "0 lines"),
+        ("frame id x\n", "is no obsmat"),
+        ("1 1.5 0 0 0 0 0 0\n2 1.5 0 0 0 0 0 0\n", "whole numbers"),
+        ("1 1 0 0 0 0 0 0\n", "no pedestrian at two frames"),
+    ],
+)
+def test_obsmats_that_cannot_be_are_refused(tmp_path, text, said):
+    (tmp_path / "obsmat.txt").write_text(text)
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.from_layout(tmp_path / "obsmat.txt", "obsmat")
+
+
+# --- LeRobot ---
+def lerobot(folder, version="v3.0", names=None, arms=("left_", "right_"), lengths=(12, 9), shared=(), **changed):
+    """A data set's folder as LeRobot writes it: one file for all episodes (v3) or one each (v2)."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    rng = np.random.default_rng(7)
+    entries = [arm + joint for arm in arms for joint in JOINTS]
+    names = entries if names is None else names
+    feature = {"dtype": "float32", "shape": [len(entries)], "names": names}
+    features = {"observation.state": feature, "action": feature, "next.reward": {"dtype": "float32", "shape": [1]}}
+    if shared:
+        features["observation.state"] = {"dtype": "float32", "shape": [7], "names": [*entries, *shared]}
+    features["observation.images.top"] = {"dtype": "video", "shape": [2, 2, 3], "names": ["height", "width", "channel"]}
+    info = {"codebase_version": version, "fps": 30, "total_frames": sum(lengths), "features": features} | changed
+    (folder / "meta").mkdir(parents=True)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    frame = np.concatenate([np.arange(n) for n in lengths])
+    columns = {
+        "observation.state": rng.normal(size=(len(frame), len(entries) + len(shared))).astype(np.float32),
+        "action": rng.normal(size=(len(frame), len(entries))).astype(np.float32),
+    }
+    lists = {
+        name: pa.array(list(x), pa.list_(pa.float32(), x.shape[1] if version == "v3.0" else -1))
+        for name, x in columns.items()
+    }
+    table = pa.table(
+        lists
+        | {"timestamp": (frame / 30).astype(np.float32), "frame_index": frame, "next.reward": frame.astype(np.float32)}
+        | {"episode_index": np.repeat(np.arange(len(lengths)), lengths), "task_index": np.zeros(len(frame), int)}
+    )
+    if version == "v3.0":
+        parquet.write_table(table, folder / "data" / "chunk-000" / "file-000.parquet")
+    else:
+        for k, (stop, n) in enumerate(zip(np.cumsum(lengths), lengths)):
+            parquet.write_table(table.slice(stop - n, n), folder / "data" / "chunk-000" / f"episode_{k:06d}.parquet")
+    return columns
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+@pytest.mark.parametrize("nested", [False, True])
+def test_both_arms_of_a_lerobot_data_set_are_agents(tmp_path, version, nested):
+    entries = [arm + joint for arm in ("left_", "right_") for joint in JOINTS]
+    columns = lerobot(tmp_path / "set", version, {"motors": [entries]} if nested else None)
+    app.main(["data", "import-lerobot", str(tmp_path / "set"), "--out", str(tmp_path / "arms.h5")])
+    store = EpisodeStore.load(tmp_path / "arms.h5")
+    assert (store.n_agents, store.episodes, store.steps) == (2, 2, 19) and store.card.dt == pytest.approx(1 / 30)
+    assert store.card.observation_names[:3] == [f"own.{joint}" for joint in JOINTS]
+    stays = np.r_[0:11, 12:20]
+    np.testing.assert_allclose(store.actions, columns["action"][stays].reshape(-1, 2, 3), atol=1e-6)
+    np.testing.assert_allclose(entry(store, "own.elbow")[:, 1], columns["observation.state"][:, 4], atol=1e-6)
+    np.testing.assert_array_equal(store.rewards[:, 0], stays - np.where(stays >= 12, 12, 0))  # of the frame that acted
+
+
+def test_arms_by_other_names_and_what_both_see(tmp_path):
+    columns = lerobot(tmp_path / "set", arms=("a.", "b."), shared=["tray"])
+    both = read_lerobot(tmp_path / "set", ["a.", "b."])
+    assert both.agents == ("a", "b") and both.state == (*JOINTS, "tray")
+    np.testing.assert_array_equal(both.columns["tray"][21:], columns["observation.state"][:, 6])
+    np.testing.assert_array_equal(both.columns["action.elbow"][21:], columns["action"][:, 4])
+    one = read_lerobot(tmp_path / "set")
+    assert one.agents == ("robot",) and one.state[3] == "b.waist" and len(one.action) == 6
+
+
+def test_a_file_of_a_data_set_is_a_table_of_named_lists(tmp_path):
+    lerobot(tmp_path / "set")
+    file = tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet"
+    names = dict(time="timestamp", agent="task_index", episode="episode_index", state=["observation.state"])
+    store = EpisodeStore.from_table(file, **names, action=["action"])
+    assert store.card.observation_names[0] == "own.observation.state.left_waist" and store.actions.shape == (19, 1, 6)
+
+
+@pytest.mark.parametrize(
+    ("changed", "arms", "said"),
+    [
+        ({"codebase_version": "v1.6"}, (), "version v1.6"),
+        ({"fps": 0}, (), "0.0 frames a second"),
+        ({"features": 3}, (), "not what LeRobot writes"),
+        ({"features": {}}, (), "column of the data set 'observation.state'"),
+        ({}, ("left_", "left_"), "names one twice"),
+        ({}, ("left_",), "The action 'right_waist' begins with none of left_"),
+        ({}, ("left_", "right_waist", "right_e", "right_g"), "arms need the same entries"),
+    ],
+)
+def test_data_sets_that_cannot_be_are_refused(tmp_path, changed, arms, said):
+    lerobot(tmp_path / "set", **changed)
+    with pytest.raises(UserError, match=said):
+        read_lerobot(tmp_path / "set", arms)
+
+
+def test_folders_that_are_no_data_sets_are_refused(tmp_path):
+    with pytest.raises(UserError, match="holds no meta/info.json"):
+        read_lerobot(tmp_path)
+    lerobot(tmp_path / "set")
+    (tmp_path / "set" / "data" / "chunk-000" / "file-000.parquet").unlink()
+    with pytest.raises(UserError, match="holds no data/"):
+        read_lerobot(tmp_path / "set")
+    (tmp_path / "set" / "meta" / "info.json").write_text("[" * 10**5)
+    with pytest.raises(UserError, match="not what LeRobot writes"):
+        read_lerobot(tmp_path / "set")
+
+
+# --- angles ---
+@pytest.mark.parametrize(("name", "turn"), [("yaw", 2 * np.pi), ("compass", 360.0), ("course_deg", 360.0)])
+def test_angles_are_never_interpolated_across_a_turn(name, turn):
+    time = np.concatenate([0.2 * np.arange(40), 0.2 * np.arange(40) + 0.1])
+    angle = (1.7 * time + 0.3) % (2 * np.pi)
+    table = {"t": time, "id": np.repeat([0, 1], 40), "x": time, "y": time, name: angle * turn / (2 * np.pi)}
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y", name], dt=0.1)
+    assert f"own.{name}" not in store.card.observation_names
+    got = np.arctan2(entry(store, f"own.sin_{name}"), entry(store, f"own.cos_{name}"))
+    true = 1.7 * entry(store, "own.x") + 0.3
+    np.testing.assert_allclose(np.abs(np.exp(1j * got) - np.exp(1j * true)), 0, atol=1e-4)
+    assert any("cosine and sine" in note for note in store.card.warnings)
+    now = {key: table[key][[3, 43]] for key in ("x", "y", name)} | dict.fromkeys(("vx", "vy"), np.ones(2))
+    seen = observe(store.card, now)
+    np.testing.assert_allclose(
+        seen[0, store.card.observation_names.index(f"own.cos_{name}")], np.cos(angle[3]), atol=1e-5
+    )
+
+
+def test_angles_in_degrees_are_asked_for_by_name():
+    table = fleet() | {"heading": np.linspace(0, 300, len(fleet()["t"]))}
+    options = NAMES | {"state": ["x", "y", "heading"]}
+    with pytest.raises(UserError, match="heading reaches 300: .*--rename heading=heading_deg"):
+        EpisodeStore.from_table(table, **options)
+    renamed = NAMES | {"state": ["x", "y", "heading_deg"], "rename": {"heading": "heading_deg"}}
+    assert "own.cos_heading_deg" in EpisodeStore.from_table(table, **renamed).card.observation_names
