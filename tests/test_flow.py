@@ -41,11 +41,11 @@ def run(two_drivers, tmp_path_factory):
 
 def played(policy, steps: int = 3, batch: int = 64) -> np.ndarray:
     """Actions (B, steps, N) at the same kind of states."""
-    memory = policy.start(batch)
+    carry = policy.initial_state(batch)
     out = []
     for t in range(steps):
         seen = jax.random.normal(jax.random.key(t), (batch, 2, 3))
-        memory, step = policy.act(memory, seen, None, jax.random.key(10 + t))
+        carry, step = policy.act(carry, seen, None, jax.random.key(10 + t))
         out.append(np.asarray(step.action)[..., 0])
     return np.stack(out, 1)
 
@@ -131,7 +131,7 @@ def test_proposals_are_of_several_drivers(run, two_drivers):
     world = worlds.fit(two_drivers, **QUICK_WORLD)
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
     seen = jnp.zeros((5, 2, 3))
-    memory, actions, _ = policy.propose(policy.start(5), seen, None, jax.random.key(0), 3, 2, world)
+    carry, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 3, 2, world)
     assert actions.shape == (5, 3, 2, 2, 1)
     own = np.asarray(actions)[:, 0, 0, 0, 0]
     other = np.asarray(actions)[:, 1, 0, 0, 0]

@@ -74,24 +74,24 @@ class FlowPolicy(eqx.Module):
                     "condition='none'; train with the preset return."
                 )
 
-    def start(self, batch: int) -> PyTree:
+    def initial_state(self, batch: int) -> PyTree:
         return {"driver": jnp.zeros(batch, jnp.int32), "age": jnp.zeros((), jnp.int32)}
 
-    def act(self, memory: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
+    def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds."""
         x = self.feature_map(observations, state)
-        memory, key = self._with_driver(memory, x, key)
-        action = self.draw(x, memory["driver"], key)
-        return memory, PolicyStep(from_unit(action, self.spec), {"driver": memory["driver"]})
+        carry, key = self._with_driver(carry, x, key)
+        action = self.draw(x, carry["driver"], key)
+        return carry, PolicyStep(from_unit(action, self.spec), {"driver": carry["driver"]})
 
     def propose(
-        self, memory: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
+        self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(memory, actions (B, `count`, `rows`, N, A) in [−1, 1], info) along the rows that the World foresees: the
+        """(carry, actions (B, `count`, `rows`, N, A) in [−1, 1], info) along the rows that the World foresees: the
         first of the episode's own driver, the others of drivers in turn."""
-        memory, key = self._with_driver(memory, self.feature_map(observations, state), key)
+        carry, key = self._with_driver(carry, self.feature_map(observations, state), key)
         batch = observations.shape[0]
-        driver = (memory["driver"][:, None] + jnp.arange(count)) % self.drivers
+        driver = (carry["driver"][:, None] + jnp.arange(count)) % self.drivers
         driver = driver.reshape(-1)
 
         def act(x: Array) -> Array:
@@ -99,7 +99,7 @@ class FlowPolicy(eqx.Module):
 
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
         actions = rolled(act, self.feature_map, world, seen, present, rows)
-        return memory, actions.reshape(batch, count, *actions.shape[2:]), {"driver": memory["driver"]}
+        return carry, actions.reshape(batch, count, *actions.shape[2:]), {"driver": carry["driver"]}
 
     def draw(self, x: Array, driver: Array, key: Key) -> Array:
         """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,)."""
@@ -132,12 +132,12 @@ class FlowPolicy(eqx.Module):
         free = told(score, ~everyone)
         return free + o.cfg_scale * (asked - free)
 
-    def _with_driver(self, memory: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
-        """The memory with this episode's driver, drawn at its first features x (B, N, D), and a key for the rest."""
+    def _with_driver(self, carry: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
+        """What is carried, with this episode's driver, drawn at its first features x (B, N, D), and a key for the rest."""
         k1, k2 = jax.random.split(key)
         batch = x.shape[0]
         seen = self.normaliser.state(x).reshape(batch, -1)
         logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
         drawn = jnp.argmax(logits + jax.random.gumbel(k1, logits.shape), -1).astype(jnp.int32)
-        driver = jnp.where(memory["age"] == 0, drawn, memory["driver"])
-        return {"driver": driver, "age": memory["age"] + 1}, k2
+        driver = jnp.where(carry["age"] == 0, drawn, carry["driver"])
+        return {"driver": driver, "age": carry["age"] + 1}, k2

@@ -58,10 +58,10 @@ def ope(
     was on any of them, `episodes_trained_on` on how many). `evaluation_world` is the World that predicts (default:
     fitted to these logs with seed + 1). The policy is asked in `states` logged states; fitted Q evaluation learns from
     `transitions` logged steps, by `num_ensemble` networks on resampled episodes, whose 95 % interval is Student's;
-    `compare` evaluates what the logs did, too. Policies are asked with an empty memory: plans under way and adapted
+    `compare` evaluates what the logs did, too. Policies are asked with an empty carry: plans under way and adapted
     margins are not there.
 
-    In `rollout_episodes` of up to `rollout_steps` steps it is played in that World, with its memory (0 episodes: not).
+    In `rollout_episodes` of up to `rollout_steps` steps it is played in that World, with its carry (0 episodes: not).
     `ahead` is how many steps are predicted from each logged state.
     """
     check_sizes(states, transitions, updates, seed)
