@@ -428,9 +428,7 @@ CLAIMS = (
         robots_kept("bc", "default+adapt-learned-decentralized", 17, "own-sight-mujoco"),
     ),
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
-    Claim(
-        "docs/ope.md", "Danger is told well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)
-    ),
+    Claim("docs/ope.md", "Danger is told well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)),
     Claim(
         "docs/attribution.md",
         "On Crossing diffusion earns more alone, and nothing more under a shield",

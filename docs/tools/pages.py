@@ -39,6 +39,8 @@ REFERENCE = {
         "ringfence.evaluation.evaluate",
         "ringfence.evaluation.protocol",
         "ringfence.evaluation.play",
+        "ringfence.evaluation.stress",
+        "ringfence.faults.faults",
         "ringfence.evaluation.simulators",
         "ringfence.logs.collect",
         "ringfence.evaluation.reference",

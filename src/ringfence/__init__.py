@@ -22,6 +22,8 @@ _WHERE = {
     "load": "ringfence.loading.resolve",
     "Controller": "ringfence.loading.controller",
     "play": "ringfence.evaluation.play",
+    "stress": "ringfence.evaluation.stress",
+    "Faults": "ringfence.faults",
     "collect": "ringfence.logs.collect",
     "ope": "ringfence.evaluation.ope",
     "World": "ringfence.world",

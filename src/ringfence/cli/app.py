@@ -293,6 +293,58 @@ def _played(run: Run, result: dict[str, Any]) -> list[Text | str]:
     ]
 
 
+def stress(
+    runs: Positional[list[Path]],
+    episodes: int = 100,
+    split: Literal["test", "validation"] = "test",
+    checkpoint: int | None = None,
+    delay: int = 0,
+    drop: float = 0.0,
+    noise: float = 0.0,
+    gain: float = 1.0,
+    asynchrony: Annotated[float, tyro.conf.arg(name="async")] = 0.0,
+    compensate: bool = False,
+    playing: How = AS_IT_IS,
+) -> None:
+    """Play a trained policy behind faults, on the resets of `ringfence eval`; kept in the run's stress.json.
+
+    Args:
+        runs: run folders, or folders that hold some.
+        episodes: a bound of 1 % takes 300 without an accident.
+        split: test resets, or validation resets for choosing settings.
+        checkpoint: step of the one that is played; the last one by default.
+        delay: steps after which an action takes effect.
+        drop: probability that an agent's observation of a step is lost; what it got last is held.
+        noise: standard deviation of what is observed, in the entries' own units.
+        gain: what becomes of an action, which is clipped to its bounds.
+        asynchrony: share of steps that an agent lets pass, each in its own rhythm.
+        compensate: tell the guard of delay and drop, which it then makes good for.
+    """
+    from ringfence.evaluation.stress import stress as run_stress
+    from ringfence.faults import Faults
+
+    faults = Faults.of({"delay": delay, "drop": drop, "noise": noise, "gain": gain, "asynchrony": asynchrony})
+    given = playing.arguments()
+    found = _some_runs(runs)
+    given |= {
+        "episodes": episodes,
+        "split": split,
+        "checkpoint": checkpoint,
+        "compensate": compensate,
+        "quiet": False,
+    }
+    table = Table("run", Column("faults", no_wrap=True), "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    refusals = Refusals()
+    shown = "\n".join(f"{name} {value}" for name, value in faults.given.items()) or "none"
+    for run in found:
+        with refusals.of(run):
+            result = run_stress(run, faults, **given)
+            told = " (told)" if compensate else ""
+            first, guard, *rest = _played(run, result)
+            table.add_row(first, shown, f"{guard}{told}", *rest)
+    _say(table, refusals, len(found))
+
+
 def _say(table: Table, refusals: Refusals, runs: int) -> None:
     """What was measured, and what runs were refused for; the process ends where any was."""
     if table.row_count:
@@ -427,6 +479,7 @@ COMMANDS = {
     "train": train,
     "eval": evaluate,
     "play": play,
+    "stress": stress,
     "pretrained": pretrained,
     "export": export,
     "bench": bench_commands.bench,

@@ -18,12 +18,14 @@ from ringfence.envs.base import Measured, NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import COUNTED, rollout
+from ringfence.faults import Faults, under_faults
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy
 from ringfence.utils.renamed import policy_of_before
 
 RATES = {"infeasible": "infeasible_rate", "ood": "ood_rate"}  # columns of what is counted in steps
+NO_FAULTS = Faults()
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 
 
@@ -126,9 +128,11 @@ def evaluate_policy(
     num_recorded: int = 0,
     label: str = "",
     quiet: bool = True,
+    faults: Faults = NO_FAULTS,
 ) -> tuple[dict, dict[str, np.ndarray]]:
-    """(summary, what was recorded) of a policy on a task's simulator. Robots are played by any object with
-    `initial_state` and `act` (types.Policy); Simple Spread, which runs inside JAX, by pytrees."""
+    """(summary, what was recorded) of a policy on a task's simulator, behind faults where there are some. Robots are
+    played by any object with `initial_state` and `act` (types.Policy); Simple Spread, which runs inside JAX, by
+    pytrees."""
     if task.env is None:
         raise UserError(
             f"Task '{task.name}' exists only as data, so `ringfence eval` has nothing to play in; play in a simulator "
@@ -137,7 +141,8 @@ def evaluate_policy(
     episodes = whole_number("episodes", episodes, 1, 10**7)
     num_recorded = min(whole_number("num_recorded", num_recorded), episodes)
     begun = time.perf_counter()
-    played = rollout(policy_of_before(policy), task.env, episodes, split, seed, num_recorded, label, quiet)
+    policy = under_faults(policy_of_before(policy), faults, task)
+    played = rollout(policy, task.env, episodes, split, seed, num_recorded, label, quiet)
     result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
     result |= {"protocol": PROTOCOL, "task": task.name, "split": split, "seed": seed}
     return result | {"eval_seconds": time.perf_counter() - begun}, played

@@ -10,6 +10,7 @@ import numpy as np
 
 from ringfence.envs.base import Env, NativeEnv, Outcome
 from ringfence.errors import UserError
+from ringfence.faults import Faulty
 from ringfence.proposals.base import act_with, with_cost
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils.progress import Progress
@@ -170,7 +171,7 @@ def _drawn(decided: PolicyStep) -> dict[str, Array]:
 
 def _foreign(policy: Policy) -> bool:
     """Whether a policy is an ordinary object that JAX cannot take apart, e.g. one around a PyTorch network."""
-    return jax.tree_util.all_leaves([policy])
+    return jax.tree_util.all_leaves([policy.policy if isinstance(policy, Faulty) else policy])
 
 
 def _stacked(steps: list[Played]) -> Played:

@@ -13,6 +13,7 @@ from ringfence.utils.config import NonNegative, check_bounds
 Samples = Annotated[int, Meta(ge=1, le=10_000)]
 Rounds = Annotated[int, Meta(ge=0, le=10**6)]
 Fall = Annotated[float, Meta(gt=0, le=1, description="lie in (0, 1]: at 0 a barrier could never fall")]
+Late = Annotated[int, Meta(ge=0, le=100)]
 CostRate = Annotated[float, Meta(gt=0, lt=1, description="be a share of steps between 0 and 1")]
 Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions lie in [-1, 1]")]
 
@@ -37,6 +38,8 @@ class GuardOptions:
     terminal_value: bool = False  # judge the last row by the value of danger, where it is learned
     adapt: NonNegative = 0.0  # step of the margin after a cost; 0: it stays
     rate: CostRate = 0.0125  # share of steps with a cost at which an adapting margin settles
+    delay: Late = 0  # steps after which an action takes effect; the guard decides for that time
+    max_age: Late = 0  # steps that observations may be old and still be moved to the present; 0: they are taken as new
 
     def __post_init__(self):
         check_bounds(self)

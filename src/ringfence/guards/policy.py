@@ -18,6 +18,7 @@ from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.problem import constraints, normalise
+from ringfence.problem.features import translation
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
@@ -60,6 +61,12 @@ class Guarded(HadStart, eqx.Module):
             "cost": jnp.full(batch, jnp.nan),
             "age": jnp.zeros((), jnp.int32),
         }
+        if options.delay + options.max_age:
+            low, high = (jnp.asarray(bound, jnp.float32) for bound in (spec.action_low, spec.action_high))
+            nothing = normalise.to_unit(jnp.clip(0.0, low, high), spec.action_low, spec.action_high)
+            shape = (batch, options.delay + options.max_age, spec.n_agents, spec.action_dim)
+            carry["sent"] = jnp.broadcast_to(nothing, shape)  # the oldest first
+            carry["observed_age"] = jnp.zeros((batch, spec.n_agents), jnp.int32)
         if constraints > 1:
             carry["costs"] = jnp.full((batch, constraints), jnp.nan)
         return carry
@@ -82,10 +89,26 @@ class Guarded(HadStart, eqx.Module):
         nothing = jnp.full_like(carry["cost"], jnp.nan)
         return {**carry, "costs": jnp.stack([costs.get(name, nothing) for name in names], -1)}
 
+    def observe_age(self, carry: PyTree, age: Array) -> PyTree:
+        """The carry with how many steps old the next observations (B, N) are, where the guard makes good for it."""
+        if not self.guard.options.max_age:
+            return carry
+        return {**carry, "observed_age": jnp.clip(age, 0, self.guard.options.max_age)}
+
+    def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
+        """The carry with what was sent (B, N, A) in the place of what was decided last."""
+        if "sent" not in carry:
+            return carry
+        spec = self.guard.world.spec
+        unit = normalise.to_unit(action, spec.action_low, spec.action_high)
+        return {**carry, "sent": carry["sent"].at[:, -1].set(unit)}
+
     def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         key_propose, key_decide = jax.random.split(key)
-        inner, actions, info = self.proposed(carry["inner"], observations, state, key_propose)
         present = self.guard.world.map(observations, state)
+        if "sent" in carry:
+            observations, state = self._as_then(observations, state, self.when_it_acts(carry, present))
+        inner, actions, info = self.proposed(carry["inner"], observations, state, key_propose)
         carry, step = self.decided({**carry, "inner": inner}, present, actions, key_decide)
         return carry, step._replace(info=info | step.info)
 
@@ -96,7 +119,8 @@ class Guarded(HadStart, eqx.Module):
         if guard.options.adapt:
             adapted = guard.adapted(carry["margin"], self._was_unsafe(carry, present))
             margin = jnp.where(carry["age"] == 0, margin, adapted)
-        found = guard.decide(present, actions, carry["last"], margin, key)
+        acting = self.when_it_acts(carry, present) if "sent" in carry else present
+        found = guard.decide(acting, actions, carry["last"], margin, key)
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -106,6 +130,8 @@ class Guarded(HadStart, eqx.Module):
         }
         spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
+        if "sent" in carry:
+            carry = {**carry, "sent": jnp.concatenate([carry["sent"][:, 1:], found.plan[:, :1]], 1)}
         unknown_costs = {name: jnp.full_like(carry[name], jnp.nan) for name in ("cost", "costs") if name in carry}
         carry = {
             **carry,
@@ -116,6 +142,29 @@ class Guarded(HadStart, eqx.Module):
             "age": carry["age"] + 1,
         }
         return carry, PolicyStep(action, info)
+
+    def when_it_acts(self, carry: PyTree, present: Array) -> Array:
+        """(B, N, D) where the team will be when the action that is decided now takes effect: the World goes on from
+        what was observed by the actions that were sent since, and by those that are on their way. An agent that is
+        alone knows its own; the others go on as its World predicts."""
+        sent = carry["sent"]
+        due = self.guard.options.delay + carry["observed_age"]  # (B, N) the last so many
+        x = present
+        for k in range(sent.shape[1]):
+            after, _ = self.guard.world.dynamics.step(x, sent[:, k])
+            x = jnp.where((due >= sent.shape[1] - k)[..., None], after, x)
+        return x
+
+    def _as_then(self, observations: Array, state: Array | None, then: Array) -> tuple[Array, Array | None]:
+        """What the proposal is shown: where the team will be (B, N, D), as far as its view can be read from it."""
+        world = self.guard.world
+        own = getattr(self.proposal, "feature_map", None)
+        observations, state = world.map.written(observations, state, then)
+        index = None if own is None else translation(own, world.map)
+        if own is None or index is None:
+            return observations, state
+        index = jnp.broadcast_to(index, (*then.shape[:-1], index.shape[1]))
+        return own.written(observations, state, jnp.take_along_axis(then, index, -1))
 
     def _was_unsafe(self, carry: PyTree, present: Array) -> Array:
         """(B, C) bool, or (B, N, C) of agents who are alone: what the step to the present cost, or is judged by the
@@ -247,5 +296,19 @@ def build(
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
+    _refuse_far(options, world)
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
     return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value), options))
+
+
+def _refuse_far(options: GuardOptions, world: World) -> None:
+    """Refuse to roll actions forward for longer than anybody knows how well the World does."""
+    error = world.card.prediction_error
+    known = FARTHEST if error is None else len(error.error_of_change)
+    late = options.delay + options.max_age
+    if late > known:
+        names = " and ".join(f"{n}={getattr(options, n)}" for n in ("delay", "max_age") if getattr(options, n))
+        raise UserError(
+            f"{names} ask the World for {late} steps before the guard decides, but its predictions are known for "
+            f"{known}; give less."
+        )

@@ -95,6 +95,16 @@ class FeatureMap:
             return entries
         return entries - state[..., np.maximum(self.minus, 0)] * taken
 
+    def written(self, observations: Array, state: Array | None, features: Array) -> tuple[Array, Array | None]:
+        """The source with entries that the view holds as they are taken from features (..., N, D); differences of two
+        entries follow from these."""
+        if self.source == "observations":
+            rows = np.arange(self.plus.shape[0])[:, None]
+            return observations.at[..., rows, self.plus].set(features), state
+        assert state is not None, "a map of the state is given one"
+        plain = self.minus < 0
+        return observations, state.at[..., self.plus[plain]].set(features[..., plain])
+
     def agreed(self, plan: Array, history: int = 0) -> Array:
         """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
         if self.reconcile is None:

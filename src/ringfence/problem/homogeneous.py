@@ -45,6 +45,14 @@ class PerAgent(HadStart, eqx.Module):
             return self.one.observe_cost(carry, {name: own(part) for name, part in cost.items()})
         return self.one.observe_cost(carry, own(cost))
 
+    def observe_age(self, carry: PyTree, age: Array) -> PyTree:
+        """Ages (B, N) of observations, to each agent its own."""
+        return self.one.observe_age(carry, age.reshape(-1, 1)) if hasattr(self.one, "observe_age") else carry
+
+    def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
+        """What was sent (B, N, A), to each agent its own."""
+        return self.one.observe_sent(carry, split_agents(action)) if hasattr(self.one, "observe_sent") else carry
+
 
 def team_policy(policy: Any, agents: int, homogeneous: bool) -> Any:
     """A policy as a team of `agents` plays it: that of one agent by each of them, where they are homogeneous."""

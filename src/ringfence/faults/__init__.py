@@ -1,0 +1,8 @@
+"""What goes wrong between a policy and what it acts on: actions that come late, observations that are lost or noisy."""
+
+from __future__ import annotations
+
+from ringfence.faults.faults import Faults
+from ringfence.faults.policy import Faulty, under_faults
+
+__all__ = ["Faults", "Faulty", "under_faults"]

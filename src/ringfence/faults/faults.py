@@ -1,0 +1,44 @@
+"""Faults of a closed loop as one value."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+from msgspec import Meta
+
+from ringfence.utils.config import NonNegative, Positive, build_config, check_bounds
+
+Delay = Annotated[int, Meta(ge=0, le=1000)]
+Chance = Annotated[float, Meta(ge=0, lt=1, description="lie in [0, 1): at 1 nothing would ever arrive")]
+
+
+@dataclass(frozen=True)
+class Faults:
+    """What goes wrong, at every step and for every agent by itself. Without any, nothing does."""
+
+    delay: Delay = 0  # steps after which an action takes effect; none has been sent before an episode begins
+    drop: Chance = 0.0  # probability that what an agent observes is lost; what it got last is held
+    noise: NonNegative = 0.0  # standard deviation of what is observed, in the entries' own units
+    gain: Positive = 1.0  # what becomes of an action, which is clipped to its bounds
+    asynchrony: Chance = 0.0  # share of steps that an agent lets pass, each in its own rhythm: 0.5 every second one
+
+    def __post_init__(self):
+        check_bounds(self)
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any]) -> Faults:
+        """From names and values; unknown names and values of another type are refused."""
+        return build_config(cls, given, "the faults")
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """Those that there are."""
+        return {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if getattr(self, f.name) != f.default}
+
+    @property
+    def name(self) -> str:
+        """All of them in one word, e.g. `delay2+drop0.3`; `none` without any."""
+        return "+".join(f"{name}{value}" for name, value in self.given.items()) or "none"

@@ -1,0 +1,223 @@
+"""Faults of a closed loop, and guards that know them."""
+
+import dataclasses
+import json
+from types import SimpleNamespace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import ringfence
+from ringfence.cli.app import main
+from ringfence.deploy import zoo
+from ringfence.envs import Crossing
+from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.errors import UserError
+from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.rollout import rollout
+from ringfence.faults import Faults, Faulty, under_faults
+from ringfence.guards.policy import build
+from ringfence.loading.resolve import load
+from ringfence.types import PolicyStep
+
+
+class Counts(eqx.Module):
+    """Sends the number of the step, and keeps what it sees; knows how old that is."""
+
+    def initial_state(self, batch):
+        return {"step": jnp.zeros(()), "age": jnp.zeros((batch, 2), jnp.int32), "sent": jnp.zeros((batch, 2, 2))}
+
+    def observe_age(self, carry, age):
+        return {**carry, "age": age}
+
+    def observe_sent(self, carry, action):
+        return {**carry, "sent": action}
+
+    def act(self, carry, observations, state, key):
+        action = jnp.full((*observations.shape[:2], 2), 0.01 * (carry["step"] + 1))
+        info = {"seen": jnp.asarray(observations), "age": carry["age"]}
+        return {**carry, "step": carry["step"] + 1}, PolicyStep(action, info)
+
+
+def task(steps=12):
+    env = Crossing(n_agents=2, episode_length=steps)
+    return SimpleNamespace(simulator=env, env=env, action_low=-1.0, action_high=1.0)
+
+
+def walk(faults, steps=12):
+    """Actions (T, N) that are done, what is seen and how old it is, what the policy is told was sent; observations of
+    step t are t."""
+    policy = under_faults(Counts(), Faults(**faults), task())
+    carry, found = policy.initial_state(1), []
+    for t in range(steps):
+        observations = jnp.full((1, 2, task().simulator.observation_dim), float(t))
+        carry, step = policy.act(carry, observations, None, jax.random.key(t))
+        found.append((step.action[0, :, 0], step.info["seen"][0], step.info["age"][0], carry["inner"]["sent"][0, :, 0]))
+    return [np.asarray(x) for x in zip(*found)]
+
+
+def test_a_late_action_is_done_so_many_steps_later_and_none_before():
+    done, _, _, sent = walk({"delay": 3})
+    np.testing.assert_allclose(done[:3], 0.0)
+    np.testing.assert_allclose(done[3:], sent[:-3])
+    np.testing.assert_allclose(sent[:, 0], 0.01 * np.arange(1, 13), rtol=1e-5)
+
+
+def test_a_lost_observation_is_the_last_one_again_and_its_age_is_told():
+    _, seen, age, _ = walk({"drop": 0.6}, 40)
+    assert (age[0] == 0).all() and age.max() > 1 and (age[:, 0] != age[:, 1]).any()
+    np.testing.assert_allclose(seen[..., 0], np.arange(40)[:, None] - age)
+    assert 0.45 < (age[1:] > 0).mean() < 0.75
+
+
+def test_noise_gain_and_turns():
+    _, seen, _, _ = walk({"noise": 0.1}, 40)
+    off = seen - np.arange(40)[:, None, None]
+    names = task().simulator.observation_names
+    flags = np.array([name.endswith(".seen") for name in names])
+    assert 0.08 < off[..., ~flags].std() < 0.12
+    np.testing.assert_array_equal(off[..., flags], 0.0)
+    done, _, _, sent = walk({"gain": 0.5})
+    np.testing.assert_allclose(done, 0.5 * sent, rtol=1e-5)
+    done, _, _, _ = walk({"asynchrony": 0.5})
+    changes = np.diff(done, axis=0) > 0
+    assert (changes.sum(1) == 1).all(), "one of two agents acts at a time, in turn"
+    np.testing.assert_array_equal(changes[::2], changes[:1].repeat(len(changes[::2]), 0))
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"delay": -1}, "delay=-1 of the faults must be between 0 and 1000"),
+        ({"drop": 1.0}, "nothing would ever arrive"),
+        ({"noise": float("nan")}, "noise=nan of the faults must"),
+        ({"noise": -0.1}, "noise=-0.1"),
+        ({"gain": 0.0}, "gain=0.0 of the faults must be positive"),
+        ({"asynchrony": float("inf")}, "asynchrony=inf"),
+        ({"delay": 1.5}, "must be a whole number"),
+        ({"latency": 1}, "Unknown config field of the faults 'latency'"),
+    ],
+)
+def test_what_is_no_fault_is_refused(given, words):
+    with pytest.raises(UserError, match=words.replace("(", r"\(")):
+        Faults.of(given)
+
+
+def test_an_episode_in_which_nothing_would_be_done_is_refused():
+    with pytest.raises(UserError, match="delay=12 steps is no less than an episode of 12"):
+        under_faults(Counts(), Faults(delay=12), task())
+
+
+def test_simulators_outside_jax_have_faults_too():
+    """Robots, by a policy that is no pytree and sees NumPy."""
+    env = dataclasses.replace(SafeMuJoCo("2x3"), episode_length=6)
+    robot = SimpleNamespace(simulator=env, env=env, action_low=-1.0, action_high=1.0)
+
+    class Foreign:
+        def __init__(self, push):
+            self.push = push
+
+        def initial_state(self, batch):
+            return None
+
+        def act(self, carry, observations, state, key):
+            assert isinstance(observations, np.ndarray) and isinstance(state, np.ndarray)
+            return carry, PolicyStep(np.full((len(observations), 2, 3), self.push, np.float32), {})
+
+    faults = Faults(delay=3, drop=0.5, noise=0.01)
+    late = rollout(under_faults(Foreign(1.0), faults, robot), env, 2)["states"]
+    idle = rollout(Foreign(0.0), env, 2)["states"]
+    np.testing.assert_allclose(late[:, :4], idle[:, :4], atol=1e-6)
+    assert np.abs(late[:, 4] - idle[:, 4]).max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return zoo.pretrained("crossing-hasty/bc", tmp_path_factory.mktemp("runs"))
+
+
+def test_without_faults_all_is_as_evaluated(run):
+    plain = evaluate(run, episodes=4)
+    there = ringfence.stress(run, episodes=4)
+    assert there["per_episode"] == plain["per_episode"] and there["faults"] == dataclasses.asdict(Faults())
+    job, policy = load(run)
+    env = job.task.simulator
+    behind = Faulty(policy, jnp.array(-1.0), jnp.array(1.0), Faults(), (8, env.observation_dim, 64, 2), ((), ()))
+    played = [rollout(one, env, 4)["states"] for one in (policy, behind)]
+    np.testing.assert_array_equal(*played)
+
+
+def test_a_guard_decides_for_the_time_when_its_action_takes_effect(run):
+    """What was observed is moved on by the actions sent since, as many as are due."""
+    policy = load(run, guard="shield", delay=2, max_age=3)[1].one
+    world = policy.guard.world
+    key_present, key_sent = jax.random.split(jax.random.key(0))
+    env = Crossing()
+    present = env.observe(env.reset(key_present, 1))[0][:, None]
+    carry = policy.initial_state(8)
+    sent = jax.random.uniform(key_sent, carry["sent"].shape, minval=-1.0, maxval=1.0)
+    age = jnp.arange(8)[:, None]  # beyond 3: as if 3
+    carry = policy.observe_age({**carry, "sent": sent}, age)
+    then = policy.when_it_acts(carry, present)
+    for i, due in enumerate([2, 3, 4, 5, 5, 5, 5, 5]):
+        x = present[i]
+        for k in range(5 - due, 5):
+            x, _ = world.dynamics.step(x, sent[i, k])
+        np.testing.assert_allclose(then[i], x, atol=1e-6)
+    at = {name: d for d, name in enumerate(world.map.names)}
+    moved = np.abs(then - present)[..., at["own.vx"]]
+    assert moved.max() > 0.05
+
+
+def test_what_proposes_is_shown_that_state_and_what_was_sent_is_remembered(run):
+    class Shows(eqx.Module):
+        def initial_state(self, batch):
+            return {}
+
+        def act(self, carry, observations, state, key):
+            return {"shown": observations}, PolicyStep(jnp.zeros((*observations.shape[:2], 2)), {})
+
+    world = load(run, guard="shield")[1].one.guard.world
+    late = build(Shows(), world, None, "shield", "learned", delay=1, correction_steps=1, horizon=1)
+    env = Crossing()
+    observations = env.observe(env.reset(jax.random.key(0), 1))[0][:, None]
+    carry = late.initial_state(8)
+    carry, step = late.act(carry, observations, None, jax.random.key(1))
+    np.testing.assert_allclose(
+        carry["inner"]["shown"], late.when_it_acts(late.initial_state(8), observations), atol=1e-6
+    )
+    np.testing.assert_allclose(carry["sent"][:, -1], step.action, atol=1e-6)
+    other = jnp.full((8, 1, 2), 0.5)
+    np.testing.assert_allclose(late.observe_sent(carry, other)["sent"][:, -1], other)
+    usual = build(Shows(), world, None, "shield", "learned", correction_steps=1, horizon=1)
+    assert "sent" not in usual.initial_state(8)
+    assert usual.observe_sent({}, other) == usual.observe_age({}, jnp.zeros((8, 1))) == {}
+
+
+def test_more_lateness_than_the_world_can_foresee_is_refused(run):
+    with pytest.raises(UserError, match="delay=6 and max_age=3 ask the World for 9 steps .* known for 8"):
+        load(run, guard="shield", delay=6, max_age=3)
+
+
+def test_the_command_line_stresses(run, capsys):
+    main(["stress", str(run.path), "--episodes", "2", "--delay", "2", "--async", "0.5", "--gain", "0.8"])
+    shown = capsys.readouterr().out
+    assert all(words in shown for words in ("delay 2", "gain 0.8", "asynchrony 0.5"))
+    (name,) = [name for name in json.loads((run.path / "stress.json").read_text()) if "gain" in name]
+    assert name == "default behind delay2+gain0.8+asynchrony0.5"
+    for wrong, words in (
+        (["--compensate"], "compensate is read by nothing without a guard"),
+        (["--delay", "100"], "delay=100 steps is no less than an episode"),
+        (["--drop", "2"], "at 1 nothing would ever arrive"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["stress", str(run.path), "--episodes", "2", *wrong])
+        assert words in " ".join(capsys.readouterr().err.split())
+
+
+def test_compensating_and_saying_so_oneself_are_one_too_many(run):
+    with pytest.raises(UserError, match="compensate and delay both tell the guard"):
+        ringfence.stress(run, {"delay": 1}, guard="shield", delay=1, compensate=True)
