@@ -333,7 +333,8 @@ def stress(
         "compensate": compensate,
         "quiet": False,
     }
-    table = Table("run", Column("faults", no_wrap=True), "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    names = ("guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    table = Table("run", Column("faults", no_wrap=True), *names)
     refusals = Refusals()
     shown = "\n".join(f"{name} {value}" for name, value in faults.given.items()) or "none"
     for run in found:
