@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from xml.etree import ElementTree
 
 import numpy as np
@@ -13,6 +14,7 @@ from ringfence.errors import UserError
 from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.constraints import Separation
 from tests.test_tables import NAMES, entry, fleet
 
 JOINTS = ["waist", "elbow", "gripper"]
@@ -334,3 +336,114 @@ def test_angles_in_degrees_are_asked_for_by_name():
         EpisodeStore.from_table(table, **options)
     renamed = NAMES | {"state": ["x", "y", "heading_deg"], "rename": {"heading": "heading_deg"}}
     assert "own.cos_heading_deg" in EpisodeStore.from_table(table, **renamed).card.observation_names
+
+
+# --- what is doubtful ---
+def track(rows: int = 400, dims: int = 2, seed: int = 3) -> dict[str, np.ndarray]:
+    """Two agents who move smoothly."""
+    rng = np.random.default_rng(seed)
+    time = np.tile(0.1 * np.arange(rows), 2)
+    table = {"t": time, "id": np.repeat([0, 1], rows)}
+    for axis in "xyz"[:dims]:
+        table[axis] = np.concatenate([np.sin(0.1 * np.arange(rows) + rng.uniform(0, 6)) for _ in range(2)])
+    return table
+
+
+def test_accelerations_are_bounded_by_what_is_usual():
+    table = track(2000)
+    jumpy = dict(table, x=table["x"].copy())
+    jumpy["x"][500] += 0.5
+    usual = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"])
+    store = EpisodeStore.from_table(jumpy, time="t", agent="id", state=["x", "y"])
+    largest = float(np.abs(usual.actions).max())
+    assert usual.card.action_high == pytest.approx(largest, rel=1e-5)
+    assert store.card.action_high == pytest.approx(largest, rel=0.05) == np.abs(store.actions).max()
+    notes = [note for note in store.card.warnings if "outliers" in note]
+    assert len(notes) == 1 and re.match("[345] accelerations of up to 100.* are outliers", notes[0])
+    assert not any("outliers" in note for note in usual.card.warnings)
+
+
+@pytest.mark.parametrize("where", [0, 37, 400, 799])
+def test_rows_that_jump_are_counted_and_dropped(where):
+    table = track()
+    table["x"][where] += 30.0
+    options = dict(time="t", agent="id", state=["x", "y"], gap=1.0)
+    with pytest.raises(UserError, match=r"more than max_speed=100, as [01] others did; .* give --max-speed"):
+        EpisodeStore.from_table(table, **options)
+    store = EpisodeStore.from_table(table, **options, max_speed=20.0)
+    assert np.abs(entry(store, "own.x")).max() < 1.1 and store.steps >= 398
+    assert any(note == "1 rows that moved faster than 20 m/s are dropped" for note in store.card.warnings)
+
+
+def test_jumps_below_what_is_refused_are_noted():
+    table = track()
+    table["x"][37] += 3.0
+    notes = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"]).card.warnings
+    said = next(note for note in notes if "row 37 and 1 others moved more than ten times as fast" in note)
+    limit = float(re.search("--max-speed ([0-9.]+) drops such rows", said)[1])
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], max_speed=limit)
+    assert not any("moved more than" in note for note in store.card.warnings)
+
+
+def test_one_dimension_is_one_dimension():
+    table = track(dims=1)
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x"], danger=Separation(0.2))
+    distance = np.abs(np.diff(entry(store, "own.x"), axis=1))[:, 0]
+    np.testing.assert_array_equal(store.costs > 0, distance[1:] < 0.2)
+    assert "other0.dx" in store.card.observation_names
+    assert not any("nobody sees where others are" in note for note in store.card.warnings)
+    near = EpisodeStore.from_table(table, time="t", agent="id", state=["x"], neighbours=1)
+    assert "other0.dx" in near.card.observation_names
+
+
+def test_separate_recordings_are_no_team():
+    table = track() | {"run": np.repeat(["a", "b"], 400)}
+    store = EpisodeStore.from_table(table, time="t", agent="id", episode="run", state=["x", "y"])
+    assert store.n_agents == 1 and any(
+        "recordings that are separate are no team" in note for note in store.card.warnings
+    )
+
+
+# --- parts ---
+def test_a_table_is_split_by_its_time(tmp_path):
+    import pandas as pd
+
+    pd.DataFrame(track(300)).to_csv(tmp_path / "fleet.csv", index=False)
+    command = ["data", "import-table", str(tmp_path / "fleet.csv"), "--out", str(tmp_path / "fleet.h5"), "--time", "t"]
+    app.main([*command, "--agent", "id", "--state", "x", "y", "--split", "0.7", "--separation", "0.1"])
+    learned, judged = (EpisodeStore.load(tmp_path / name) for name in ("fleet.h5", "fleet-rest.h5"))
+    assert (learned.steps, judged.steps) == (209, 89)  # 210 and 90 rows of each agent
+    np.testing.assert_allclose(entry(learned, "own.x")[:, 0], track(300)["x"][:210], atol=1e-5)
+    np.testing.assert_allclose(entry(judged, "own.x")[:, 0], track(300)["x"][210:300], atol=1e-5)
+    assert learned.card.action_high == judged.card.action_high and learned.card.dt == judged.card.dt
+
+
+def test_recordings_with_times_of_their_own_stay_whole():
+    table = fleet(episodes=5)
+    table["t"] = table["t"] - 100.0 * table["run"]
+    learned, judged = EpisodeStore.split_table(table, 0.6, **NAMES)
+    assert (learned.episodes, judged.episodes) == (3, 2)
+    whole = EpisodeStore.from_table(table, **NAMES)
+    np.testing.assert_array_equal(np.concatenate([learned.actions, judged.actions]), whole.actions)
+    learned, judged = EpisodeStore.split_table(table, 0.6, **NAMES, neighbours=1)
+    assert (learned.episodes, judged.episodes) == (9, 6)
+
+
+@pytest.mark.parametrize(
+    ("share", "changed", "said"),
+    [
+        (1.5, {}, "split=1.5 must be a number between 0 and 1"),
+        (float("nan"), {}, "must be a number between 0 and 1"),
+        (0.01, {"run": None}, "leaves 0 episodes in front of the cut"),
+        (0.1, {}, "leaves one part without rows"),
+    ],
+)
+def test_splits_that_leave_nothing_are_refused(share, changed, said):
+    table = fleet(episodes=2)
+    table["t"] = table["t"] - 100.0 * table["run"]
+    options = NAMES
+    if "run" in changed:
+        table = track()
+        options = dict(time="t", agent="id", state=["x", "y"])
+    with pytest.raises(UserError, match=said):
+        EpisodeStore.split_table(table, share, **options)

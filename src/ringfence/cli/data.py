@@ -41,8 +41,8 @@ class Episodes:
     """steps of an episode, at least."""
     max_episode_steps: int | None = None
     """steps of an episode, at most; longer ones are cut."""
-    max_speed: float = 100.0
-    """m/s that nothing there can do."""
+    max_speed: float | None = None
+    """m/s that nothing there can do: rows that jump faster are dropped. Without it, 100 m/s are refused."""
 
     def options(self) -> dict[str, Any]:
         """Fields of a `TableSchema`."""
@@ -95,6 +95,7 @@ def import_table(
     rename: list[str] = [],  # noqa: B006
     wide: str | None = None,
     layout: Literal["highd", "interaction", "sumo", "obsmat"] | None = None,
+    split: float | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
     task: str | None = None,
 ) -> None:
@@ -115,12 +116,14 @@ def import_table(
         rename: what columns are called in the file and here, e.g. position_x=x position_y=y.
         wide: how a file with columns for every agent calls them, e.g. {agent}_{column} of leader_x and follower_x.
         layout: names of columns of a published format, instead of the options above.
+        split: share of the time to learn by, e.g. 0.7; the rest is written beside it, as fleet-rest.h5, to judge by.
         episodes: how rows become episodes.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.store import EpisodeStore
 
     kept = writable(out_file)
+    rest = None if split is None else writable(kept.with_name(f"{kept.stem}-rest{kept.suffix}"))
     options = {
         **episodes.options(),
         "cost": cost,
@@ -129,10 +132,16 @@ def import_table(
     if layout is not None:
         if state or action or reward or goal or episode or rename or wide:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
-        return imported(EpisodeStore.from_layout(file, layout, **options), kept)
-    options |= {"time": time, "agent": agent, "episode": episode, "state": state}
-    options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
-    imported(EpisodeStore.from_table(file, **options), kept)
+        options["layout"] = layout
+    else:
+        options |= {"time": time, "agent": agent, "episode": episode, "state": state}
+        options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
+    if split is not None and rest is not None:
+        learned, judged = EpisodeStore.split_table(file, split, **options)
+        imported(learned, kept)
+        return imported(judged, rest)
+    made = EpisodeStore.from_table if layout is None else EpisodeStore.from_layout
+    imported(made(file, **options), kept)
 
 
 def _pairs(rename: list[str]) -> dict[str, str]:

@@ -30,7 +30,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Table
-from ringfence.logs.io.table import read_layout, read_table
+from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
 from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, validate
 from ringfence.problem import constraints
@@ -364,10 +364,43 @@ class EpisodeStore:
         return cls.from_steps(**read_table(table, schema, notes=notes, card=card))
 
     @classmethod
-    def from_layout(cls, table: Table, layout: str, **options: Any) -> EpisodeStore:
-        """A table in a published format, `highd` or `interaction`; options as of `from_table`."""
-        options = renamed(options, OLD_OPTIONS, "from_layout")
-        return cls.from_steps(**read_layout(table, layout, **options))
+    def from_layout(
+        cls,
+        table: Table,
+        layout: str,
+        *,
+        notes: Sequence[str] = (),
+        card: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> EpisodeStore:
+        """A table in a published format (`highd`, `interaction`, `sumo`, `obsmat`); options as of `from_table`."""
+        columns, schema = read_layout(table, layout, renamed(options, OLD_OPTIONS, "from_layout"))
+        return cls.from_table(columns, schema, notes=notes, card=card)
+
+    @classmethod
+    def split_table(
+        cls,
+        table: Table,
+        share: float,
+        *,
+        layout: str | None = None,
+        notes: Sequence[str] = (),
+        card: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> tuple[EpisodeStore, EpisodeStore]:
+        """Two stores of one table, to learn by and to judge by: the first `share` of its time, and the rest. They have
+        the same entries, bounds and steps, and no episode is in both. Options as of `from_table` or `from_layout`."""
+        options = renamed(options, OLD_OPTIONS, "split_table")
+        table, schema = (table, TableSchema.of(options)) if layout is None else read_layout(table, layout, options)
+        steps, early = read_parts(table, schema, share, notes=notes, card=card)
+        whole = cls.from_steps(**steps)
+        if not 0 < early < whole.episodes:
+            raise StoreError(
+                f"split={share:g} leaves {early} episodes in front of the cut and {whole.episodes - early} behind it; "
+                "give another share, or a smaller min_episode_steps."
+            )
+        first = np.arange(whole.episodes) < early
+        return whole.select(first), whole.select(~first)
 
     # --- disk ---
     def save(self, path: str | os.PathLike) -> Path:

@@ -162,6 +162,11 @@ def _left_out(motion: Motion, rows: np.ndarray) -> tuple[str, ...]:
     """What is in no episode, in sentences."""
     tracks = motion.tracks
     notes = []
+    if rows.shape[1] == 1 and len(np.unique(tracks.agent)) > 1:
+        notes.append(
+            "no two agents are there at one time for long enough: episodes are of one agent alone, since recordings "
+            "that are separate are no team"
+        )
     share = 1 - len(np.unique(rows)) / len(tracks.step)
     if share > 0.001:
         notes.append(

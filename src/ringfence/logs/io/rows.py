@@ -16,6 +16,8 @@ COARSE = 0.01  # of what a column changes by in a row: the distance of neighbour
 GAP = 5.0  # steps without a row that end an episode
 LONG = 5.0  # s, a step that hardly any controller has
 FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
+MANY_MOVED = 0.05  # of the rows, that are not dropped for having jumped: the unit is another
+MAX_SPEED = 100.0  # m/s that nothing there can do, unless somebody says what it can
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,10 @@ class Values:
     columns: Columns  # (M,) each of state, action and goal
     reward: np.ndarray  # (M,)
     cost: np.ndarray  # (M, K)
+
+    def chosen(self, kept: np.ndarray) -> Values:
+        columns = {name: column[kept] for name, column in self.columns.items()}
+        return Values(columns, self.reward[kept], self.cost[kept])
 
     def stacked(self, names: tuple[str, ...]) -> np.ndarray:
         """(M, columns)"""
@@ -120,15 +126,50 @@ def refuse_jumps(rows: Rows, values: Values, schema: TableSchema) -> None:
     """Refuse rows that nothing can lie apart by."""
     if not schema.position:
         return
+    limit = schema.max_speed or MAX_SPEED
     speed = _speeds(rows, values, schema)
-    beyond = speed > schema.max_speed
+    beyond = speed > limit
     if beyond.any():
         k = int(np.flatnonzero(beyond)[np.argmin(rows.order[1:][beyond])])
         raise StoreError(
             f"row {int(rows.order[k + 1])}: {', '.join(schema.position)} moved at {speed[k]:.4g} m/s since row "
-            f"{int(rows.order[k])} of the same agent, more than max_speed={schema.max_speed:g}; check the units of "
-            "positions (m) and times (s), or drop the row."
+            f"{int(rows.order[k])} of the same agent, more than max_speed={limit:g}, as {int(beyond.sum()) - 1} others "
+            "did; check the units of positions (m) and times (s), or give --max-speed what is possible there, which "
+            f"drops rows that jump, up to {100 * MANY_MOVED:g} % of them."
         )
+
+
+def without_jumps(rows: Rows, values: Values, schema: TableSchema) -> tuple[Rows, Values, list[str]]:
+    """The rows that nobody reached faster than the schema's `max_speed`, and how many are dropped; all of them where it
+    says no speed, or where so many jumped that the unit must be another."""
+    if schema.max_speed is None or not schema.position:
+        return rows, values, []
+    kept = np.arange(len(rows.time))
+    while len(kept) > (1 - MANY_MOVED) * len(rows.time):
+        some = _chosen(rows, kept)
+        beyond = _speeds(some, values.chosen(kept), schema) > schema.max_speed
+        if not beyond.any():
+            dropped = len(rows.time) - len(kept)
+            said = [f"{dropped} rows that moved faster than {schema.max_speed:g} m/s are dropped"] if dropped else []
+            return some, values.chosen(kept), said
+        kept = np.delete(kept, _that_jumped(some, beyond))
+    return rows, values, []
+
+
+def _that_jumped(rows: Rows, beyond: np.ndarray) -> np.ndarray:
+    """Rows to drop where `beyond` (M-1,) says what moved too fast since the row before: the later row of the first of
+    several such moves, or an agent's first row where it is the one that lies apart."""
+    before = np.append(False, beyond[:-1])
+    after = np.append(beyond[1:], False)
+    begins = np.append(True, ~rows.follows)[:-1]
+    goes_on = np.append(rows.follows[1:], False)
+    first_is_apart = beyond & begins & goes_on & ~after
+    later = beyond & ~first_is_apart & (~before | begins)
+    return np.concatenate([np.flatnonzero(first_is_apart), np.flatnonzero(later) + 1])
+
+
+def _chosen(rows: Rows, kept: np.ndarray) -> Rows:
+    return Rows(rows.order[kept], rows.recording[kept], rows.agent[kept], rows.time[kept], rows.agents)
 
 
 def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Iterator[str]:
@@ -143,8 +184,8 @@ def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Ite
         yield from _off_the_clock(rows, clock)
     if schema.action:
         yield from _large_actions(values, schema)
-    if len(schema.position) < 2:
-        yield "state holds no x and y, so nobody sees where others are relative to oneself"
+    if not schema.position:
+        yield "state holds no x, y or z, so nobody sees where others are relative to oneself"
 
 
 def _moved(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
@@ -190,15 +231,18 @@ def _doubtful_velocities(rows: Rows, values: Values, schema: TableSchema) -> Ite
 
 
 def _jumps(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
-    if not schema.velocity:
-        return
     speed = _speeds(rows, values, schema)
-    largest = max(float(np.linalg.norm(values.stacked(schema.velocity), axis=1).max()), 1e-9)
-    jumps = np.flatnonzero(speed > 5 * largest)
+    if schema.velocity:
+        limit = 5 * max(float(np.linalg.norm(values.stacked(schema.velocity), axis=1).max()), 1e-9)
+        what = "five times as fast as any velocity says"
+    else:
+        limit = 10 * max(float(np.quantile(speed[rows.follows], 0.99)), 1e-9)
+        what = "ten times as fast as 99 % of the rows"
+    jumps = np.flatnonzero(speed > limit)
     if jumps.size and jumps.size < FEW_MOVED * len(speed):
         yield (
-            f"row {int(rows.order[jumps[0] + 1])} and {jumps.size - 1} others moved more than five times as fast as "
-            "any velocity says: positions jump there, or no column tells recordings apart"
+            f"row {int(rows.order[jumps[0] + 1])} and {jumps.size - 1} others moved more than {what}: positions jump "
+            f"there, or no column tells recordings apart; --max-speed {limit:.3g} drops such rows"
         )
 
 

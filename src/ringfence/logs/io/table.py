@@ -19,11 +19,25 @@ from ringfence.logs.io.columns import Columns, Table, numbers, read_columns, sec
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.lists import expanded
-from ringfence.logs.io.rows import Clock, Rows, Values, clock_of, doubts, refuse_jumps, sorted_rows, values_of
+from ringfence.logs.io.parts import parted
+from ringfence.logs.io.rows import (
+    Clock,
+    Rows,
+    Values,
+    clock_of,
+    doubts,
+    refuse_jumps,
+    sorted_rows,
+    values_of,
+    without_jumps,
+)
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, resample
 from ringfence.logs.io.wide import read_wide
 from ringfence.problem.constraints import CostColumn
+
+USUAL = 0.999  # of accelerations, that are no outliers
+STANDS_OUT = 2.0  # times that, above which the largest are outliers
 
 
 @dataclass(frozen=True)
@@ -64,27 +78,51 @@ def read_table(
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
     names the first row that cannot be (counted from 0, without a header).
     """
+    return _read(table, schema, notes, card)[0]
+
+
+def read_parts(
+    table: Table,
+    schema: TableSchema,
+    share: float,
+    *,
+    notes: Sequence[str] = (),
+    card: Mapping[str, Any] | None = None,
+) -> tuple[dict[str, Any], int]:
+    """The same, and how many of the episodes are of the first `share` of the time: these come first, and none is of
+    both parts."""
+    return _read(table, schema, notes, card, share)
+
+
+def _read(
+    table: Table,
+    schema: TableSchema,
+    notes: Sequence[str],
+    card: Mapping[str, Any] | None,
+    share: float | None = None,
+) -> tuple[dict[str, Any], int]:
+    """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
     columns, schema = _columns_of(table, schema)
     columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
     values = values_of(columns, rows, schema)
+    rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
     clock = clock_of(rows, schema)
+    doubtful = list(doubts(rows, values, clock, schema))
+    recordings = int(rows.recording.max()) + 1
+    if share is not None:
+        rows, values = parted(rows, values, share)
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
-    warnings = [*notes, *angles, *doubts(rows, values, clock, schema), *_made_of(schema), *episodes.notes]
-    return _steps(motion, episodes, warnings, card or {})
+    early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
+    warnings = [*notes, *angles, *dropped, *doubtful, *_made_of(schema), *episodes.notes]
+    return _steps(motion, episodes, warnings, card or {}), int(early.sum())
 
 
-def read_layout(
-    table: Table,
-    layout: str,
-    *,
-    notes: Sequence[str] = (),
-    card: Mapping[str, Any] | None = None,
-    **options: Any,
-) -> dict[str, Any]:
-    """The same of a table in a published format (`LAYOUTS`); options are those of a `TableSchema` beside columns."""
+def read_layout(table: Table, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
+    """A table in a published format (`LAYOUTS`) as one that `read_table` takes, and its schema; options are those of a
+    `TableSchema` beside columns."""
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
     known = LAYOUTS[layout]
@@ -101,7 +139,7 @@ def read_layout(
     columns["time"] = seconds(read, theirs["time"]) * known.time_unit
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
-    return read_table(columns, schema, notes=notes, card=card)
+    return columns, schema
 
 
 def _columns_of(table: Table, schema: TableSchema) -> tuple[Columns, TableSchema]:
@@ -155,7 +193,16 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
             warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
         costs = costs[:, 0]
     actions = _actions(motion, episodes)[episodes.leaves]
-    bound = _largest(actions, of_each=bool(schema.action))
+    bound = _largest(actions) if schema.action else _usual(actions)
+    outliers = int((np.abs(actions) > bound).any(-1).sum())
+    if outliers:
+        largest = float(np.abs(actions).max())
+        actions = np.clip(actions, -bound, bound)
+        warnings = [
+            *warnings,
+            f"{outliers} accelerations of up to {largest:.4g} m/s² are outliers and cut to {bound.max():.4g}, which "
+            f"{100 * USUAL:g} % are within",
+        ]
     facts = {
         "task": "table",
         "observation_names": episodes.names,
@@ -179,12 +226,21 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
     }
 
 
-def _largest(actions: np.ndarray, of_each: bool) -> np.ndarray:
-    """The largest size of actions (T, N, A), 1 where there is none; `of_each` entry by itself, since commands are of
+def _largest(actions: np.ndarray) -> np.ndarray:
+    """(A,) the largest size of commands (T, N, A), 1 where there is none. Each entry has its own, since commands are of
     several kinds: a speed is bounded by speeds and not by how fast something turned."""
     largest = np.abs(actions).max((0, 1), initial=0.0)
-    largest = largest if of_each else largest.max(keepdims=True)
     return np.where(largest > 0, largest, 1.0)
+
+
+def _usual(actions: np.ndarray) -> np.ndarray:
+    """(1,) a bound of accelerations (T, N, A), the same for all axes: the largest, unless it stands out. Differences of
+    velocities that jitter or jump are far above what anything there can do."""
+    sizes = np.abs(actions).reshape(-1, actions.shape[-1])
+    largest = float(sizes.max(initial=0.0))
+    usual = float(np.quantile(sizes, USUAL, axis=0, method="higher").max()) if len(sizes) else 0.0
+    bound = usual if 0 < usual < largest / STANDS_OUT else largest
+    return np.array([bound if bound > 0 else 1.0])
 
 
 def _of_team(costs: np.ndarray, homogeneous: bool) -> bool:

@@ -37,8 +37,8 @@ class TableSchema:
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
     `team` of them is there (by default of the size with most rows). With `neighbours`=k it is the whole track of one
     agent, who sees the k nearest others within `sensing_radius` m; such agents are homogeneous, and a policy plays any
-    number of them. Episodes have `min_episode_steps` to `max_episode_steps` steps. `max_speed` m/s is more than
-    anything there can do.
+    number of them. Episodes have `min_episode_steps` to `max_episode_steps` steps. What moved faster than 100 m/s
+    is refused; with `max_speed` m/s, rows that jumped faster than that are dropped, if they are few.
 
     `rename` has our names by the table's, for all that is named above. A table with columns for every agent says by
     `wide` how these are called: "{agent}_{column}" reads leader_x as x of `leader`, and `agent` is a name of our own.
@@ -59,7 +59,7 @@ class TableSchema:
     sensing_radius: float | None = None
     min_episode_steps: int = 5
     max_episode_steps: int | None = None
-    max_speed: float = 100.0
+    max_speed: float | None = None
     danger: Hazard | None = None
     rename: Mapping[str, str] = field(default_factory=dict)
     wide: str | None = None
@@ -168,8 +168,8 @@ def _goal(schema: TableSchema) -> None:
 
 
 def _position(schema: TableSchema) -> None:
-    if (schema.homogeneous or schema.danger is not None) and len(schema.position) < 2:
-        raise UserError("state holds no x and y, which neighbours and distances follow from; rename these columns.")
+    if (schema.homogeneous or schema.danger is not None) and not schema.position:
+        raise UserError("state holds no x, y or z, which neighbours and distances follow from; rename these columns.")
 
 
 def _danger(schema: TableSchema) -> None:
