@@ -131,8 +131,7 @@ def test_proposals_are_of_several_drivers(run, two_drivers):
     world = worlds.fit(two_drivers, **QUICK_WORLD)
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
     seen = jnp.zeros((5, 2, 3))
-    carry, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 3, 2, world)
-    assert actions.shape == (5, 3, 2, 2, 1)
-    own = np.asarray(actions)[:, 0, 0, 0, 0]
-    other = np.asarray(actions)[:, 1, 0, 0, 0]
-    assert (np.sign(own) != np.sign(other)).mean() > 0.9
+    carry, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world)
+    assert actions.shape == (5, 9, 2, 2, 1)
+    ways = np.asarray(actions)[:, :, 0, 0, 0]
+    assert ((ways.max(1) > 0.4) & (ways.min(1) < -0.4)).all()

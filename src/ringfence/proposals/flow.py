@@ -88,11 +88,12 @@ class FlowPolicy(eqx.Module):
         self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
     ) -> tuple[PyTree, Array, dict[str, Array]]:
         """(carry, actions (B, `count`, `rows`, N, A) in [−1, 1], info) along the rows that the World foresees: the
-        first of the episode's own driver, the others of drivers in turn."""
-        carry, key = self._with_driver(carry, self.feature_map(observations, state), key)
+        first of the episode's own driver, the others of such as may drive here."""
+        x = self.feature_map(observations, state)
+        carry, key = self._with_driver(carry, x, key)
         batch = observations.shape[0]
-        driver = (carry["driver"][:, None] + jnp.arange(count)) % self.drivers
-        driver = driver.reshape(-1)
+        others = self._drawn(jnp.repeat(x, count - 1, 0), jax.random.fold_in(key, 1)).reshape(batch, count - 1)
+        driver = jnp.concatenate([carry["driver"][:, None], others], 1).reshape(-1)
 
         def act(x: Array) -> Array:
             return self.draw(x, driver, key)
@@ -133,11 +134,14 @@ class FlowPolicy(eqx.Module):
         return free + o.cfg_scale * (asked - free)
 
     def _with_driver(self, carry: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
-        """What is carried, with the driver that this episode's first features x (B, N, D) draw, and a key."""
+        """The carry with this episode's driver, drawn at its first features x (B, N, D), and a key for the rest."""
         k1, k2 = jax.random.split(key)
+        driver = jnp.where(carry["age"] == 0, self._drawn(x, k1), carry["driver"])
+        return {"driver": driver, "age": carry["age"] + 1}, k2
+
+    def _drawn(self, x: Array, key: Key) -> Array:
+        """(B,) who drives at features x (B, N, D), drawn."""
         batch = x.shape[0]
         seen = self.normaliser.state(x).reshape(batch, -1)
         logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
-        drawn = jnp.argmax(logits + jax.random.gumbel(k1, logits.shape), -1).astype(jnp.int32)
-        driver = jnp.where(carry["age"] == 0, drawn, carry["driver"])
-        return {"driver": driver, "age": carry["age"] + 1}, k2
+        return jnp.argmax(logits + jax.random.gumbel(key, logits.shape), -1).astype(jnp.int32)
