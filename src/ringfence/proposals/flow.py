@@ -134,7 +134,7 @@ class FlowPolicy(eqx.Module):
         return free + o.cfg_scale * (asked - free)
 
     def _with_driver(self, carry: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
-        """The carry with this episode's driver, drawn at its first features x (B, N, D), and a key for the rest."""
+        """What is carried, with the driver that this episode's first features x (B, N, D) draw, and a key."""
         k1, k2 = jax.random.split(key)
         driver = jnp.where(carry["age"] == 0, self._drawn(x, k1), carry["driver"])
         return {"driver": driver, "age": carry["age"] + 1}, k2
