@@ -111,6 +111,16 @@ def test_runs_act_within_each_entry(logs, world, run, planner, tmp_path):
     assert not env.outside
 
 
+def test_a_guard_whose_world_has_other_bounds_acts_as_the_run_means(logs, run):
+    """Tables are bounded by their own largest action, so a World of other logs made 0.2 m/s of 0.1 m/s in silence."""
+    wide = dataclasses.replace(logs, card=logs.card.updated(action_low=[-0.3, -2.0], action_high=[0.3, 2.0]))
+    other = worlds.fit(wide, **QUICK_WORLD)
+    alone = ringfence.Controller(run)
+    beside = ringfence.Controller(run, guard="select", world=other, anyway=True, horizon=2)
+    for seen in logs.observations[:5]:
+        np.testing.assert_allclose(beside.act(seen), alone.act(seen), atol=1e-6)
+
+
 def test_a_callable_under_guard_acts_within_each_entry(logs, world):
     policy = ringfence.guard(lambda observations, state: np.full((2, 2), 9.0), world, guard="select", anyway=True)
     np.testing.assert_allclose(policy.act(logs.observations[0]), [HIGH, HIGH], atol=1e-7)

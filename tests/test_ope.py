@@ -223,10 +223,10 @@ def test_actions_are_compared_in_one_unit(uneven):
     """A guard's proposals are in the run's bounds, actions in those of the logs."""
     import jax.numpy as jnp
 
-    from ringfence.evaluation.ope.responses import _in_units_of
+    from ringfence.problem.normalise import in_units_of
 
     _, _, world = uneven
     wide = dataclasses.replace(world.spec, action_low=-2.0, action_high=2.0)
-    np.testing.assert_allclose(_in_units_of(world, wide, jnp.array([0.25, -0.5])), [0.5, -1.0])
+    np.testing.assert_allclose(in_units_of(world.spec, wide, jnp.array([0.25, -0.5])), [0.5, -1.0])
     same = jnp.array([0.25])
-    assert _in_units_of(world, world.spec, same) is same
+    assert in_units_of(world.spec, world.spec, same) is same

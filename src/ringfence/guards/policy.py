@@ -19,7 +19,7 @@ from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
-from ringfence.proposals.base import held
+from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
@@ -188,7 +188,13 @@ class Guarded(HadStart, eqx.Module):
         world = self.guard.world
         options = self.guard.options
         if isinstance(self.proposal, Proposes):
-            return self.proposal.propose(inner, observations, state, key, options.num_samples, options.horizon, world)
+            own = getattr(self.proposal, "spec", world.spec)
+            seen = in_bounds_of(own, world)
+            count = options.num_samples
+            carry, actions, info = self.proposal.propose(inner, observations, state, key, count, options.horizon, seen)
+            if seen is not world:  # a World of logs with wider bounds knows what its own agents did
+                actions = jnp.clip(normalise.in_units_of(world.spec, own, actions), -1.0, 1.0)
+            return carry, actions, info
         carry, step = self.proposal.act(inner, observations, state, key)
         action = normalise.to_unit(step.action, world.spec.action_low, world.spec.action_high)
         return carry, held(action, options.horizon), {}

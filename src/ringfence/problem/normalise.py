@@ -18,7 +18,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.types import Array, Bound
+from ringfence.types import Array, Bound, Spec
 
 Coordinates = Literal["displacement", "state"]
 ROUNDING = 1e-5  # of an entry's size: less variation is rounding, and the entry is centred and left alone
@@ -106,6 +106,14 @@ def from_unit(action: Array, low: Bound, high: Bound) -> Array:
     """Inverse of `to_unit`."""
     middle, half = _middle_and_half(low, high)
     return middle + half * action
+
+
+def in_units_of(wanted: Spec, given: Spec, action: Array) -> Array:
+    """Actions in [−1, 1] of the bounds of one spec in those of another; the same where the bounds are."""
+    if (given.action_low, given.action_high) == (wanted.action_low, wanted.action_high):
+        return action
+    physical = from_unit(action, given.action_low, given.action_high)
+    return to_unit(physical, wanted.action_low, wanted.action_high)
 
 
 def _middle_and_half(low: Bound, high: Bound) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -71,6 +72,25 @@ class Constant(HadStart, eqx.Module):
 def held(action: Array, rows: int) -> Array:
     """(B, 1, K, N, A): one action (B, N, A), held."""
     return jnp.broadcast_to(action[:, None, None], (action.shape[0], 1, rows, *action.shape[1:]))
+
+
+class _Rescaled(eqx.Module):
+    """Forward dynamics by actions in [−1, 1] of other bounds than those that they were learned in."""
+
+    dynamics: Any
+    learned: Spec = eqx.field(static=True)
+    given: Spec = eqx.field(static=True)
+
+    def step(self, x: Array, action: Array) -> tuple[Array, Array]:
+        return self.dynamics.step(x, normalise.in_units_of(self.learned, self.given, action))
+
+
+def in_bounds_of(spec: Spec, world: World) -> World:
+    """The World as a proposal's actions move it, whose bounds may be those of other logs."""
+    if (spec.action_low, spec.action_high) == (world.spec.action_low, world.spec.action_high):
+        return world
+    dynamics: Any = _Rescaled(world.dynamics, world.spec, spec)
+    return dataclasses.replace(world, dynamics=dynamics)
 
 
 def rolled(act: Callable[[Array], Array], own, world: World, seen: Array, present: Array, rows: int) -> Array:

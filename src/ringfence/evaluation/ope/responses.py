@@ -13,8 +13,8 @@ from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.result import Behaviour
 from ringfence.guards.policy import Guarded
 from ringfence.problem import normalise
-from ringfence.proposals.base import held
-from ringfence.types import Array, Key, Proposes, PyTree, Spec
+from ringfence.proposals.base import held, in_bounds_of
+from ringfence.types import Array, Key, Proposes, PyTree
 from ringfence.world import World
 
 BATCH = 512  # states that a policy is asked in together
@@ -68,7 +68,7 @@ def _respond(policy: Any, world: World, seen: Array, state: Array | None, key: K
     found = {"action": action} | {k: step.info[k] for k in ("infeasible", "ood") if k in step.info}
     if isinstance(policy, Guarded):
         _, wanted, _ = policy.proposed(policy.initial_state(len(seen))["inner"], seen, state, act_key)
-        wanted = _in_units_of(world, policy.guard.world.spec, wanted)
+        wanted = normalise.in_units_of(world.spec, policy.guard.world.spec, wanted)
         difference = jnp.abs(wanted - action[:, None, None])[:, :, 0].max((-2, -1))
         found["changed"] = difference.min(-1) > CHANGED
     plan = _plan(policy, carry, world, seen, state, action, plan_key, ahead)
@@ -81,19 +81,13 @@ def _plan(
 ) -> Array:
     """(B, K, N, A): the guard's plan, else what the policy proposes, else its action held."""
     if isinstance(policy, Guarded):
-        return _in_units_of(world, policy.guard.world.spec, carry["last"])
+        return normalise.in_units_of(world.spec, policy.guard.world.spec, carry["last"])
     if isinstance(policy, Proposes):
-        proposed = policy.propose(policy.initial_state(len(seen)), seen, state, key, 1, ahead, world)[1][:, 0]
-        return _in_units_of(world, getattr(policy, "spec", world.spec), proposed)
+        own = getattr(policy, "spec", world.spec)
+        moved = in_bounds_of(own, world)
+        proposed = policy.propose(policy.initial_state(len(seen)), seen, state, key, 1, ahead, moved)[1][:, 0]
+        return normalise.in_units_of(world.spec, own, proposed)
     return held(action, ahead)[:, 0]
-
-
-def _in_units_of(world: World, spec: Spec, action: Array) -> Array:
-    """Actions in [−1, 1] of one spec's bounds, in those of the World that evaluates; the same where the bounds are."""
-    if (spec.action_low, spec.action_high) == (world.spec.action_low, world.spec.action_high):
-        return action
-    physical = normalise.from_unit(action, spec.action_low, spec.action_high)
-    return normalise.to_unit(physical, world.spec.action_low, world.spec.action_high)
 
 
 def behaviour(logs: Logs, steps: np.ndarray, responses: Responses, world: World) -> Behaviour:
