@@ -10,8 +10,11 @@ import sys
 import numpy as np
 import pytest
 
+from ringfence.cli import app
 from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.bagfile import typestore
 from ringfence.logs.io.rosbag import read_bag
+from ringfence.logs.store import EpisodeStore
 
 pytest.importorskip("rosbags", reason="rosbags writes the bags of these tests")
 
@@ -448,8 +451,9 @@ def test_what_is_missing_is_named(tmp_path, monkeypatch):
     ):
         read_bag(path, ["/r0", "/r2"])
     many = {f"/x{i}/odom": [odometry(f"/x{i}/odom", 0.0)] for i in range(20)}
+    many["/x7/cmd_vel"] = [command("/x7/cmd_vel", 0.0)]
     with pytest.raises(
-        StoreError, match="agent 'x0' has no commands: .* has no topic '/x0/cmd_vel', it has .* and 16 more"
+        StoreError, match="agent 'x0' has no commands: .* has no topic '/x0/cmd_vel', it has .* and 17 more"
     ):
         read_bag(write(tmp_path / "many", pair(**many)), "/x{i}")
     (path / "metadata.yaml").unlink()
@@ -546,3 +550,62 @@ def test_a_message_that_is_cut_is_named(tmp_path):
         writer.write(connection, START + 1, whole[:-8])
     with pytest.raises(StoreError, match="message 1 of '/a/cmd_vel' is damaged"):
         read_bag(path, "/{i}")
+
+
+# --- other commands, or none ---
+def car(topic, time, speed, steering, stamped=True):
+    drive = dict(speed=speed, steering_angle=steering)
+    if not stamped:
+        return topic, "ackermann_msgs/msg/AckermannDrive", ns(time), drive
+    fields = dict(header=Header(ns(time)), drive=drive)
+    return topic, "ackermann_msgs/msg/AckermannDriveStamped", ns(time) + 1_000_000, fields
+
+
+@pytest.mark.parametrize("form", ["bag", "mcap"])
+@pytest.mark.parametrize("stamped", [True, False])
+def test_cars_are_commanded_by_speed_and_steering(tmp_path, form, stamped):
+    drives = {
+        f"/r{i}/drive": [car(f"/r{i}/drive", 0.1 * k - 0.05, k + 1, 0.25, stamped) for k in range(6)] for i in range(2)
+    }
+    messages = pair(**drives)
+    bag = read_bag(write(tmp_path, messages, form, typestore(1 if form == "bag" else 2)), "/r{i}", cmd="drive")
+    assert bag.action == ("cmd_speed", "cmd_steering") and "cmd_vx" not in bag.columns
+    np.testing.assert_array_equal(bag.columns["cmd_speed"][:6], np.arange(1, 7))
+    np.testing.assert_array_equal(bag.columns["cmd_steering"], 0.25)
+
+
+def test_agents_of_different_commands(tmp_path):
+    path = write(tmp_path, pair(**{"/r1/cmd_vel": [car("/r1/cmd_vel", 0.0, 1.0, 0.0)]}), store=typestore(2))
+    with pytest.raises(
+        StoreError, match="'/r0/cmd_vel' is geometry_msgs/msg/Twist and '/r1/cmd_vel' is ackermann_msgs"
+    ):
+        read_bag(path, "/r{i}")
+
+
+@pytest.mark.parametrize("kind", ["Odometry", "PoseStamped"])
+def test_bags_without_commands_give_accelerations(tmp_path, kind):
+    messages = []
+    for i in range(2):
+        for k in range(12):
+            at = odometry(f"/r{i}/odom", 0.1 * k, x=0.02 * k**2, y=i, twist=(0.4 * k, 0.0, 0.0))
+            if kind == "PoseStamped":
+                pose = dict(header=at[3]["header"], pose=at[3]["pose"]["pose"])
+                at = at[0], "geometry_msgs/msg/PoseStamped", at[2], pose
+            messages.append(at)
+    path = write(tmp_path, messages)
+    bag = read_bag(path, "/r{i}")
+    assert bag.action == () and bag.notes == ("no agent has the topic 'cmd_vel', and no other cmd was given",)
+    app.main(["data", "import-bag", str(path), "--agents", "/r{i}", "--out", str(tmp_path / "bag.h5")])
+    store = EpisodeStore.load(tmp_path / "bag.h5")
+    assert (store.n_agents, store.steps) == (2, 11)
+    np.testing.assert_allclose(store.actions[1:, :, 0], 4.0, atol=1e-4)
+    np.testing.assert_allclose(store.actions[..., 1], 0.0, atol=1e-5)
+    with pytest.raises(StoreError, match="has no commands: .* has no topic '/r0/drive'"):
+        read_bag(path, "/r{i}", cmd="drive")
+
+
+def test_a_stamp_that_is_late_is_refused(tmp_path):
+    late = [odometry("/r1/odom", 0.1 * k, stamp=ns(0.1 * k - (9 if k == 0 else 0))) for k in range(6)]
+    with pytest.raises(StoreError, match=r"'/r1/odom', 0 s after its first, is 9 s off .*\(5 s are allowed\); cut"):
+        read_bag(write(tmp_path, pair(**{"/r1/odom": late})), "/r{i}")
+    assert len(read_bag(tmp_path / "log", "/r{i}", stamps=False).columns["x"]) == 12

@@ -169,7 +169,7 @@ def import_bag(
     agents: str,
     out_file: Out,
     odom: str = "odom",
-    cmd: str = "cmd_vel",
+    cmd: str | None = None,
     joints: str | None = None,
     cost: str | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
@@ -184,7 +184,8 @@ def import_bag(
         agents: prefix of the agents' topics, {i} standing for any number or word, e.g. /robot_{i}.
         out_file: the store to write.
         odom: topic of poses, below the prefix.
-        cmd: topic of commands, below the prefix.
+        cmd: topic of commands (Twist or Ackermann), below the prefix; cmd_vel by default, and where nobody has it,
+            accelerations.
         joints: topic of joint states, below the prefix.
         cost: topic of danger, of each agent below the prefix, or of the team.
         episodes: how rows become episodes.

@@ -50,6 +50,10 @@ def _command(twist) -> tuple[float, ...]:
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
+def _ackermann(drive) -> tuple[float, ...]:
+    return drive.speed, drive.steering_angle
+
+
 def _scalar(m) -> tuple[float]:
     return (m.data,)
 
@@ -64,10 +68,30 @@ ROLES: dict[str, dict[str, Callable]] = {
     "cmd": {
         "geometry_msgs/msg/Twist": _command,
         "geometry_msgs/msg/TwistStamped": lambda m: _command(m.twist),
+        "ackermann_msgs/msg/AckermannDrive": _ackermann,
+        "ackermann_msgs/msg/AckermannDriveStamped": lambda m: _ackermann(m.drive),
     },
     "joints": {"sensor_msgs/msg/JointState": lambda m: (tuple(m.name), m.position, m.velocity)},
     "cost": {f"std_msgs/msg/{kind}": _scalar for kind in ("Bool", "Float32", "Float64", "Int32")},
 }
+
+
+# What rosbags does not know of itself, as github.com/ros-drivers/ackermann_msgs defines it.
+ACKERMANN = {
+    "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
+    "float32 acceleration\nfloat32 jerk\n",
+    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n",
+}
+
+
+def typestore(ros: int) -> Any:
+    """Types of ROS 1 or ROS 2 that messages are read as."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
+    for kind, definition in ACKERMANN.items():
+        store.register(get_types_from_msg(definition, kind))
+    return store
 
 
 # --- the file ---
@@ -197,7 +221,6 @@ def opened(path: Path) -> Iterator[BagFile]:
     try:
         from rosbags.rosbag1 import Reader as Reader1
         from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise StoreError("Reading a bag needs rosbags; run pip install 'ringfence[ros]'.") from None
     _check_path(path)
@@ -213,7 +236,7 @@ def opened(path: Path) -> Iterator[BagFile]:
             if not isinstance(connection.topic, str) or not isinstance(connection.msgtype, str):
                 raise _damaged(path, ValueError(f"it names a topic {connection.topic!r}"))
             topics.setdefault(topic_name(connection.topic), []).append(connection)
-        store = get_typestore(Stores.ROS1_NOETIC if first else Stores.ROS2_HUMBLE)
+        store = typestore(1 if first else 2)
         yield BagFile(path, reader, topics, store, store.deserialize_ros1 if first else store.deserialize_cdr)
     finally:
         with suppress(Exception):

@@ -20,7 +20,10 @@ from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, open
 
 TWIST = ("vx", "vy", "wz")
 COMMAND = ("cmd_vx", "cmd_vy", "cmd_wz")
+CMD = "cmd_vel"
+STEERED = ("cmd_speed", "cmd_steering")
 CLOCK = 1.0  # s; stamps further from the times of recording come from another clock than the recorder's
+LATE = 5.0  # s; a stamp so much further from its time of recording than the topic's others is of another time
 JOINTS = 1000  # names of joints that a topic may hold
 LARGEST = 1e30  # of any number; a store holds float32
 MOVING = 0.05  # m/s; slower rows do not tell in which frame a twist is
@@ -32,8 +35,10 @@ class Bag:
 
     `columns` holds arrays (R,): `time` (s), `agent` (str), `x`, `y` (m), `yaw` (rad, in [-pi, pi]), `cos_yaw`,
     `sin_yaw`; of Odometry `vx`, `vy` (m/s, in the world frame) and `wz` (rad/s); `cmd_vx`, `cmd_vy` (m/s) and `cmd_wz`
-    (rad/s) as commanded, in the robot's frame; `<joint>.position`, `<joint>.velocity` and `cost` where asked for.
+    (rad/s) as commanded, in the robot's frame, or `cmd_speed` (m/s) and `cmd_steering` (rad) of a car;
+    `<joint>.position`, `<joint>.velocity` and `cost` where asked for.
     `state` and `action` name the columns that are natural as such: no angle that wraps, no command that is always 0.
+    Of a bag without commands `action` is empty, and a table's actions are accelerations then.
     `notes` say what was dropped or is doubtful.
     """
 
@@ -49,7 +54,7 @@ def read_bag(
     agents: str | Sequence[str],
     *,
     odom: str = "odom",
-    cmd: str = "cmd_vel",
+    cmd: str | None = None,
     joints: str | None = None,
     cost: str | None = None,
     stamps: bool = True,
@@ -63,8 +68,9 @@ def read_bag(
     * `odom`: nav_msgs Odometry, or geometry_msgs PoseStamped, PoseWithCovarianceStamped or TransformStamped, which have
       no velocities. Odometry's twist is in the robot's frame (child_frame_id) and is turned by its yaw into the world;
       `twist="world"` takes it as it stands, for publishers that break this rule.
-    * `cmd`: geometry_msgs Twist or TwistStamped. A row holds the last command at or before it; rows before the first
-      are dropped, and a note counts them.
+    * `cmd`: geometry_msgs Twist or TwistStamped, or ackermann_msgs AckermannDrive or AckermannDriveStamped; by default
+      `cmd_vel`, or nothing where no agent has that topic. A row holds the last command at or before it; rows
+      before the first are dropped, and a note counts them.
     * `joints`: sensor_msgs JointState, held likewise, joint by joint. Where all names of an agent's joints begin with
       its own name, that is left out, so that agents have the same columns. What is NaN throughout was not measured.
     * `cost`: std_msgs Bool, Float32, Float64 or Int32 of each agent, or of the team if it begins with a slash or exists
@@ -99,6 +105,7 @@ def _clock_of(
     clock = _clock(path, odometry, others, start, stamps, notes)
     _frames(odometry, notes)
     _refuse_two_kinds(path, odometry)
+    _refuse_two_commands(path, robots)
     return clock
 
 
@@ -107,11 +114,14 @@ def _table(path: Path, robots: list[_Robot], clock: Clock, twist: str, notes: li
     parts = [_columns_of(path, robot, clock, twist, notes) for robot in robots]
     _refuse_other_joints(path, robots, parts)
     columns = {name: np.concatenate([part[name] for part in parts]) for name in ("time", *parts[0])}
-    action = tuple(name for name in COMMAND if columns[name].any()) or COMMAND
-    if action != COMMAND:
-        still = ", ".join(name for name in COMMAND if name not in action)
+    command = tuple(name for name in (*COMMAND, *STEERED) if name in columns)
+    action = tuple(name for name in command if columns[name].any()) or command
+    if action != command:
+        still = ", ".join(name for name in command if name not in action)
         notes.append(f"no action, since zero in every row: {still}")
-    state = tuple(name for name in columns if name not in ("time", "agent", "yaw", "cost", *COMMAND))
+    if not command:
+        notes.append(f"no agent has the topic '{CMD}', and no other cmd was given")
+    state = tuple(name for name in columns if name not in ("time", "agent", "yaw", "cost", *command))
     return Bag(columns, state, action, tuple(robot.name for robot in robots), tuple(notes))
 
 
@@ -130,26 +140,31 @@ class _Robot:
 
     name: str
     odom: Topic
-    cmd: Topic
+    cmd: Topic | None
     joints: Topic | None
     cost: Topic | None
 
     @classmethod
     def of(cls, asked: _Asked, topics: dict[str, Topic]) -> _Robot:
         own = {role: topics[name] for role, name in asked.topics.items()}
-        return cls(asked.name, own["odom"], own["cmd"], own.get("joints"), own.get("cost"))
+        return cls(asked.name, own["odom"], own.get("cmd"), own.get("joints"), own.get("cost"))
 
 
 def _asked_of(
-    bag: BagFile, prefixes: list[str], odom: str, cmd: str, joints: str | None, cost: str | None
+    bag: BagFile, prefixes: list[str], odom: str, cmd: str | None, joints: str | None, cost: str | None
 ) -> list[_Asked]:
-    """What is to be read of every agent; one with poses and without commands is refused by its name."""
+    """What is to be read of every agent; one with poses and without commands, which others have, is refused by its
+    name."""
+    if cmd is None and any(joined(prefix, CMD) in bag.topics for prefix in prefixes):
+        cmd = CMD
     costs = [] if cost is None else _cost_topics(bag, prefixes, cost)
     found = []
     for k, prefix in enumerate(prefixes):
         name = prefix.strip("/") or "robot"
-        topics = {"odom": joined(prefix, odom), "cmd": joined(prefix, cmd)}
-        if topics["odom"] in bag.topics and topics["cmd"] not in bag.topics:
+        topics = {"odom": joined(prefix, odom)}
+        if cmd is not None:
+            topics["cmd"] = joined(prefix, cmd)
+        if topics["odom"] in bag.topics and "cmd" in topics and topics["cmd"] not in bag.topics:
             raise StoreError(
                 f"The agent '{name}' has no commands: {bag.lacks(topics['cmd'])}; pass another cmd or fewer agents."
             )
@@ -219,6 +234,9 @@ def _clock(path: Path, odometry: list[Topic], others: list[Topic], start: int, s
             _refuse_another_clock(path, topic.name, lags[topic.name], lead, lags[lead])
     behind = float(np.median(lags[lead].seconds))
     foreign = float(np.median(np.abs(lags[lead].seconds))) > CLOCK
+    for topic in topics:
+        if topic.name in stamped and not (foreign and topic in odometry):
+            _refuse_late(path, topic.name, lags[topic.name], lags[lead], foreign)
     times = {t.name: _times(t, stamped.get(t.name), foreign) for t in topics}
     for topic in topics:
         _refuse_backwards(path, topic.name, times[topic.name], topic.name in stamped)
@@ -258,6 +276,19 @@ def _refuse_another_clock(path: Path, name: str, lag: _Lag, lead: str, lag_of_le
         )
 
 
+def _refuse_late(path: Path, name: str, lag: _Lag, lag_of_lead: _Lag, foreign: bool) -> None:
+    """Single messages, as a buffer, a latched topic or a clock that was set makes them."""
+    usual = np.interp(lag.when, *lag_of_lead) if foreign else np.median(lag.seconds)
+    late = np.abs(lag.seconds - usual)
+    if len(late) and late.max() > LATE:
+        k = int(late.argmax())
+        raise StoreError(
+            f"'{path}': the stamp of a message of '{name}', {lag.when[k] - lag.when[0]:.3g} s after its first, is "
+            f"{late[k]:.3g} s off the topic's others ({LATE:g} s are allowed); cut the bag there, or pass stamps=False "
+            "to take the times of recording."
+        )
+
+
 def _times(topic: Topic, stamps: np.ndarray | None, foreign: bool) -> np.ndarray:
     """(M,) ns: stamps, and where they are not set the times of recording, if both are of one clock."""
     if stamps is None:
@@ -294,10 +325,13 @@ def _columns_of(path: Path, robot: _Robot, clock: Clock, twist: str, notes: list
         notes.append(f"{again} rows of {robot.name} have the time of the row before")
     columns = {"agent": np.full(len(times), robot.name)}
     columns |= _poses(rows, (times - clock.origin) / 1e9, twist, notes)
-    latest = _latest(*clock.align(rows, robot.cmd))
-    commands = _numbers(robot.cmd, COMMAND)[latest]
-    columns |= {name: commands[:, i] for i, name in enumerate(COMMAND)}
-    known = latest >= 0
+    known = np.ones(len(times), bool)
+    if robot.cmd is not None:
+        latest = _latest(*clock.align(rows, robot.cmd))
+        command = _command_of(robot.cmd)
+        commands = _numbers(robot.cmd, command)[latest]
+        columns |= {name: commands[:, i] for i, name in enumerate(command)}
+        known = latest >= 0
     if robot.joints is not None:
         row_times, joint_times = clock.align(rows, robot.joints)
         for name, (which, values) in sorted(_joints(robot.joints, robot.name).items()):
@@ -310,15 +344,22 @@ def _columns_of(path: Path, robot: _Robot, clock: Clock, twist: str, notes: list
     return {name: column[known] for name, column in columns.items()}
 
 
+def _command_of(topic: Topic) -> tuple[str, ...]:
+    return STEERED if topic.type.startswith("ackermann_msgs/") else COMMAND
+
+
 def _note_unknown(path: Path, robot: _Robot, known: np.ndarray, notes: list[str]) -> None:
     """Rows of which no command, or no state of some joint, is known."""
+    held = [] if robot.cmd is None else ["command"]
+    held += [] if robot.joints is None else ["states of all joints"]
+    before = " and ".join(held)
     if not known.any():
+        what = before.replace("command", "commands").replace("states of all joints", "joints")
         raise StoreError(
-            f"'{path}': all {len(known)} messages of '{robot.odom.name}' are older than the first of its commands"
-            f"{' and joints' if robot.joints is not None else ''}; pass fewer agents."
+            f"'{path}': all {len(known)} messages of '{robot.odom.name}' are older than the first of its {what}; pass "
+            "fewer agents."
         )
     if not known.all():
-        before = "command" if robot.joints is None else "command and states of all joints"
         notes.append(f"{(~known).sum()} rows of {robot.name} before its first {before} were dropped")
 
 
@@ -327,6 +368,16 @@ def _refuse_two_kinds(path: Path, odometry: list[Topic]) -> None:
         raise StoreError(
             f"'{path}': '{odometry[0].name}' is {odometry[0].type} and others are not, so only some agents have "
             "velocities; pass fewer agents or another odom."
+        )
+
+
+def _refuse_two_commands(path: Path, robots: list[_Robot]) -> None:
+    commands = [robot.cmd for robot in robots if robot.cmd is not None]
+    other = next((topic for topic in commands if _command_of(topic) != _command_of(commands[0])), None)
+    if other is not None:
+        raise StoreError(
+            f"'{path}': '{commands[0].name}' is {commands[0].type} and '{other.name}' is {other.type}; agents need the "
+            "same commands, so pass fewer agents."
         )
 
 
