@@ -207,7 +207,8 @@ def test_bounds_that_are_none_are_refused(logs, low, high, message):
 def test_specs_know_their_bounds_by_entry():
     spec = Spec("slow", 2, 2, ("x",), (0.0, -1.0), ((1.0, 2.0), (3.0, 4.0)), 8)
     assert Spec.of(json.loads(json.dumps(spec.to_dict()))) == spec and hash(spec)
-    for low, high in (((0.0, 3.0), (1.0, 2.0)), ((0.0, 0.0, 0.0), 1.0), ((0.0, -1.0), float("nan"))):
+    wrong = (((0.0, 3.0), (1.0, 2.0)), ((0.0, 0.0, 0.0), 1.0), ((0.0, -1.0), float("nan")), (((0.0, 0.0), (0.0,)), 1.0))
+    for low, high in (*wrong, (("a", "b"), 1.0), ((), 1.0)):
         with pytest.raises(UserError, match="bounds"):
             dataclasses.replace(spec, action_low=low, action_high=high)
 

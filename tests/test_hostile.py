@@ -504,6 +504,8 @@ RUNS = {
         plus=[[10**6] * len(r) for r in config["feature_map"]["plus"]]
     ),
     "bounds": lambda config: config["spec"].update(action_low=5.0, action_high=1.0),
+    "bounds that cross in an entry": lambda config: config["spec"].update(action_low=[-1.0, 2.0]),
+    "bounds of no shape": lambda config: config["spec"].update(action_low=[[-1.0, -1.0], [-1.0]]),
 }
 
 

@@ -164,6 +164,9 @@ def test_episodes_that_were_trained_on_are_counted(uneven):
     found = ringfence.ope(run, store, evaluation_world=world, **QUICK | {"rollout_episodes": 0})
     part = dataclasses.replace(found, episodes_trained_on=20).summary()[0]
     assert "by 40 logged episodes, of which it was trained on 20: leave these out" in part
+    (run.path / "episodes.json").write_text('{"a": 1}')
+    with pytest.raises(UserError, match="damaged episodes.json; delete that file"):
+        _trained_on(run, new)
     (run.path / "episodes.json").unlink()  # as runs of before are
     assert _trained_on(run, store) == 40 and _trained_on(run, new) is None
 

@@ -61,7 +61,10 @@ class Spec:
 
     def __post_init__(self):
         shapes = ((), (self.action_dim,), (self.n_agents, self.action_dim))
-        low, high = np.asarray(self.action_low), np.asarray(self.action_high)
+        try:
+            low, high = np.asarray(self.action_low, np.float64), np.asarray(self.action_high, np.float64)
+        except (TypeError, ValueError):
+            raise UserError("Actions have bounds that are no numbers of one shape; give one, or one of each.") from None
         if low.shape not in shapes or high.shape not in shapes:
             raise UserError(
                 f"Actions have bounds of shape {low.shape} and {high.shape}; give one number, or one of each of the "
