@@ -16,11 +16,16 @@ from ringfence.deploy import zoo
 from ringfence.envs import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.errors import UserError
+from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
+from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults, Faulty, under_faults
+from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import build
-from ringfence.loading.resolve import load
+from ringfence.loading.controller import Controller
+from ringfence.loading.resolve import load, resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.types import PolicyStep
 
 
@@ -221,3 +226,82 @@ def test_the_command_line_stresses(run, capsys):
 def test_compensating_and_saying_so_oneself_are_one_too_many(run):
     with pytest.raises(UserError, match="compensate and delay both tell the guard"):
         ringfence.stress(run, {"delay": 1}, guard="shield", delay=1, compensate=True)
+
+
+# --- certificates ---
+
+LIGHT = {"correction_steps": 1, "horizon": 1, "terminal_value": False}  # a guard that compiles soon
+
+
+@pytest.fixture
+def few(monkeypatch):
+    monkeypatch.setattr("ringfence.evaluation.rollout.CHUNK", 4)
+
+
+def test_a_quantile_of_few_episodes_is_none():
+    scores = np.arange(1.0, 21.0)
+    assert conformal(scores, 0.95) == 20.0 and conformal(scores, 0.5) == 11.0
+    assert conformal(scores[:18], 0.95) == np.inf
+
+
+def test_what_was_foreseen_is_compared_with_the_state_that_it_was_of(run, few):
+    """Of a guard that knows its delay, so many steps later."""
+    resolved = resolve(PolicySpec.of(run, guard="shield", delay=2, **LIGHT))
+    task = resolved.job.task
+    policy = under_faults(resolved.team, Faults(delay=2), task)
+    played = rollout(policy, task.simulator, 4, foreseen=True)
+    came = judged(resolved.guard, task, played["states"])
+    error = [np.abs(played["foreseen"][:, :90] - came[:, lag : 90 + lag]).mean() for lag in range(5)]
+    assert np.argmin(error) == 2
+    assert (shortfalls(resolved, played) >= 0).all()
+    assert "foreseen" not in rollout(policy, task.simulator, 4)
+
+
+def test_a_margin_is_calibrated_and_its_promise_kept_to_whom_it_was_made(run, few, tmp_path):
+    made = certify(run, {"delay": 1}, quantile=0.5, calibration=4, episodes=4, **LIGHT)
+    assert made.guard["delay"] == 1 and made.faults["delay"] == 1 and made.episodes == 4
+    assert made.bound == pytest.approx(upper_bound(made.violations, 4))
+    margins = [one["margin"] for one in made.rounds]
+    assert margins == sorted(margins) and made.guard["margin"] == margins[-1]
+    assert made.agreed == (made.rounds[-1]["quantile"] <= margins[-1])
+    file = made.save(tmp_path / "cert.json")
+    assert Certificate.load(file) == made
+    how = {"guard": "shield", **LIGHT}
+    controller = Controller(run, certificate=file, delay=1, **how)
+    assert controller.policy.one.guard.options.margin == made.guard["margin"]
+    env = Crossing()
+    controller.act(np.asarray(env.observe(env.reset(jax.random.key(0), 1)))[0])
+    info = controller.info
+    assert info["covered"] == ~(info["infeasible"] | info["ood"])
+    for wrong, words in (
+        ({"delay": 2}, "of a guard with delay=1, and this one has 2"),
+        ({"delay": 1, "agents": 5}, "is of 8 agents, and 5 play"),
+        ({"delay": 1, "margin": 0.1}, "of a guard with margin="),
+    ):
+        with pytest.raises(UserError, match=words):
+            Controller(run, certificate=file, **how, **wrong)
+    with pytest.raises(UserError, match="A certificate is of a guarded run"):
+        Controller(run, certificate=file)
+    for field, words in (("policy", "another run"), ("world", "another World")):
+        other = dataclasses.replace(made, **{field: "0"}).save(tmp_path / "other.json")
+        with pytest.raises(UserError, match=words):
+            Controller(run, certificate=other, delay=1, **how)
+    (tmp_path / "broken.json").write_text("[]")
+    with pytest.raises(UserError, match="is no certificate"):
+        Certificate.load(tmp_path / "broken.json")
+    assert any("95" in line for line in made.summary())
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"confidence": 1.0}, "confidence=1.0 must lie between 0 and 1"),
+        ({"calibration": 10}, "calibration=10 episodes tell no quantile of 0.95; give 19 or more"),
+        ({"guard": "adapt"}, "An adapting margin cannot be frozen"),
+        ({"guard": "none", "compensate": False}, "A certificate is of a guarded run"),
+        ({"episodes": 0}, "episodes=0"),
+    ],
+)
+def test_what_cannot_be_certified_is_refused(run, given, words):
+    with pytest.raises(UserError, match=words):
+        certify(run, {}, **given)

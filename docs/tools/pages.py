@@ -41,6 +41,8 @@ REFERENCE = {
         "ringfence.evaluation.play",
         "ringfence.evaluation.stress",
         "ringfence.faults.faults",
+        "ringfence.evaluation.certify",
+        "ringfence.faults.certificate",
         "ringfence.evaluation.simulators",
         "ringfence.logs.collect",
         "ringfence.evaluation.reference",

@@ -24,6 +24,7 @@ _WHERE = {
     "play": "ringfence.evaluation.play",
     "stress": "ringfence.evaluation.stress",
     "Faults": "ringfence.faults",
+    "certify": "ringfence.evaluation.certify",
     "collect": "ringfence.logs.collect",
     "ope": "ringfence.evaluation.ope",
     "World": "ringfence.world",

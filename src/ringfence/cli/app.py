@@ -346,6 +346,54 @@ def stress(
     _say(table, refusals, len(found))
 
 
+def certify(
+    run: Positional[Path],
+    out_file: Annotated[Path, tyro.conf.arg(name="out")],
+    delay: int = 0,
+    drop: float = 0.0,
+    noise: float = 0.0,
+    gain: float = 1.0,
+    asynchrony: Annotated[float, tyro.conf.arg(name="async")] = 0.0,
+    confidence: float = 0.95,
+    quantile: float = 0.95,
+    calibration: int = 100,
+    episodes: int = 300,
+    playing: How = AS_IT_IS,
+) -> None:
+    """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
+    it. The guard is told of delay and drop. docs/stress.md says what is promised.
+
+    Args:
+        run: a run folder.
+        out_file: the certificate, JSON.
+        delay: steps after which an action takes effect.
+        drop: probability that an agent's observation of a step is lost; what it got last is held.
+        noise: standard deviation of what is observed, in the entries' own units.
+        gain: what becomes of an action, which is clipped to its bounds.
+        asynchrony: share of steps that an agent lets pass, each in its own rhythm.
+        confidence: of the bound.
+        quantile: of episodes, whose shortfall the margin is to cover.
+        calibration: episodes of each batch that the margin is calibrated on.
+        episodes: fresh ones, for the bound.
+    """
+    from ringfence.evaluation.certify import certify as run_certify
+    from ringfence.faults import Faults
+
+    faults = Faults.of({"delay": delay, "drop": drop, "noise": noise, "gain": gain, "asynchrony": asynchrony})
+    given = playing.arguments()
+    if given.get("guard", "none") == "none":
+        given |= {"guard": "shield"}
+    file = writable(out_file)
+    found = _runs([run])
+    if len(found) > 1:
+        raise UserError(f"'{run}' holds {len(found)} runs, and a certificate is of one; name it, e.g. {found[0].path}.")
+    given |= {"confidence": confidence, "quantile": quantile, "calibration": calibration, "episodes": episodes}
+    made = run_certify(found[0], faults, quiet=False, **given)
+    for line in made.summary():
+        out.print(lines(line), soft_wrap=True)
+    print(made.save(file))
+
+
 def _say(table: Table, refusals: Refusals, runs: int) -> None:
     """What was measured, and what runs were refused for; the process ends where any was."""
     if table.row_count:
@@ -481,6 +529,7 @@ COMMANDS = {
     "eval": evaluate,
     "play": play,
     "stress": stress,
+    "certify": certify,
     "pretrained": pretrained,
     "export": export,
     "bench": bench_commands.bench,

@@ -18,7 +18,8 @@ from ringfence.utils.progress import Progress
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
 CHUNK = 50  # episodes per compiled batch
 COUNTED = ("infeasible", "ood")  # of every step: a guard's condition could not be met; its World knew nothing there
-CUT = ("reward", "cost", "state", "violated", *COUNTED)  # of as many episodes as were asked for
+FORESEEN = "foreseen"  # by the guard: the least score of the state that its action leads to
+CUT = ("reward", "cost", "state", "violated", FORESEEN, *COUNTED)  # of as many episodes as were asked for
 
 Played = dict[str, np.ndarray]
 
@@ -32,14 +33,16 @@ def rollout(
     num_recorded: int = 0,
     label: str = "",
     quiet: bool = True,
+    batch: int = 0,
+    foreseen: bool = False,
 ) -> Played:
     """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
     whether the task itself `terminated` (E,) it, and who was `violated` (E, L, N) where agents have costs of their own;
     the first `num_recorded` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's
-    noise, never the resets."""
+    noise, never the resets; another `batch` has other resets. `foreseen` keeps what a guard inside JAX foresees."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
-    root = RESETS[split]
+    root = RESETS[split] + 2 * batch  # whose noise has the key after it
     act_key = jax.random.fold_in(jax.random.key(root + 1), seed)
     label = label or "evaluating"
     if isinstance(env, NativeEnv):
@@ -49,7 +52,9 @@ def rollout(
             f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
             "act() uses jax.numpy."
         )
-    played = _in_chunks(_compiled(env, jax.random.key(root), act_key), policy, episodes, num_recorded, label, quiet)
+    played = _in_chunks(
+        _compiled(env, jax.random.key(root), act_key, foreseen), policy, episodes, num_recorded, label, quiet
+    )
     _refuse_lost(played)
     return {
         "rewards": played.pop("reward"),
@@ -61,7 +66,9 @@ def rollout(
     }
 
 
-def _compiled(env: Env, reset_key: Key, act_key: Key) -> Callable[[Policy, int, int, int], dict[str, Array]]:
+def _compiled(
+    env: Env, reset_key: Key, act_key: Key, foreseen: bool
+) -> Callable[[Policy, int, int, int], dict[str, Array]]:
     """A program that plays the chunk `index` of `batch` episodes and keeps what was drawn in the first `keep`."""
 
     def play(policy: Policy, index: int, batch: int, keep: int) -> dict[str, Array]:
@@ -74,6 +81,8 @@ def _compiled(env: Env, reset_key: Key, act_key: Key) -> Callable[[Policy, int, 
             if out.cost.ndim == 2:
                 kept["violated"] = out.cost > 0
             kept |= _counted(decided)
+            if foreseen:
+                kept[FORESEEN] = decided.info[FORESEEN]
             if keep:
                 kept |= {name: value[:keep] for name, value in _drawn(decided).items()}
             return (carry, after), kept
@@ -166,7 +175,7 @@ def _counted(decided: PolicyStep) -> dict[str, Array]:
 
 
 def _drawn(decided: PolicyStep) -> dict[str, Array]:
-    return {name: value for name, value in decided.info.items() if name not in COUNTED}
+    return {name: value for name, value in decided.info.items() if name not in (*COUNTED, FORESEEN)}
 
 
 def _foreign(policy: Policy) -> bool:

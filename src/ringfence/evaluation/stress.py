@@ -43,7 +43,7 @@ def stress(
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     if compensate:
-        options |= _told(faults, options)
+        options |= told(faults, options)
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
     resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
@@ -60,13 +60,13 @@ def stress(
     return result
 
 
-def _told(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
+def told(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
     """What a guard is told of faults, as its options."""
     guarded = options.get("guard", "none") != "none"
     if not guarded:
         raise UserError("compensate is read by nothing without a guard; name one with guard=, e.g. shield.")
-    told = {"delay": faults.delay, "max_age": MAX_AGE if faults.drop else 0}
-    twice = sorted(told.keys() & options.keys())
+    found = {"delay": faults.delay, "max_age": MAX_AGE if faults.drop else 0}
+    twice = sorted(found.keys() & options.keys())
     if twice:
         raise UserError(f"compensate and {twice[0]} both tell the guard of it; give one of them.")
-    return {name: value for name, value in told.items() if value}
+    return {name: value for name, value in found.items() if value}

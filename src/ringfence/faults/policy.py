@@ -60,7 +60,7 @@ class Faulty(eqx.Module):
     def act(self, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
         outside = isinstance(observations, np.ndarray)  # of JAX: so is what a foreign policy is given
         carry = self._arrived(carry, observations, state, jax.random.fold_in(key, OWN_KEY))
-        seen = np.asarray(carry["observations"]) if outside else carry["observations"]
+        seen: Any = np.asarray(carry["observations"]) if outside else carry["observations"]
         if state is not None:
             state = np.asarray(carry["state"]) if outside else carry["state"]
         inner = carry["inner"]

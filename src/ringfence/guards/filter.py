@@ -40,6 +40,7 @@ class Decision(NamedTuple):
     chosen: Array  # (B,) index of the proposal, or (B, N) of agents that are alone
     rows: Array  # (B, P, K+1, N, D) where the proposals lead
     safety: Array  # (B, N) least score along the plan, of any constraint
+    first: Array  # (B, N) the same of its first row alone
     short: Array  # (B, N) bool: the condition is not met along it
     ood: Array  # (B, N) bool: the first action leads out of distribution
 
@@ -78,12 +79,14 @@ class Guard(eqx.Module):
         if self.options.correction_steps:
             plan = self.shielded(present, plan, margin)
         ahead, spread = self.predict(present, plan[:, None])
+        scores = self.barrier.along(ahead, spread)[:, 0]
         missing = self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin)
         return Decision(
             plan=plan,
             chosen=chosen,
             rows=rows,
-            safety=self.barrier.along(ahead, spread)[:, 0].min((1, 3)),
+            safety=scores.min((1, 3)),
+            first=scores[:, 0].min(-1),
             short=(missing < -TOLERANCE).any(1),
             ood=spread[:, 0, 0] > self.world.ood_threshold,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -10,11 +11,12 @@ import jax
 import numpy as np
 
 from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
 from ringfence.guards.wrap import Callback, under_guard
 from ringfence.loading.resolve import load
 from ringfence.problem.constraints import Hazard
-from ringfence.problem.homogeneous import PerAgent
+from ringfence.problem.homogeneous import PerAgent, agent_policy
 from ringfence.proposals.base import act_with, with_cost
 from ringfence.proposals.options import DEFAULT
 from ringfence.training import worlds
@@ -30,6 +32,8 @@ from ringfence.world import World
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,) of one environment
 OneCost = np.ndarray | dict[str, np.ndarray]  # (1,), or that by constraint
 
+UNGUARDED = "A certificate is of a guarded run; give one with guard=, or leave certificate= out."
+
 
 class Controller:
     """A policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
@@ -42,15 +46,32 @@ class Controller:
     actions (N, A), with `world=` and options of `ringfence.guard`. `info` says of the last action what is known of it,
     e.g. `ood`: the World knows nothing there. `policy` is what simulators of whole batches play. Not for several
     threads at once.
+
+    certificate: a file of `ringfence certify`, which must be of this run, World, guard and team. The margin is taken
+    from it. `info["covered"]` then says whether the guard kept its condition where its World knows its way: of other
+    steps the certificate counts how they end, and says no more.
     """
 
     def __init__(
-        self, run: Run | str | Path | Callable | Callback, planner: str = DEFAULT, seed: int = 0, **options: Any
+        self,
+        run: Run | str | Path | Callable | Callback,
+        planner: str = DEFAULT,
+        seed: int = 0,
+        certificate: str | Path | None = None,
+        **options: Any,
     ):
         keep_programs()
+        promised = None if certificate is None else Certificate.load(certificate)
+        if promised is not None:
+            if options.get("guard", "none") == "none":
+                raise UserError(UNGUARDED)
+            options = {"margin": promised.guard["margin"], **options}
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._source = _source(run, planner, options)
         self.policy: Policy = self._source.policy
+        self.certificate = promised
+        if promised is not None:
+            _require(promised, self._source)
         self.info: dict[str, np.ndarray] = Info()
         self.last_action: np.ndarray | None = None
         self.reset()
@@ -81,6 +102,8 @@ class Controller:
             key, now = jax.random.split(self._key)
             carry, step = source.act(self._carry, seen, paid, now)
             action, info = acted(step, source.name)
+            if self.certificate is not None:
+                info["covered"] = ~(info["infeasible"] | info["ood"])
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
         return action
 
@@ -196,6 +219,16 @@ def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _F
     found = in_float32(under_guard)(run, worlds.load(world) if isinstance(world, str | Path) else world, **options)
     assert isinstance(found, Callback)  # of whatever is no policy of the library
     return _Function(found)
+
+
+def _require(certificate: Certificate, source: _TrainedRun | _Function) -> None:
+    """Refuse a certificate of anybody else."""
+    one = agent_policy(source.policy)
+    if isinstance(source, _Function) or not isinstance(one, Guarded):
+        raise UserError(UNGUARDED)
+    guard = one.guard
+    options = dataclasses.asdict(guard.options)
+    certificate.require(one.proposal, guard.world, source.agents, options, guard.barrier.source)
 
 
 def _batch(seen: Seen) -> Seen:

@@ -67,8 +67,9 @@ def agent_policy(policy: Any) -> Any:
 def merge_agents(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     """What B N teams of one decided, as B teams of N."""
     info = {k: step.info[k].reshape(shape).any(1) for k in ("infeasible", "ood") if k in step.info}
-    if "clearance" in step.info:
-        info["clearance"] = step.info["clearance"].reshape(shape).min(1)
+    for name in ("clearance", "foreseen"):
+        if name in step.info:
+            info[name] = step.info[name].reshape(shape).min(1)
     return PolicyStep(step.action.reshape(*shape, -1), info)
 
 

@@ -1,0 +1,173 @@
+"""A margin is calibrated behind faults, and what it then promises is counted on fresh episodes.
+
+The score of an episode is the most by which reality fell short of foresight: over its steps, the least score of the
+state that an action was foreseen to lead to, less that of the state it led to. A guard whose margin covers it keeps
+that state's score at 0 or above, wherever it could keep its margin. The quantile over episodes is conformal (Vovk et
+al. 2005), but another margin makes other episodes. So it is raised until a fresh batch agrees, and frozen. Then new
+episodes are played, and the bound is exact (Clopper and Pearson 1934), whatever the calibration was worth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.datasets.task import Task
+from ringfence.envs.base import NativeEnv
+from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.rollout import FORESEEN, Played, rollout
+from ringfence.evaluation.statistics import upper_bound
+from ringfence.evaluation.stress import told
+from ringfence.faults import Faults, under_faults
+from ringfence.faults.certificate import Certificate, digest
+from ringfence.guards import Guard
+from ringfence.loading.resolve import Resolved, resolve
+from ringfence.loading.spec import PolicySpec
+from ringfence.problem.homogeneous import local_features
+from ringfence.training.runs import Run
+from ringfence.types import Array
+from ringfence.utils.compilation import keep_programs
+from ringfence.utils.precision import in_float32
+
+MAX_ROUNDS = 4  # of calibration
+WIDEST = 6.0  # margin: at more a guard does little but stand
+
+
+@in_float32
+def certify(
+    run: Run | str,
+    faults: Faults | Mapping[str, Any] | None = None,
+    *,
+    guard: str = "shield",
+    confidence: float = 0.95,
+    quantile: float = 0.95,
+    calibration: int = 100,
+    episodes: int = 300,
+    compensate: bool = True,
+    quiet: bool = True,
+    **options: Any,
+) -> Certificate:
+    """The certificate of a guarded run behind faults.
+
+    `calibration` episodes of each batch (validation resets) give the margin: the `quantile` of their shortfalls, where
+    it is above the guard's own. `episodes` fresh ones (test resets) give the bound at the given `confidence`. Other
+    options are as in `load` and `stress`.
+    """
+    faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
+    _check(confidence, quantile, calibration, episodes)
+    options = {**options, "guard": guard}
+    if compensate:
+        options |= told(faults, options)
+    keep_programs()
+    resolved = _resolved(run, options)
+    rounds: list[dict[str, float]] = []
+    agreed = False
+    while len(rounds) < MAX_ROUNDS and not agreed:
+        margin = _guard(resolved).options.margin
+        played = _played(resolved, faults, calibration, "validation", len(rounds), quiet)
+        found = conformal(shortfalls(resolved, played), quantile)
+        rounds.append({"margin": margin, "quantile": found, "episodes": calibration})
+        agreed = found <= margin
+        if not agreed and (len(rounds) == MAX_ROUNDS or margin >= WIDEST):
+            break
+        if not agreed:
+            resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
+    return _tested(resolved, faults, rounds, agreed, confidence, _played(resolved, faults, episodes, "test", 1, quiet))
+
+
+def conformal(scores: np.ndarray, quantile: float) -> float:
+    """The ⌈(n + 1) q⌉-th smallest of n scores: a fresh one is within it with probability q; infinite where n is too
+    small to say."""
+    rank = math.ceil((len(scores) + 1) * quantile)
+    return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
+
+
+def shortfalls(resolved: Resolved, played: Played) -> np.ndarray:
+    """(E,) by how much the states that actions led to scored less than was foreseen, at worst; 0 where never."""
+    guard = _guard(resolved)
+    late = guard.options.delay
+    foreseen = played[FORESEEN][:, : played[FORESEEN].shape[1] - late]
+    came = judged(guard, resolved.job.task, played["states"])[:, late:]
+    return np.maximum(foreseen - came, 0.0).max(1)
+
+
+def judged(guard: Guard, task: Task, states: np.ndarray) -> np.ndarray:
+    """(E, L) the least score of each state after the first (E, L+1, S), as the guard's barrier has it."""
+    env = task.simulator
+
+    @jax.jit
+    def of_episode(states: Array) -> Array:
+        observations = None if isinstance(env, NativeEnv) else env.observe(env.from_global_state(states))
+        x = local_features(guard.world.map, task.homogeneous, observations, states)
+        x = x.reshape(len(states), -1, *x.shape[1:])
+        scores = guard.barrier.now(x[:-1], x[1:])
+        return scores.reshape(len(scores), -1).min(-1)
+
+    return np.stack([np.asarray(of_episode(jnp.asarray(one))) for one in states])
+
+
+def _check(confidence: float, quantile: float, calibration: int, episodes: int) -> None:
+    for name, value in (("confidence", confidence), ("quantile", quantile)):
+        if not 0 < value < 1:
+            raise UserError(f"{name}={value} must lie between 0 and 1; 0.95 is usual.")
+    whole_number("episodes", episodes, 1, 10**7)
+    whole_number("calibration", calibration, 1, 10**7)
+    least = math.ceil(quantile / (1 - quantile) - 1e-9)
+    if calibration < least:
+        raise UserError(f"calibration={calibration} episodes tell no quantile of {quantile:g}; give {least} or more.")
+
+
+def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
+    resolved = resolve(PolicySpec.of(run, **options))
+    if resolved.guard is None:
+        raise UserError("A certificate is of a guarded run; name a guard with guard=, e.g. shield.")
+    if resolved.guard.options.adapt:
+        raise UserError("An adapting margin cannot be frozen; certify a guard whose margin stays, e.g. shield.")
+    if isinstance(resolved.job.task.simulator, NativeEnv):
+        raise UserError(f"'{resolved.job.task.name}' steps outside JAX, where nothing is certified yet.")
+    return resolved
+
+
+def _guard(resolved: Resolved) -> Guard:
+    assert resolved.guard is not None, "refused before"
+    return resolved.guard
+
+
+def _played(resolved: Resolved, faults: Faults, episodes: int, split: str, batch: int, quiet: bool) -> Played:
+    task = resolved.job.task
+    policy = under_faults(resolved.team, faults, task)
+    margin = _guard(resolved).options.margin
+    label = f"{task.name} behind {faults.name}, margin {margin:.3g}"
+    seed = resolved.run.config["seed"]
+    return rollout(policy, task.simulator, episodes, split, seed, 0, label, quiet, batch, foreseen=True)
+
+
+def _tested(
+    resolved: Resolved, faults: Faults, rounds: list[dict[str, float]], agreed: bool, confidence: float, played: Played
+) -> Certificate:
+    guard = _guard(resolved)
+    violations = int((played["costs"].sum(1) > 0).sum())
+    episodes = len(played["costs"])
+    return Certificate(
+        policy=digest(resolved.proposal),
+        world=digest(guard.world),
+        task=resolved.job.task.name,
+        agents=resolved.job.team,
+        guard=dataclasses.asdict(guard.options),
+        barrier=resolved.spec.barrier,
+        faults=dataclasses.asdict(faults),
+        confidence=confidence,
+        bound=upper_bound(violations, episodes, confidence),
+        episodes=episodes,
+        violations=violations,
+        rounds=tuple(rounds),
+        agreed=agreed,
+        held=float((shortfalls(resolved, played) <= guard.options.margin).mean()),
+        infeasible_rate=float(played["infeasible"].mean()),
+    )
