@@ -6,6 +6,7 @@ nothing by steps that it knows.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
 SAFE_STEPS = 120_000  # likewise
 FOLDS = 3
 SUFFICIENT = 0.3  # share of unsafe steps, beyond what others explain, at which a cell is dangerous
+CLEAR = 0.8  # probability of danger of cells whose neighbours may hold an edge
 PRIOR = 2.0  # safe visits that every cell is taken to have had
 
 
@@ -60,6 +62,7 @@ class Counted:
     cells: Cells  # of all steps
     safe: np.ndarray  # (T,) or (T, N) log P(safe) by this cause
     called: np.ndarray  # (T,) or (T, N) bool: called unsafe as the cause is scored later, also where nobody was
+    near: np.ndarray  # (T,) or (T, N) bool: within a cell of danger, so that it may well explain an unsafe step
     gain: float = 0.0  # log likelihood of a step, beyond what was explained
     error: float = 0.0  # standard error of the gain over episodes
 
@@ -91,12 +94,31 @@ def _sampled(bad: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.sort(np.concatenate([rows, rng.choice(fine, count, replace=False)]))
 
 
-def counted(steps: Steps, cause: Cause, explained: np.ndarray) -> Counted:
-    """The cause, by what others leave unexplained: `explained` is log P(safe) of the steps by them."""
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """What several causes tell of the steps, the worst of them."""
+
+    safe: np.ndarray  # (T,) or (T, N) log P(safe)
+    near: np.ndarray  # (T,) or (T, N) bool
+
+    @classmethod
+    def by(cls, steps: Steps, chosen: Sequence[Counted]) -> Explained:
+        nothing = np.zeros(steps.unsafe.shape)
+        safe = np.minimum.reduce([nothing, *[one.safe for one in chosen]])
+        return cls(safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
+
+    def left(self, unsafe: np.ndarray) -> np.ndarray:
+        """(T,) or (T, N) how much of each unsafe step is still to be explained. At the edge of a cause that is nothing:
+        cells are too coarse to tell, and what they leave there is no cause of its own."""
+        return np.exp(self.safe) * unsafe * ~self.near
+
+
+def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
+    """The cause, by what others leave unexplained."""
     low, high, bins, _ = steps.cells(told_of(cause, ()))
     cell, agents = steps.picked(cause)
     size = bins**cause.width
-    left = np.exp(explained) * steps.unsafe
+    left = explained.left(steps.unsafe)
     of = agents if steps.each else np.zeros(len(agents), int)
     place = (cell + size * steps.fold[:, None]).ravel()
     bad = np.bincount(place, _by(left, of).ravel(), FOLDS * size).reshape(FOLDS, size)
@@ -107,14 +129,28 @@ def counted(steps: Steps, cause: Cause, explained: np.ndarray) -> Counted:
     others = _danger(all_bad - bad, all_fine - fine, usual)  # (FOLDS, size)
     if not others.any():
         nothing = np.zeros(steps.unsafe.shape)
-        return Counted(cells, nothing, nothing > 0)
+        return Counted(cells, nothing, nothing > 0, nothing > 0)
     safe = _worst(steps, np.log1p(-others)[steps.fold[:, None], cell], agents)
     called = safe < np.log(0.5)
     if not cause.length:
         seen = all_bad + all_fine - bad - fine > 0
         called |= _worst(steps, np.where(seen, 0.0, -1.0)[steps.fold[:, None], cell], agents) < 0
-    gained = gain(steps, explained, safe)
-    return Counted(cells, safe, called, *gained)
+    edge = _grown_by_one((others > CLEAR).reshape(FOLDS, *[bins] * cause.width)).reshape(FOLDS, size)
+    near = _worst(steps, np.where(edge, -1.0, 0.0)[steps.fold[:, None], cell], agents) < 0
+    return Counted(cells, safe, called, near, *gain(steps, explained, safe))
+
+
+def _grown_by_one(cells: np.ndarray) -> np.ndarray:
+    """Cells (FOLDS, bins, ...), and those next to them."""
+    for axis in range(1, cells.ndim):
+        ahead, behind = np.zeros_like(cells), np.zeros_like(cells)
+        inner = [slice(None)] * cells.ndim
+        first, last = inner.copy(), inner.copy()
+        first[axis], last[axis] = slice(1, None), slice(None, -1)
+        ahead[tuple(first)] = cells[tuple(last)]
+        behind[tuple(last)] = cells[tuple(first)]
+        cells = cells | ahead | behind
+    return cells
 
 
 def _by(values: np.ndarray, of: np.ndarray) -> np.ndarray:
@@ -140,9 +176,11 @@ def _worst(steps: Steps, each: np.ndarray, agents: np.ndarray) -> np.ndarray:
     return found
 
 
-def gain(steps: Steps, explained: np.ndarray, safe: np.ndarray) -> tuple[float, float]:
+def gain(steps: Steps, explained: Explained, safe: np.ndarray) -> tuple[float, float]:
     """(log likelihood that a cause adds to a step, its standard error over episodes)."""
-    more = likelihood(steps, np.minimum(explained, safe)) - likelihood(steps, explained)
+    more = likelihood(steps, np.minimum(explained.safe, safe)) - likelihood(steps, explained.safe)
+    more = np.where(steps.unsafe & explained.near, 0.0, more)
+    more = more if more.ndim == 1 else more.sum(1)
     totals = np.bincount(steps.episode, more)
     totals = totals[np.bincount(steps.episode) > 0]
     error = totals.std() * np.sqrt(len(totals)) / len(more)
@@ -150,12 +188,11 @@ def gain(steps: Steps, explained: np.ndarray, safe: np.ndarray) -> tuple[float, 
 
 
 def likelihood(steps: Steps, safe: np.ndarray) -> np.ndarray:
-    """(T,) log likelihood of the steps; what no cause explains is as frequent as in all."""
+    """(T,) or (T, N) log likelihood of the steps; what no cause explains is as frequent as in all."""
     open_ = safe > -1e-6
     leak = np.clip(steps.unsafe[open_].mean() if open_.any() else 0.0, 1e-4, 1 - 1e-4)
     chance = np.clip(1 - np.exp(safe) * (1 - leak), 1e-4, 1 - 1e-4)
-    each = np.where(steps.unsafe, np.log(chance), np.log1p(-chance))
-    return each if each.ndim == 1 else each.sum(1)
+    return np.where(steps.unsafe, np.log(chance), np.log1p(-chance))
 
 
 def _range(steps: Steps, cause: Cause) -> tuple[np.ndarray, np.ndarray]:

@@ -18,11 +18,11 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.cause_counts import Counted, Steps, counted, gain, likelihood, some_steps
+from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
 from ringfence.world.causes import Cause, Edge, Found, candidates, only_of, told_of, wider
 from ringfence.world.cells import CELLS, Cells
 
-VERSION = 7  # of the search: what was found by another is looked for again
+VERSION = 8  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -34,7 +34,7 @@ AROUND = 3.0  # cells to either side that an edge is looked for in
 def radius(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, cause: Cause) -> Edge:
     """Where one cause is dangerous, as steps tell it that look for no other."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng(0))
-    nothing = np.zeros(steps.unsafe.shape)
+    nothing = Explained.by(steps, [])
     return refined(steps, counted(steps, cause, nothing).cells.edge, cause, nothing)
 
 
@@ -61,26 +61,36 @@ def _grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     if n_agents > 1 and len(chosen) < MOST:
         alone = [one for cause in pool for one in only_of(cause, n_agents)]
         chosen = _added(steps, chosen, alone)
+        chosen = _simplified(steps, _pruned(steps, chosen), pool)
     return [_widened(steps, one, _without(steps, chosen, one), names) for one in chosen]
+
+
+def _simplified(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> list[Counted]:
+    """The causes of all agents as simple as they can be beside the others: what was found first may have stood for what
+    was found later, too."""
+    for k, one in enumerate(chosen):
+        if not one.cause.who:
+            related = [cause for cause in pool if set(cause.things[0]) <= set(one.cause.things[0])]
+            chosen[k] = _simplest(steps, related, _without(steps, chosen, one)) or one
+    return chosen
 
 
 def _added(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> list[Counted]:
     """These causes and more of the pool, while they tell something."""
     chosen = list(chosen)
-    explained = _together(steps, chosen)
-    least = LEAST_GAIN * -likelihood(steps, np.zeros(steps.unsafe.shape)).mean()
+    least = LEAST_GAIN * -likelihood(steps, np.zeros(steps.unsafe.shape)).sum() / len(steps.x)
     while len(chosen) < MOST:
+        explained = Explained.by(steps, chosen)
         best = _simplest(steps, pool, explained)
         if best is None or best.gain < max(least, SURE * best.error):
             break
         if best.cause.who:
             best = _gathered(steps, best, pool, explained)
         chosen.append(best)
-        explained = np.minimum(explained, best.safe)
     return chosen
 
 
-def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: np.ndarray) -> Counted:
+def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
     """The cause of a single agent as one of all for whom it holds likewise, one after the other."""
     things = best.cause.things
     length = best.cause.length
@@ -95,7 +105,7 @@ def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: np.
     return best
 
 
-def _widened(steps: Steps, one: Counted, explained: np.ndarray, names: Sequence[str]) -> Counted:
+def _widened(steps: Steps, one: Counted, explained: Explained, names: Sequence[str]) -> Counted:
     """The cause with more entries, where these tell clearly more; once simple ones tell what they can, so that a second
     cause is not taken for a part of the first."""
     best = counted(steps, one.cause, explained)
@@ -104,7 +114,7 @@ def _widened(steps: Steps, one: Counted, explained: np.ndarray, names: Sequence[
     return best
 
 
-def _simplest(steps: Steps, pool: Sequence[Cause], explained: np.ndarray) -> Counted | None:
+def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained) -> Counted | None:
     """The simplest cause of those that tell about as much as any."""
     gains = [counted(steps, cause, explained).gain for cause in pool]
     least = (1 - SIMPLER) * max(gains, default=0.0)
@@ -115,7 +125,7 @@ def _simplest(steps: Steps, pool: Sequence[Cause], explained: np.ndarray) -> Cou
     return counted(steps, best, explained)
 
 
-def _best_wider(steps: Steps, best: Counted, explained: np.ndarray, names: Sequence[str]) -> Counted | None:
+def _best_wider(steps: Steps, best: Counted, explained: Explained, names: Sequence[str]) -> Counted | None:
     """The cause with one more entry, where that tells clearly more."""
     tried = [counted(steps, cause, explained) for cause in wider(best.cause, names)]
     found = max(tried, key=lambda t: t.gain, default=None)
@@ -128,19 +138,14 @@ def _pruned(steps: Steps, chosen: list[Counted]) -> list[Counted]:
     """Without those that the rest make needless."""
     for one in sorted(chosen, key=lambda t: t.gain):
         rest = [t for t in chosen if t is not one]
-        more, error = gain(steps, _together(steps, rest), one.safe)
+        more, error = gain(steps, Explained.by(steps, rest), one.safe)
         if rest and more < max(LEAST_GAIN * 0.5, NEEDED * error):
             chosen = rest
     return chosen
 
 
-def _without(steps: Steps, chosen: list[Counted], one: Counted) -> np.ndarray:
-    return _together(steps, [t for t in chosen if t is not one])
-
-
-def _together(steps: Steps, chosen: list[Counted]) -> np.ndarray:
-    """Log P(safe) by several causes: the worst counts."""
-    return np.minimum.reduce([np.zeros(steps.unsafe.shape), *[t.safe for t in chosen]])
+def _without(steps: Steps, chosen: list[Counted], one: Counted) -> Explained:
+    return Explained.by(steps, [t for t in chosen if t is not one])
 
 
 def _summary(steps: Steps, chosen: list[Counted]) -> Found:
@@ -152,19 +157,19 @@ def _summary(steps: Steps, chosen: list[Counted]) -> Found:
     return Found(tuple(one.cause for one in chosen), round(share, 4), round(false_alarms, 4), shares)
 
 
-def refined(steps: Steps, edge: Edge, cause: Cause, explained: np.ndarray) -> Edge:
+def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edge:
     """The edge with bounds between the values that parted unsafe steps from safe ones, finer than cells are."""
     if not edge.bounds:
         return edge
     agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
     values = cause.of(steps.x)[:, agents, things, 0]
     value = _of_the_worst(steps, values, signed(values, edge), agents)
-    told = np.exp(explained) > 0.5
+    left = explained.left(steps.unsafe) > 0.5
     size = (edge.high[0] - edge.low[0]) / CELLS[1]
     bounds = list(edge.bounds)
     for k, bound in enumerate(edge.bounds):
         near = np.abs(value - bound) < AROUND * size
-        bad, fine = value[near & steps.unsafe & told], value[near & ~steps.unsafe]
+        bad, fine = value[near & left], value[near & ~steps.unsafe]
         if not edge.unseen[k] and len(bad) and len(fine):
             bounds[k] = _parting(bad, fine, low_is_bad=(k % 2 == 0) == edge.inside)
     seen = [bound for bound, unseen in zip(bounds, edge.unseen) if not unseen]
