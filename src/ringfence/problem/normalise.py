@@ -103,9 +103,13 @@ def to_unit(action: Array, low: Bound, high: Bound) -> Array:
 
 
 def from_unit(action: Array, low: Bound, high: Bound) -> Array:
-    """Inverse of `to_unit`."""
+    """Inverse of `to_unit`. Where entries have bounds of their own, nothing lies beyond them: simulators refuse an
+    action whose last bit does."""
     middle, half = _middle_and_half(low, high)
-    return middle + half * action
+    action = middle + half * action
+    if isinstance(low, int | float) and isinstance(high, int | float):
+        return action
+    return action.clip(np.asarray(low, np.float32), np.asarray(high, np.float32))
 
 
 def in_units_of(wanted: Spec, given: Spec, action: Array) -> Array:
