@@ -174,6 +174,21 @@ def test_a_followed_plan_is_remembered(planner, small_store, tmp_path):
     assert apart(call, told, played(planner, small_store, noisy=True, **options)) <= 1e-5
 
 
+def test_a_flow_keeps_its_driver(small_store, small_world, tmp_path):
+    """The driver is drawn from the noise that a file is given, and carried; also under a guard."""
+    changes = dict(num_updates=4, batch=8, width=16, depth=2, drivers=4)
+    flow = loop.train("flow", small_store, changes=changes, quiet=True, out=tmp_path)[0]
+    steps = played(flow, small_store, noisy=True)
+    call, told = of_stablehlo(exporting.export(flow, tmp_path / "f", "stablehlo"))
+    assert {"memory.driver", "memory.age"} <= {x["name"] for x in told["inputs"]}
+    assert apart(call, told, steps) <= 1e-5
+    guarded = {**FULL, "num_samples": 3, "world": small_world}
+    steps = played(flow, small_store, noisy=True, **guarded)
+    assert apart(*of_stablehlo(exporting.export(flow, tmp_path / "g", "stablehlo", **guarded)), steps) <= 1e-5
+    pytest.importorskip("jax2onnx")
+    assert apart(*of_onnx(exporting.export(flow, tmp_path / "f.onnx")), played(flow, small_store, noisy=True)) <= 1e-5
+
+
 def test_agents_who_are_alike(own_store, tmp_path):
     """Learned of three of them, without states; a file is of as many as are asked for."""
     names = own_store.card.observation_names

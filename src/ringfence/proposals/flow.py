@@ -48,6 +48,12 @@ def _asked(seen: Array, score: Array, keep: Array) -> Array:
     return jnp.stack([jnp.where(keep, score, 0.0), keep.astype(seen.dtype)], -1)
 
 
+def _gumbel(normal: Array) -> Array:
+    """Gumbel noise from normal noise, the only one that exported files can be given."""
+    share = jnp.clip(0.5 * (1.0 + jax.lax.erf(normal / 2**0.5)), 1e-6, 1.0 - 1e-6)
+    return -jnp.log(-jnp.log(share))
+
+
 class FlowPolicy(eqx.Module):
     """Follows one of the drivers that the logs were found to hold; which one is drawn when an episode begins."""
 
@@ -82,7 +88,7 @@ class FlowPolicy(eqx.Module):
         x = self.feature_map(observations, state)
         carry, key = self._with_driver(carry, x, key)
         action = self.draw(x, carry["driver"], key)
-        return carry, PolicyStep(from_unit(action, self.spec), {"driver": carry["driver"]})
+        return carry, PolicyStep(from_unit(action, self.spec), {})
 
     def propose(
         self, carry: PyTree, observations: Array, state: Array, key: Key, count: int, rows: int, world: World
@@ -100,7 +106,7 @@ class FlowPolicy(eqx.Module):
 
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
         actions = rolled(act, self.feature_map, world, seen, present, rows)
-        return carry, actions.reshape(batch, count, *actions.shape[2:]), {"driver": carry["driver"]}
+        return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
     def draw(self, x: Array, driver: Array, key: Key) -> Array:
         """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,)."""
@@ -144,4 +150,4 @@ class FlowPolicy(eqx.Module):
         batch = x.shape[0]
         seen = self.normaliser.state(x).reshape(batch, -1)
         logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
-        return jnp.argmax(logits + jax.random.gumbel(key, logits.shape), -1).astype(jnp.int32)
+        return jnp.argmax(logits + _gumbel(jax.random.normal(key, logits.shape)), -1).astype(jnp.int32)
