@@ -18,6 +18,7 @@ from ringfence.evaluation.stress import stress
 OUT = Path(__file__).resolve().parent.parent / "results" / "stress" / "crossing-hasty.csv"
 FIELDS = ("faults", "guard", "told", "episodes", "return", "violation_rate", "violation_upper", "infeasible_rate")
 DELAYS = [{}, {"delay": 1}, {"delay": 2}, {"delay": 3}]
+FARTHER = {"margin": 1.5, "horizon": 5}  # chosen on 50 validation episodes with three late steps
 OTHERS = [
     {"drop": 0.3},
     {"drop": 0.6},
@@ -41,21 +42,29 @@ def main() -> None:
         run = zoo.pretrained("crossing-hasty/bc", folder)
         for faults in DELAYS if a.delays else DELAYS + OTHERS:
             told = bool(faults.keys() & {"delay", "drop"})
-            for how in (False, True) if told else (False,):
-                row = _row(run, faults, how, a.episodes, done)
+            trials = [
+                (False, {}),
+                *([(True, {})] if told else []),
+                *([(True, FARTHER)] if faults == {"delay": 3} else []),
+            ]
+            for how, options in trials:
+                row = _row(run, faults, how, options, a.episodes, done)
                 if row is not None:
                     print(row, flush=True)
                     _rows.append(a.out, row, FIELDS)
 
 
-def _row(run: Any, faults: dict[str, Any], told: bool, episodes: int, done: set) -> dict[str, Any] | None:
+def _row(
+    run: Any, faults: dict[str, Any], told: bool, options: dict[str, Any], episodes: int, done: set
+) -> dict[str, Any] | None:
     name = "+".join(f"{k}{v}" for k, v in faults.items()) or "none"
-    if (name, "shield", str(told)) in done:
+    guard = ", ".join(["shield", *(f"{k} {v}" for k, v in options.items())])
+    if (name, guard, str(told)) in done:
         return None
-    result = stress(run, faults, episodes=episodes, guard="shield", compensate=told)
+    result = stress(run, faults, episodes=episodes, guard="shield", compensate=told, **options)
     return {
         "faults": name,
-        "guard": "shield",
+        "guard": guard,
         "told": told,
         "episodes": episodes,
         "return": round(result["return_mean"], 3),

@@ -22,6 +22,7 @@ from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults, Faulty, under_faults
 from ringfence.faults.certificate import Certificate
+from ringfence.faults.monitor import Monitor
 from ringfence.guards.policy import build
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load, resolve
@@ -305,3 +306,44 @@ def test_a_margin_is_calibrated_and_its_promise_kept_to_whom_it_was_made(run, fe
 def test_what_cannot_be_certified_is_refused(run, given, words):
     with pytest.raises(UserError, match=words):
         certify(run, {}, **given)
+
+
+# --- monitor ---
+
+
+def test_a_kept_promise_seldom_raises_an_alarm_and_a_broken_one_soon():
+    rng = np.random.default_rng(0)
+
+    def first_alarm(rate, episodes):
+        monitor = Monitor(0.03)
+        for k in range(episodes):
+            if monitor.observe(bool(rng.random() < rate)):
+                return k + 1
+        return np.inf
+
+    kept = [first_alarm(0.03, 200) for _ in range(400)]
+    assert np.isfinite(kept).mean() <= 0.02  # 1 % is promised, of all episodes to come
+    assert np.median([first_alarm(0.6, 50) for _ in range(200)]) <= 5
+    assert np.isfinite([first_alarm(0.1, 600) for _ in range(50)]).mean() > 0.9, "little is found out, too"
+    for wrong in ({"rate": 0.0}, {"rate": 0.1, "false_alarms": 1.0}, {"rate": float("nan")}):
+        with pytest.raises(UserError, match="must lie between 0 and 1"):
+            Monitor(**wrong)
+    with pytest.raises(UserError, match="must be true or false"):
+        Monitor(0.1).observe(0.3)
+
+
+def test_a_controller_is_told_how_old_observations_are(run):
+    env = Crossing()
+    seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1)))[0]
+    controller = Controller(run, guard="shield", max_age=2, **LIGHT)
+    fresh = controller.act(seen)
+    for _ in range(3):
+        controller.act(seen)
+    carry = controller._aged(np.array([0, 1, 2, 0, 0, 0, 0, 0]))
+    np.testing.assert_array_equal(carry["observed_age"][:, 0], [0, 1, 2, 0, 0, 0, 0, 0])
+    assert controller.act(seen, age=2).shape == fresh.shape
+    for age, words in ((3, "age=3 is more than max_age=2"), (-1, "must be a whole number"), (0.5, "must be a whole")):
+        with pytest.raises(UserError, match=words):
+            controller.act(seen, age=age)
+    with pytest.raises(UserError, match="age is read by nothing here"):
+        Controller(run).act(seen, age=1)

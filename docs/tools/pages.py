@@ -43,6 +43,7 @@ REFERENCE = {
         "ringfence.faults.faults",
         "ringfence.evaluation.certify",
         "ringfence.faults.certificate",
+        "ringfence.faults.monitor",
         "ringfence.evaluation.simulators",
         "ringfence.logs.collect",
         "ringfence.evaluation.reference",

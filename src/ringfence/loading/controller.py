@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import LAST_SEED, UserError, whole_number
@@ -16,7 +17,7 @@ from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_
 from ringfence.guards.wrap import Callback, under_guard
 from ringfence.loading.resolve import load
 from ringfence.problem.constraints import Hazard
-from ringfence.problem.homogeneous import PerAgent, agent_policy
+from ringfence.problem.homogeneous import PerAgent, agent_policy, team_policy
 from ringfence.proposals.base import act_with, with_cost
 from ringfence.proposals.options import DEFAULT
 from ringfence.training import worlds
@@ -88,24 +89,51 @@ class Controller:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._carry = self.policy.initial_state(1)
 
-    def act(self, observations: np.ndarray, state: np.ndarray | None = None, cost: Paid | None = None) -> np.ndarray:
+    def act(
+        self,
+        observations: np.ndarray,
+        state: np.ndarray | None = None,
+        cost: Paid | None = None,
+        age: int | np.ndarray | None = None,
+    ) -> np.ndarray:
         """(N, A) joint action within the task's bounds; a callable is asked with the same arrays. `cost` is what the
         last step cost, in all or by each constraint's name, which an adapting guard follows. Arrays of another shape
         than the run's or the World's are refused, and so is what is not finite: indices beyond an array's end would be
-        clipped in silence, and noise would follow NaN.
+        clipped in silence, and noise would follow NaN. `age` is how many steps old the observations are, of all or of
+        each agent, for a guard with `max_age`.
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
         source = self._source
         with no_safe_action(self.last_action):
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
+            before = self._carry if age is None else self._aged(age)
             key, now = jax.random.split(self._key)
-            carry, step = source.act(self._carry, seen, paid, now)
+            carry, step = source.act(before, seen, paid, now)
             action, info = acted(step, source.name)
             if self.certificate is not None:
                 info["covered"] = ~(info["infeasible"] | info["ood"])
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
         return action
+
+    @in_float32
+    def _aged(self, age: Any) -> PyTree:
+        """The carry with how old the next observations are."""
+        agents = self._source.agents
+        steps = np.asarray(age)
+        if steps.dtype.kind not in "iu" or steps.shape not in ((), (agents,)) or steps.min() < 0:
+            raise UserError(f"age={str(age)[:60]} must be a whole number of steps, 0 or more, or one of each agent.")
+        guarded = self.policy.guarded if isinstance(self.policy, Callback) else agent_policy(self.policy)
+        if not isinstance(guarded, Guarded) or not guarded.guard.options.max_age:
+            raise UserError(
+                "age is read by nothing here; give a guard with max_age=, up to which it makes good for it."
+            )
+        if steps.max() > guarded.guard.options.max_age:
+            raise UserError(
+                f"age={steps.max()} is more than max_age={guarded.guard.options.max_age}; stop, or give a larger one."
+            )
+        team = team_policy(guarded, agents, guarded.guard.world.spec.homogeneous)
+        return team.observe_age(self._carry, jnp.broadcast_to(jnp.asarray(steps, jnp.int32), (1, agents)))
 
 
 @in_float32
