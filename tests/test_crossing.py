@@ -59,14 +59,15 @@ def test_a_unicycle_moves_along_its_heading():
 @pytest.mark.parametrize("room", [{}, {"n_agents": 64}, {"n_agents": 3, "obstacles": 4, "walls": True}])
 def test_everybody_starts_at_rest_and_free_and_the_state_tells_all(room):
     env = Crossing(**room)
-    state = env.reset(jax.random.key(1), 50)
+    state = jax.jit(env.reset, static_argnums=1)(jax.random.key(1), 50)
     assert float(env.clearance(state).min()) > 0.05 and float(jnp.abs(state.velocity).max()) == 0
     again = env.from_global_state(env.global_state(state))
     assert all(jnp.array_equal(a, b) for a, b in zip(state, again))
     assert env.global_state(state).shape[-1] == len(env.state_names)
-    assert env.observe(state).shape[-1] == len(env.observation_names) == env.observation_dim
+    assert jax.eval_shape(env.observe, state).shape[-1] == len(env.observation_names) == env.observation_dim
     push = jax.random.uniform(jax.random.key(2), (50, env.n_agents, 2), minval=-1.0, maxval=1.0)
-    (a, told), (b, same) = env.step(state, push), env.step(again, push)
+    step = jax.jit(env.step)
+    (a, told), (b, same) = step(state, push), step(again, push)
     assert all(jnp.array_equal(x, y) for x, y in zip((*a, *told), (*b, *same)))  # even where a goal is drawn anew
 
 
@@ -78,9 +79,9 @@ def comes_within(offset, speed) -> float:
 
 def test_agents_see_first_who_comes_near():
     env = Crossing(n_agents=12)
-    state = env.reset(jax.random.key(3), 4)
+    state = jax.jit(env.reset, static_argnums=1)(jax.random.key(3), 4)
     state = state._replace(velocity=jax.random.normal(jax.random.key(4), state.velocity.shape))
-    seen, names = np.asarray(env.observe(state)), env.observation_names
+    seen, names = np.asarray(jax.jit(env.observe)(state)), env.observation_names
     p, v = np.asarray(state.position), np.asarray(state.velocity)
     at = names.index("other0.dx")
     for b, i in ((0, 0), (2, 7), (3, 11)):
@@ -95,7 +96,7 @@ def test_agents_see_first_who_comes_near():
                 np.testing.assert_array_equal(told, [SIGHT, 0, 0, 0, 0])
     assert Crossing(n_agents=3).observation_names == names  # a smaller team looks the same
     few = Crossing(n_agents=3)
-    assert few.observe(few.reset(jax.random.key(0), 2))[..., at + 10 + 4 :: 5].max() == 0
+    assert jax.jit(lambda: few.observe(few.reset(jax.random.key(0), 2)))()[..., at + 10 + 4 :: 5].max() == 0
 
 
 def test_costs_are_of_those_who_touch():
@@ -114,12 +115,14 @@ def test_costs_are_of_those_who_touch():
 def test_what_is_foreseen_of_others_who_coast_is_exact():
     """Everything follows from the agents' own velocities, rows ahead, as long as nobody is pushed."""
     env = Crossing(n_agents=4)
-    state = env.reset(jax.random.key(0), 20)
+    step = jax.jit(env.step)
+    observe = jax.jit(env.observe)
+    state = jax.jit(env.reset, static_argnums=1)(jax.random.key(0), 20)
     state = state._replace(velocity=0.3 * jax.random.normal(jax.random.key(1), state.velocity.shape))
-    rows = [env.observe(state)]
+    rows = [observe(state)]
     for _ in range(4):
-        state, _ = env.step(state, jnp.zeros((20, 4, 2)))
-        rows.append(env.observe(state))
+        state, _ = step(state, jnp.zeros((20, 4, 2)))
+        rows.append(observe(state))
     came = jnp.stack(rows, 1)
     view = env.feature_map("pruned")
     plan = jnp.repeat(came[:, :1], 5, 1).at[..., :2].set(came[..., :2])
