@@ -15,6 +15,7 @@ from ringfence.datasets import registry
 from ringfence.deploy import zoo
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
+from ringfence.guards.wrap import Nothing
 from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
@@ -75,7 +76,7 @@ def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):
 
     for _ in range(2):
         loaded = worlds.load(file)
-        start(guards.policy.build(guards.wrap.Nothing(), loaded, constraints.Separation(), "shield", "both"))
+        start(guards.policy.build(Nothing(), loaded, constraints.Separation(), "shield", "both"))
     assert len(traced) == 1
     others = [dataclasses.replace(loaded.map, view="other"), dataclasses.replace(loaded.map, plus=loaded.map.plus + 1)]
     assert all(loaded.map != other for other in others) and loaded.map == dataclasses.replace(loaded.map)
