@@ -75,13 +75,24 @@ class Logged:
         """Rows of the longest episode."""
         return int(self.store.lengths.max()) + 1
 
+    def picked(self, name: str, index: np.ndarray) -> np.ndarray:
+        """Entries of an array, picked on the host: JAX compiles a program for every shape that it picks."""
+        return np.asarray(self.arrays[name])[index]
+
+    def before(self, steps: np.ndarray) -> np.ndarray:
+        """(W, N, D) the states before steps."""
+        return self.picked("features", self.picked("row", steps))
+
+    def after(self, steps: np.ndarray) -> np.ndarray:
+        """(W, N, D) the states after steps."""
+        return self.picked("features", self.picked("row", steps) + 1)
+
     def predicted(self, dynamics: Dynamics) -> Array:
         """(T, N, D) where every step's actions are predicted to lead."""
         parts = []
         for start in range(0, self.store.steps, AT_ONCE):
-            steps = slice(start, start + AT_ONCE)
-            before = self.arrays["features"][self.arrays["row"][steps]]
-            parts.append(_after(dynamics, before, self.arrays["actions"][steps]))
+            steps = np.arange(start, min(start + AT_ONCE, self.store.steps))
+            parts.append(_after(dynamics, self.before(steps), self.picked("actions", steps)))
         return jnp.concatenate(parts)
 
     def close_to_danger(self) -> np.ndarray:

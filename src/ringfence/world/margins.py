@@ -25,22 +25,20 @@ MISSED = 0.001  # share of entries that may look as safe as a cause's own margin
 
 def rolled(dynamics: Dynamics, logged: Logged, starts: np.ndarray, ahead: int) -> tuple[Array, Array]:
     """Rows (W, K, N, D) and disagreement (W, K, N) from the states before steps, along the logged actions."""
-    row = logged.arrays["row"][starts]
-    last = logged.store.steps - 1
-    actions = jnp.stack([logged.arrays["actions"][np.minimum(starts + k, last)] for k in range(ahead)])
-    rows, spread = _roll(dynamics, logged.arrays["features"][row], actions)
-    return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
+    along = np.minimum(starts + np.arange(ahead)[:, None], logged.store.steps - 1)
+    return _roll(dynamics, logged.before(starts), logged.picked("actions", along))
 
 
 @jax.jit
 def _roll(dynamics: Dynamics, x: Array, actions: Array) -> tuple[Array, Array]:
-    """Rows (K, W, N, D) and disagreement (K, W, N) along actions (K, W, N, A)."""
+    """Rows (W, K, N, D) and disagreement (W, K, N) along actions (K, W, N, A)."""
 
     def step(x: Array, action: Array) -> tuple[Array, tuple[Array, Array]]:
         after, spread = dynamics.step(x, action)
         return after, (after, spread)
 
-    return jax.lax.scan(step, x, actions)[1]
+    rows, spread = jax.lax.scan(step, x, actions)[1]
+    return jnp.moveaxis(rows, 0, 1), jnp.moveaxis(spread, 0, 1)
 
 
 def conformal(values: np.ndarray, level: float) -> float:
@@ -93,8 +91,9 @@ def predicted_ends(dynamics: Dynamics, logged: Logged, ends: np.ndarray) -> list
         if not len(start):
             continue
         rows, _ = rolled(dynamics, logged, start, back + 1)
-        before = logged.arrays["features"][row[start]] if back == 0 else rows[:, -2]
-        found.append((before, rows[:, -1]))
+        rows = np.asarray(rows)
+        before = logged.before(start) if back == 0 else rows[:, -2]
+        found.append((jnp.asarray(before), jnp.asarray(rows[:, -1])))
     return found
 
 

@@ -67,7 +67,7 @@ def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Ed
 def _radius(cause: Cause, logged: Logged) -> Edge:
     steps = logged.fitted_steps
     rows = np.asarray(logged.arrays["row"])[steps] + 1
-    x = np.asarray(logged.arrays["features"][rows])
+    x = logged.picked("features", rows)
     return cause_search.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
 
 
@@ -76,7 +76,7 @@ def _states(logged: Logged, rng: np.random.Generator) -> Array:
     held = logged.held_steps
     fine = held[~logged.unsafe[held]]
     fine = rng.choice(fine, min(STATES, len(fine)), replace=False)
-    return logged.arrays["features"][np.asarray(logged.arrays["row"])[fine] + 1]
+    return jnp.asarray(logged.after(fine))
 
 
 def _put(

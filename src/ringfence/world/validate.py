@@ -115,7 +115,7 @@ def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generat
     starts = rng.choice(starts, min(WINDOWS, len(starts)), replace=False)
     predicted, _ = rolled(dynamics, logged, starts, ahead)
     row = np.asarray(logged.arrays["row"])[starts]
-    came = np.stack([np.asarray(logged.arrays["features"][row + k]) for k in range(ahead + 1)], 1)
+    came = logged.picked("features", row[:, None] + np.arange(ahead + 1))
     error = _rms(np.asarray(predicted) - came[:, 1:])
     change = _rms(came[:, 1:] - came[:, :1])
     scale = np.maximum(np.asarray(dynamics.scale), 1e-9)
@@ -138,10 +138,10 @@ def _coasted(logged: Logged, starts: np.ndarray, ahead: int) -> np.ndarray:
     row = row[row > first]
     if not len(row):
         return np.full((ahead, len(logged.map.names)), np.nan)
-    x = logged.arrays["features"]
-    now = np.asarray(x[row])
-    moved = now - np.asarray(x[row - 1])
-    errors = [now + k * moved - np.asarray(x[row + k]) for k in range(1, ahead + 1)]
+    x = np.asarray(logged.arrays["features"])
+    now = x[row]
+    moved = now - x[row - 1]
+    errors = [now + k * moved - x[row + k] for k in range(1, ahead + 1)]
     return _rms(np.stack(errors, 1))
 
 
@@ -170,9 +170,9 @@ def _threshold(dynamics: Dynamics, logged: Logged) -> Threshold:
 
 def _value_scores(values: Values, logged: Logged, alone: bool, rng: np.random.Generator) -> ValueScores:
     steps = rng.choice(logged.held_steps, min(STEPS, len(logged.held_steps)), replace=False)
-    row = logged.arrays["row"][steps]
-    x = logged.arrays["features"]
-    reward, value = _valued(values, x[row], logged.arrays["actions"][steps], x[row + 1], alone)
+    before = jnp.asarray(logged.before(steps))
+    actions = jnp.asarray(logged.picked("actions", steps))
+    reward, value = _valued(values, before, actions, jnp.asarray(logged.after(steps)), alone)
     rewards = np.asarray(logged.arrays["rewards"])[steps].mean(1)
     returns = np.asarray(logged.returns_to_go(values.discount))[steps]
     return ValueScores(
@@ -264,13 +264,12 @@ def recall(barrier: Barrier, logged: Logged) -> float:
 
 def _scored(barrier: Barrier | MinBarrier, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """ℓ of steps and V of where they lead, each (W,), of the agent in most danger."""
-    x = logged.arrays["features"]
     now = []
     ahead = []
     for start in range(0, len(steps), SCORED):
-        row = np.asarray(logged.arrays["row"])[steps[start : start + SCORED]]
-        after = x[row + 1]
-        now.append(np.asarray(_score(barrier, x[row], after)))
+        some = steps[start : start + SCORED]
+        after = logged.after(some)
+        now.append(np.asarray(_score(barrier, logged.before(some), after)))
         ahead.append(np.asarray(_score_ahead(barrier, after)))
     return np.concatenate(now), np.concatenate(ahead)
 
@@ -319,7 +318,8 @@ def _avoidable(
     asked = {k: ends for k, ends in asked.items() if len(ends)}
     start = np.concatenate([ends - (k - 1) for k, ends in asked.items()])
     left = np.minimum(np.arange(max(BEFORE))[:, None], (last - row - 1)[start][None])
-    found = np.asarray(_avoided(dynamics, barrier, arrays["features"][row[start]], arrays["actions"][start + left]))
+    x = np.asarray(arrays["features"])[row[start]]
+    found = np.asarray(_avoided(dynamics, barrier, x, np.asarray(arrays["actions"])[start + left]))
     parts = np.split(found, np.cumsum([len(ends) for ends in asked.values()])[:-1])
     shares = {k: float(part.mean()) for k, part in zip(asked, parts)}
     most = max(shares.values())
