@@ -272,7 +272,7 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
         UserError, match="fitted with execution=decentralized, the guard is to have execution=centralized"
     ):
         load(run, guard="shield", world=alone)
-    same = worlds.fit(small_store, **QUICK_WORLD)
+    same = worlds.fit(small_store, causes=False, **QUICK_WORLD)
     with pytest.raises(UserError, match="unfit to guard by"):
         evaluate(run, episodes=2, guard="shield", world=same)
     result = evaluate(run, episodes=2, guard="shield", world=same, anyway=True)

@@ -252,10 +252,10 @@ def test_what_was_foreseen_is_compared_with_the_state_that_it_was_of(run, few):
     policy = under_faults(resolved.team, Faults(delay=2), task)
     played = rollout(policy, task.simulator, 4, foreseen=True)
     came = judged(resolved.guard, task, played["states"])
-    error = [np.abs(played["foreseen"][:, :90] - came[:, lag : 90 + lag]).mean() for lag in range(5)]
+    error = [np.abs(played["next_clearance"][:, :90] - came[:, lag : 90 + lag]).mean() for lag in range(5)]
     assert np.argmin(error) == 2
     assert (shortfalls(resolved, played) >= 0).all()
-    assert "foreseen" not in rollout(policy, task.simulator, 4)
+    assert "next_clearance" not in rollout(policy, task.simulator, 4)
 
 
 def test_a_margin_is_calibrated_and_its_promise_kept_to_whom_it_was_made(run, few, tmp_path):

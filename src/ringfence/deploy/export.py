@@ -49,7 +49,7 @@ from ringfence.utils.renamed import renamed
 
 FORMATS = ("onnx", "stablehlo")
 OPSET = 21  # of ONNX: onnxruntime 1.20 (2024) and younger read it
-INFO = ("clearance", "infeasible", "ood", "chosen")  # of what a policy tells, what is one number
+INFO = ("clearance", "next_clearance", "infeasible", "ood", "chosen")  # of what a policy tells, what is one number
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from ringfence.utils.progress import Progress
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
 CHUNK = 50  # episodes per compiled batch
 COUNTED = ("infeasible", "ood")  # of every step: a guard's condition could not be met; its World knew nothing there
-FORESEEN = "foreseen"  # by the guard: the least score of the state that its action leads to
+FORESEEN = "next_clearance"  # by the guard: the least score of the state that its action leads to
 CUT = ("reward", "cost", "state", "violated", FORESEEN, *COUNTED)  # of as many episodes as were asked for
 
 Played = dict[str, np.ndarray]

@@ -125,7 +125,7 @@ class Guarded(HadStart, eqx.Module):
             "plans": found.rows,
             "chosen": found.chosen,
             "clearance": found.safety.min(-1),
-            "foreseen": found.first.min(-1),
+            "next_clearance": found.first.min(-1),
             "infeasible": found.short.any(-1),
             "ood": found.ood.any(-1),
         }

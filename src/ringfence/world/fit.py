@@ -32,13 +32,12 @@ from ringfence.utils.cache import cache_dir
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
-from ringfence.world import cause_search, dynamics, validate, values
+from ringfence.world import cause_search, dynamics, margins, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
-from ringfence.world.margins import in_own_margins
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
@@ -93,7 +92,14 @@ def fit_view(
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
-    content = [validate.VERSION, cause_search.VERSION, store.content, features.to_dict(map), *_bounds(store)]
+    content = [
+        validate.VERSION,
+        cause_search.VERSION,
+        margins.VERSION,
+        store.content,
+        features.to_dict(map),
+        *_bounds(store),
+    ]
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     file = parts.file("world", list(PARTS), content)
@@ -248,7 +254,7 @@ def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
     plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition
     if not plain or logged.map.shared_body or logged.map.joint:
         return Found()
-    content = [moved, cause_search.VERSION, _digest(logged.label)]
+    content = [moved, cause_search.VERSION, _digest(logged.label), logged.map.names]
     found = parts.json("causes", content, Found, lambda: search.result[0])
     return found if found.explained >= EXPLAINED else Found()
 
@@ -292,7 +298,15 @@ def _labelled(
 
 def _about(search: _Search, moved: str, found: Found) -> list[Any]:
     """What a barrier is made of, beside its settings."""
-    return [moved, _digest(search.logged.label), cause_search.VERSION, msgspec.to_builtins(found)]
+    logged = search.logged
+    return [
+        moved,
+        _digest(logged.label),
+        cause_search.VERSION,
+        margins.VERSION,
+        logged.map.names,
+        msgspec.to_builtins(found),
+    ]
 
 
 def _with_future(
@@ -348,7 +362,7 @@ def _label(
             width=settings.barrier_width,
             quiet=quiet,
         )
-        nets = in_own_margins(nets, acts, logged, np.random.default_rng(0))
+        nets = margins.in_own_margins(nets, acts, logged, np.random.default_rng(0))
         return dataclasses.replace(blank, causes=nets)
     return cbf.fit_label(
         blank,

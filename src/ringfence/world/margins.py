@@ -16,6 +16,7 @@ from ringfence.world.cause_nets import Score, least_margin, with_margin, worst
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 
+VERSION = 2  # of margins of causes: scores of another are learned again
 WINDOWS = 3000  # entries, and safe steps, that margins are read from
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin
@@ -123,7 +124,6 @@ def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndar
     predicted = np.concatenate([np.asarray(part) for part in of_ends])
     missed = max(MISSED, OUTLIERS / len(predicted))
     of_safe = np.asarray(lowest(worst([net], safe)))
-    margin = calibrated(predicted, of_safe, missed)
-    if (of_safe >= margin).mean() < BEARABLE:
-        margin = 0.0  # what cannot be foreseen is not bought by any margin
+    bearable = float(np.quantile(of_safe, 1 - BEARABLE))  # what cannot be foreseen is not bought by any margin
+    margin = min(conformal(predicted, 1 - missed), bearable)
     return with_margin(net, max(margin, least_margin(net)))
