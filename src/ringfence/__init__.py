@@ -27,6 +27,7 @@ _WHERE = {
     "certify": "ringfence.evaluation.certify",
     "collect": "ringfence.logs.collect",
     "ope": "ringfence.evaluation.ope",
+    "replay": "ringfence.evaluation.replay",
     "World": "ringfence.world",
     "fit": "ringfence.training.worlds",
     "load_world": "ringfence.training.worlds:load",

@@ -17,7 +17,7 @@ from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli.console import Refusals, complain
 from ringfence.cli.doctor import doctor
-from ringfence.cli.playing import AS_IT_IS, Assignments, How, assignments
+from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
@@ -489,6 +489,64 @@ def ope(
         print(build_ope(report, world.card, audit(store), result))
 
 
+def replay(
+    run: Positional[Path],
+    data: Positional[str],
+    kinematics: Literal["double_integrator", "holonomic", "unicycle", "bicycle", "world"] | None = None,
+    wheelbase: float = 2.7,
+    radius: float | None = None,
+    windows: int = 300,
+    steps: int | None = None,
+    every_episode: bool = False,
+    seed: int = 0,
+    out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
+    report: Path | None = None,
+    playing: How = Playing(guard="shield"),  # noqa: B008
+) -> None:
+    """Judge a policy and its guard by logs alone: one agent is driven, the others do what they did. Contacts without
+    and with guard are counted, by the run and by drivers that are bad on purpose, in windows that do not overlap.
+
+    Args:
+        run: folder of a trained run, or the file of a World, which then guards the bad drivers alone.
+        data: a store of its task, best one that neither was trained on (or a task, whose data set is regenerated).
+        kinematics: how the driven agent moves; by default a double integrator where that explains the logs, else the
+            World's.
+        wheelbase: m, of a bicycle.
+        radius: m between two agents below which they touch; by default the task's formula, else as costs tell it.
+        windows: at most so many, drawn evenly.
+        steps: of a window; 8 s by default.
+        every_episode: replay all episodes, not only those that a World of this seed held out.
+        seed: of which episodes were held out, and of what policies draw.
+        out_file: write the result as JSON.
+        report: write an HTML page.
+    """
+    from ringfence.evaluation.replay import replay as replayed
+    from ringfence.report.replay_page import build_replay
+    from ringfence.training.runs import write_json
+
+    given = playing.arguments()
+    out_file = None if out_file is None else writable(out_file)
+    report = None if report is None else writable(report)
+    policy = None if run.is_file() else _runs([run])[0]
+    if policy is None:
+        given["world"] = playing.world or run
+    how: dict[str, Any] = {
+        "kinematics": kinematics,
+        "wheelbase": wheelbase,
+        "radius": radius,
+        "windows": windows,
+        "steps": steps,
+    }
+    result = replayed(policy, _store(data), seed=seed, every_episode=every_episode, **how, **given)
+    for line in result.summary():
+        out.print(lines(line), soft_wrap=True)
+    if out_file is not None:
+        write_json(out_file, result.to_json())
+        print(out_file)
+    if report is not None:
+        print(build_replay(report, result))
+
+
 def report(
     runs: Positional[list[Path]], out_file: Annotated[Path, tyro.conf.arg(name="out")] = Path("report.html")
 ) -> None:
@@ -534,6 +592,7 @@ COMMANDS = {
     "export": export,
     "bench": bench_commands.bench,
     "ope": ope,
+    "replay": replay,
     "report": report,
     "demo": demo,
     "doctor": doctor,

@@ -1,0 +1,312 @@
+"""Replays: one agent driven by a policy, the others as logged; with and without guard, in the same windows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ringfence.datasets import registry
+from ringfence.datasets.task import Task
+from ringfence.errors import LAST_SEED, UserError, known, whole_number
+from ringfence.evaluation.replay.drivers import DRIVERS
+from ringfence.evaluation.replay.motion import kinematics_of
+from ringfence.evaluation.replay.result import Film, ReplayResult, Row
+from ringfence.evaluation.replay.scene import NOBODY, Motion, Names, motion_of, windows_of
+from ringfence.evaluation.replay.stage import Driven, Stage
+from ringfence.guards import GUARDS
+from ringfence.guards.policy import Guarded, build
+from ringfence.guards.wrap import Nothing
+from ringfence.loading.resolve import resolve
+from ringfence.loading.spec import PolicySpec
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem import constraints
+from ringfence.training import worlds
+from ringfence.training.runs import Run
+from ringfence.utils.compilation import keep_programs
+from ringfence.utils.precision import in_float32
+from ringfence.world import World
+from ringfence.world.logged import held_out
+
+SECONDS = 8.0  # of a window, by default
+LONG = 2.0  # s that the formula looks ahead
+TELLS = 0.75  # balanced accuracy below which distances do not tell costs
+FILMS = 3
+
+
+@in_float32
+def replay(
+    policy: Run | str | Path | None,
+    store: EpisodeStore,
+    *,
+    world: World | str | Path | None = None,
+    guard: str = "shield",
+    barrier: str | None = None,
+    drivers: Sequence[str] = tuple(DRIVERS),
+    kinematics: str | None = None,
+    wheelbase: float = 2.7,
+    radius: float | None = None,
+    steps: int | None = None,
+    windows: int = 300,
+    every_episode: bool = False,
+    baselines: bool = True,
+    anyway: bool = False,
+    seed: int = 0,
+    **options: Any,
+) -> ReplayResult:
+    """Contacts that a guard prevents and causes where one agent is driven and all others do what they did.
+
+    policy: a run, or None for the bad `drivers` alone, which hold speed and course (straight), speed up (accelerate),
+    go to the goal as fast as any did (hasty), or to the nearest (seek). `world` guards (default: the run's), and
+    `options` are those of `load`. Windows of `steps` (8 s) do not overlap and lie in the episodes that a World of
+    `seed` held out, or in `every_episode`; each agent is driven in turn, in `windows` windows at most. Contact is being
+    closer than `radius` m to another: by default the task's formula, else the distance that best tells the logged
+    unsafe steps. `kinematics` is a name of KINEMATICS. `baselines` adds a brake that takes everybody's velocity for
+    constant, and a guard that knows the formula, along 2 s.
+
+    Others do not react: what drives into a driven agent from behind counts as its contact, too.
+    """
+    keep_programs()
+    _check(drivers, guard, windows, steps, seed)
+    task = registry.from_store(store)
+    store = task.logs(store)
+    names = Names.of(store)
+    names.check(store.card.task)
+    run = None if policy is None else Run.of(policy)
+    if run is not None and run.config["task"] != store.card.task:
+        raise UserError(f"The run is of '{run.config['task']}', the logs are of '{store.card.task}'; replay its own.")
+    told: dict[str, Any] = {"barrier": barrier} if barrier else {}
+    if world is not None:
+        told["world"] = world if isinstance(world, World) else worlds.load(world)
+    guarded = _guarded(run, task, guard, told | options, anyway) if guard != "none" else None
+    known_world = guarded.guard.world if guarded is not None else told.get("world")
+    if known_world is not None:
+        check_view(known_world, store)
+    motion = motion_of(store, names)
+    radius, source = radius_of(store, motion, radius)
+    stage, left_out = _stage(
+        store, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
+    )
+    filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
+    notes = [] if left_out == 0 else [f"{left_out} windows begin in contact and are left out."]
+    if baselines and known_world is not None:
+        formula = _formula(known_world, radius, stage.windows.dt)
+        filters |= {"formula": formula} if formula else {}
+        notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
+    shown: list[Played] = []
+    if run is not None:
+        plain = stage.play(resolve(PolicySpec.of(run)).policy)
+        under = {} if guarded is None else {guard: stage.play(guarded)}
+        shown.append(Played(run.config["algorithm"], plain, under))
+    for name in drivers:
+        under = {filter: stage.play(name, one) for filter, one in filters.items()}
+        if baselines:
+            under["brake"] = stage.play(name, brake=True)
+        shown.append(Played(name, stage.play(name), under))
+    return ReplayResult(
+        task=store.card.task,
+        radius=float(radius),
+        radius_from=source,
+        kinematics=stage.kinematics.name,
+        steps=stage.windows.steps,
+        seconds=stage.windows.steps * stage.windows.dt,
+        windows=stage.windows.count,
+        begun_in_contact=left_out,
+        guard=guard,
+        verdict=_verdict(known_world),
+        rows=tuple(row for one in shown for row in rows_of(stage, one)),
+        notes=tuple(notes),
+        films=tuple(film for one in shown if guard in one.under for film in [_film(stage, one, guard)])[:FILMS],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Played:
+    """A driver's windows without a filter, and under each."""
+
+    name: str
+    plain: Driven
+    under: dict[str, Driven]
+
+
+def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool) -> Guarded:
+    """The run under guard, or a guard of whatever is proposed."""
+    if run is not None:
+        found = resolve(PolicySpec.of(run, guard=guard, anyway=anyway, **options)).policy
+        assert isinstance(found, Guarded), "a guard was named"
+        return found
+    spec = PolicySpec.of(guard=guard, anyway=anyway, **options)
+    if not isinstance(spec.world, World):
+        raise UserError("Nothing says which World guards; give world=, e.g. ringfence.fit(store), or a run.")
+    changes = dict(spec.guard_options)
+    return build(Nothing(), spec.world, task.hazard, guard, spec.barrier, anyway=anyway, **changes)
+
+
+def _verdict(world: World | None) -> str | None:
+    return None if world is None or world.card.verdict is None else world.card.verdict.word
+
+
+def _check(drivers: Sequence[str], guard: str, windows: int, steps: int | None, seed: int) -> None:
+    for name in drivers:
+        known("driver", name, DRIVERS)
+    known("guard", guard, GUARDS)
+    whole_number("windows", windows, 1)
+    whole_number("seed", seed, 0, LAST_SEED)
+    if steps is not None:
+        whole_number("steps", steps, 1)
+
+
+def check_view(world: World, store: EpisodeStore) -> None:
+    """Refuse a World of other agents, entries, bounds or time steps than these logs have."""
+    width, state_width = world.widths
+    there = 0 if store.state is None else store.state.shape[1]
+    shape = (store.n_agents, store.observations.shape[2], store.actions.shape[2])
+    wanted = (world.spec.n_agents, width or shape[1], world.spec.action_dim)
+    if shape != wanted or (world.map.reads_state and there < (state_width or 1)):
+        raise UserError(
+            f"The World reads {wanted[0]} agents of {wanted[1]} entries and {wanted[2]} actions, the logs hold "
+            f"{shape[0]} of {shape[1]} and {shape[2]}; fit a World to these logs."
+        )
+    names = store.card.observation_names
+    if names and not world.map.reads_state:
+        for name, entry in zip(world.map.names, world.map.plus[0]):
+            if names[int(entry)] != name:
+                raise UserError(
+                    f"The World reads '{name}' where these logs hold '{names[int(entry)]}'; fit a World to these logs."
+                )
+    mine = [np.asarray(bound, float) for bound in (world.spec.action_low, world.spec.action_high)]
+    theirs = [np.asarray(bound, float) for bound in store.card.bounds]
+    if not all(np.allclose(a, b, rtol=1e-4) for a, b in zip(mine, theirs)):
+        raise UserError(
+            f"The World's actions are within {mine[0].tolist()} and {mine[1].tolist()}, those of these logs within "
+            f"{theirs[0].tolist()} and {theirs[1].tolist()}; fit a World to these logs."
+        )
+    if world.map.dt is not None and store.card.dt is not None and not np.isclose(world.map.dt, store.card.dt):
+        raise UserError(
+            f"The World steps by {world.map.dt:g} s, these logs by {store.card.dt:g} s; import them with that dt."
+        )
+
+
+def _stage(
+    store: EpisodeStore,
+    motion: Motion,
+    world: World | None,
+    kinematics: str | None,
+    wheelbase: float,
+    radius: float,
+    steps: int | None,
+    most: int,
+    every_episode: bool,
+    seed: int,
+) -> tuple[Stage, int]:
+    """The stage, and how many windows begin in contact."""
+    if store.card.dt is None:
+        raise UserError(f"The card of '{store.card.task}' does not say how long a step takes; give it dt (s).")
+    dt = float(store.card.dt)
+    chosen = np.arange(store.episodes) if every_episode else np.flatnonzero(held_out(store, seed))
+    longest = int(np.median(store.lengths[chosen]))
+    steps = steps or max(1, min(round(SECONDS / dt), longest))
+    cut, left_out = windows_of(store, chosen, steps, most, radius, dt, store.card.homogeneous)
+    body = kinematics_of(kinematics, store, motion, world, dt, wheelbase)
+    return Stage(cut, body, radius, seed), left_out
+
+
+def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple[float, str]:
+    """(m, where it is from): as given, the task's own, or the distance that best tells the logged unsafe steps."""
+    if given is not None:
+        if not 0 < given < np.inf:
+            raise UserError(f"radius={given!r} must be a number of metres above 0.")
+        return float(given), "given"
+    hazard = store.hazard
+    parts = hazard.hazards if isinstance(hazard, constraints.All) else (hazard,)
+    told = [part.radius for part in parts if isinstance(part, constraints.Separation)]
+    if told:
+        return told[0], "the task's formula"
+    row = np.arange(store.steps) + store.episode_of_step + 1
+    distance = np.linalg.norm(motion.offset[row], axis=-1).min(-1)  # (T, N)
+    unsafe = store.costs > 0
+    if unsafe.ndim == 1:
+        distance = distance.min(-1)
+    distance = distance.ravel()
+    unsafe = unsafe.ravel()
+    if not unsafe.any() or unsafe.all():
+        raise UserError(f"Nothing says how close is contact: the costs of '{store.card.task}' are alike; give radius=.")
+    order = np.argsort(distance, kind="stable")
+    hit = unsafe[order]
+    balance = (np.cumsum(hit) / hit.sum() + 1 - np.cumsum(~hit) / (~hit).sum()) / 2
+    best = int(balance.argmax())
+    if balance[best] < TELLS or distance[order[best]] >= NOBODY:
+        raise UserError(
+            f"No distance tells which steps of '{store.card.task}' are unsafe (the best is right in "
+            f"{100 * balance[best]:.0f} %); give radius=."
+        )
+    after = distance[order[min(best + 1, len(order) - 1)]]
+    return float((distance[order[best]] + min(after, 2 * distance[order[best]])) / 2), "the logged costs"
+
+
+def _formula(world: World, radius: float, dt: float) -> Guarded | None:
+    """A shield that knows the distance, along 2 s; None where the World's view does not hold places of others."""
+    hazard = constraints.Separation(radius, 0.25 * radius)
+    if constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents) is None:
+        return None
+    rows = int(np.clip(round(LONG / dt), 3, 20))
+    return build(Nothing(), world, hazard, "shield", "analytic", {}, horizon=rows)
+
+
+def rows_of(stage: Stage, played: Played) -> list[Row]:
+    logged = int((stage.windows.nearest_logged[:, 1:] < stage.radius).any(-1).sum())
+    plain = played.plain.contact
+    made = []
+    for filter, found in {"none": played.plain, **played.under}.items():
+        clearance = found.info.get("clearance")
+        made.append(
+            Row(
+                policy=played.name,
+                filter=filter,
+                windows=stage.windows.count,
+                logged=logged,
+                alone=int(plain.sum()),
+                contacts=int(found.contact.sum()),
+                prevented=int((plain & ~found.contact).sum()),
+                caused=int((~plain & found.contact).sum()),
+                infeasible=_share(found, "infeasible"),
+                ood=_share(found, "ood"),
+                margin=None if clearance is None else float(np.median(clearance)),
+                by_agent=_by_agent(stage.windows.driven, found),
+            )
+        )
+    return made
+
+
+def _share(found: Driven, name: str) -> float | None:
+    return float(found.info[name].mean()) if name in found.info else None
+
+
+def _by_agent(driven: np.ndarray, found: Driven) -> tuple[dict[str, Any], ...]:
+    """What the guard says while each agent is driven."""
+    made = []
+    for agent in np.unique(driven):
+        own = driven == agent
+        told = {name: float(value[own].mean()) for name, value in found.info.items()}
+        made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **told})
+    return tuple(made)
+
+
+def _film(stage: Stage, played: Played, guard: str) -> Film:
+    """The first window that the guard changes for the better, else for the worse, else the first."""
+    plain, guarded = played.plain, played.under[guard]
+    better = np.flatnonzero(plain.contact & ~guarded.contact)
+    worse = np.flatnonzero(~plain.contact & guarded.contact)
+    k = int([*better[:1], *worse[:1], 0][0])
+    what = "a contact prevented" if len(better) else "a contact caused" if len(worse) else "the first window"
+    w = stage.windows
+    return Film(
+        title=f"{played.name} under {guard}: {what}",
+        others=w.others_at[k],
+        logged=w.place[k],
+        alone=plain.place[k],
+        guarded=guarded.place[k],
+    )

@@ -1,0 +1,308 @@
+"""Windows of logs in which one agent is driven, and what everybody would observe while it is."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.logs.store import EpisodeStore
+from ringfence.problem.features import others
+
+AXES = ("x", "y")
+NOBODY = 1e6  # m: how far away is who is not there
+
+
+@dataclass(frozen=True, eq=False)
+class Names:
+    """Which entries of observations (O) and of the state (S) say what."""
+
+    observation: dict[str, int]
+    state: dict[str, int]
+    agents: int
+
+    @classmethod
+    def of(cls, store: EpisodeStore) -> Names:
+        names = store.card.observation_names or ()
+        states = store.card.state_names or () if store.state is not None else ()
+        return cls({n: d for d, n in enumerate(names)}, {n: d for d, n in enumerate(states)}, store.n_agents)
+
+    def pair(self, pattern: str) -> list[int] | None:
+        """Entries of x and y, where both are observed; `pattern` as own.v{}."""
+        found = [self.observation.get(pattern.format(axis)) for axis in AXES]
+        return None if None in found else [d for d in found if d is not None]
+
+    def state_pair(self, pattern: str) -> list[int] | None:
+        found = [self.state.get(pattern.format(axis)) for axis in AXES]
+        return None if None in found else [d for d in found if d is not None]
+
+    def pairs(self, pattern: str, count: int) -> list[list[int]] | None:
+        """The pairs of `count` things, e.g. other{}.d{{}}, where all are observed."""
+        found = [self.pair(pattern.format(j)) for j in range(count)]
+        return None if None in found else [pair for pair in found if pair is not None]
+
+    def state_pairs(self, pattern: str) -> list[list[int]] | None:
+        """The same of every agent in the state."""
+        found = [self.state_pair(pattern.format(j)) for j in range(self.agents)]
+        return None if None in found else [pair for pair in found if pair is not None]
+
+    @cached_property
+    def slots(self) -> int:
+        """How many others are observed relative to an agent."""
+        count = 0
+        while self.pair(f"other{count}.d{{}}") is not None:
+            count += 1
+        return count
+
+    @cached_property
+    def placed(self) -> bool:
+        """Whether everybody's place is known."""
+        told = self.pair("own.{}") is not None and self.agents > 1
+        return told or (self.agents > 1 and self.state_pairs("agent{}.{{}}") is not None)
+
+    def check(self, task: str) -> None:
+        """Refuse logs that cannot be replayed."""
+        if not self.slots and self.agents < 2:
+            raise UserError(
+                f"'{task}' has one agent and observes no other, so nobody can be replayed; give logs of two."
+            )
+        if not self.slots and not self.placed:
+            raise UserError(
+                f"The logs of '{task}' hold no places: name entries other0.dx and other0.dy, or own.x and own.y, or "
+                "agent0.x and agent0.y of the state."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What M logged moments say of each agent's motion."""
+
+    place: np.ndarray | None  # (M, N, 2) m; None: to be summed up from velocities
+    velocity: np.ndarray | None  # (M, N, 2) m/s; None: by differences
+    offset: np.ndarray  # (M, N, K, 2) m to others, NOBODY where nobody is seen
+    seen: np.ndarray  # (M, N, K) bool
+
+
+def motion_of(store: EpisodeStore, names: Names) -> Motion:
+    """The motion in all rows of a store."""
+    x = np.asarray(store.observations, np.float64)
+    n = store.n_agents
+    place = None
+    if own := names.pair("own.{}"):
+        place = x[..., own]
+    elif store.state is not None and (where := names.state_pairs("agent{}.{{}}")):
+        place = np.asarray(store.state, np.float64)[:, where]
+    elif goal := names.pair("goal.d{}"):
+        place = -x[..., goal]
+    seen = np.ones((len(x), n, names.slots or n - 1), bool)
+    if names.slots:
+        offset = x[..., np.array(names.pairs("other{}.d{{}}", names.slots))]
+        for j in range(names.slots):
+            if f"other{j}.seen" in names.observation:
+                seen[..., j] = x[..., names.observation[f"other{j}.seen"]] > 0.5
+    else:
+        assert place is not None, "checked before"
+        offset = place[:, others(n)] - place[:, :, None]
+    offset = np.where(seen[..., None], offset, NOBODY)
+    return Motion(place, _velocities(store, names, x), offset, seen)
+
+
+def _velocities(store: EpisodeStore, names: Names, x: np.ndarray) -> np.ndarray | None:
+    if pair := names.pair("own.v{}"):
+        return x[..., pair]
+    if store.state is not None and (where := names.state_pairs("agent{}.v{{}}")):
+        return np.asarray(store.state, np.float64)[:, where]
+    entry = names.observation
+    speed = entry.get("own.v", entry.get("own.speed"))
+    if speed is not None and "own.cos" in entry and "own.sin" in entry:
+        return x[..., [entry["own.cos"], entry["own.sin"]]] * x[..., speed, None]
+    return None
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """W windows of L steps; in each of them agent `driven` (W,) is driven. Rows are L+1."""
+
+    names: Names
+    sorted: bool  # others are observed in the order of their distance
+    driven: np.ndarray
+    episode: np.ndarray  # (W,)
+    start: np.ndarray  # (W,) step of the episode
+    observations: np.ndarray  # (W, L+1, N, O)
+    state: np.ndarray | None  # (W, L+1, S)
+    actions: np.ndarray  # (W, L, N, A) as logged
+    place: np.ndarray  # (W, L+1, 2) of the driven agent, as logged
+    velocity: np.ndarray  # (W, L+1, 2)
+    offset: np.ndarray  # (W, L+1, K, 2) to others, from its logged place
+    goal: np.ndarray  # (W, 2)
+    dt: float  # s
+
+    @property
+    def count(self) -> int:
+        return len(self.driven)
+
+    @property
+    def steps(self) -> int:
+        return self.actions.shape[1]
+
+    @cached_property
+    def others_at(self) -> np.ndarray:
+        """(W, L+1, K, 2) places of the others."""
+        return self.place[:, :, None] + self.offset
+
+    @cached_property
+    def others_move(self) -> np.ndarray:
+        """(W, L+1, K, 2) m/s: as observed, or by differences."""
+        if drift := self.names.pairs("other{}.dv{{}}", self.names.slots):
+            mine = self.observations[np.arange(self.count), :, self.driven]
+            return mine[..., np.array(drift)] + self.velocity[:, :, None]
+        moved = np.diff(self.others_at, axis=1) / self.dt
+        return np.concatenate([moved, moved[:, -1:]], 1)
+
+    def distances(self, t: int, place: np.ndarray) -> np.ndarray:
+        """(W, K) m from places (W, 2) to the others at row t."""
+        return np.linalg.norm(self.others_at[:, t] - place[:, None], axis=-1)
+
+    @cached_property
+    def nearest_logged(self) -> np.ndarray:
+        """(W, L+1) m to the nearest other, as logged."""
+        return np.linalg.norm(self.offset, axis=-1).min(-1)
+
+    def observed(
+        self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Observations (W, N, O) and state (W, S) at row t, where the driven agent is at `place` (W, 2) and moves with
+        `velocity` (W, 2), turned to `heading` (W,)."""
+        moved = place - self.place[:, t]
+        faster = velocity - self.velocity[:, t]
+        x = np.array(self.observations[:, t], np.float64)
+        rows = np.arange(self.count)
+        mine = x[rows, self.driven]
+        self._own(mine, moved, faster, velocity, heading)
+        self._others(mine, moved, faster)
+        x[rows, self.driven] = mine
+        self._as_others_see(x, moved, faster)
+        return x.astype(np.float32), self._whole(t, moved, faster)
+
+    def _own(self, mine, moved, faster, velocity, heading) -> None:
+        for pattern, change in (("own.{}", moved), ("own.v{}", faster), ("goal.d{}", -moved)):
+            if pair := self.names.pair(pattern):
+                mine[:, pair] += change
+        along = (velocity * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)
+        known = {"own.v": along, "own.speed": along, "own.cos": np.cos(heading), "own.sin": np.sin(heading)}
+        for name, value in (known | {"own.heading": heading, "own.yaw": heading, "own.theta": heading}).items():
+            if name in self.names.observation:
+                mine[:, self.names.observation[name]] = value
+
+    def _others(self, mine, moved, faster) -> None:
+        """What the driven agent sees of others; those who are not there stay where nobody is."""
+        for j in range(self.names.slots):
+            seen = np.ones((self.count, 1))
+            if f"other{j}.seen" in self.names.observation:
+                seen = mine[:, self.names.observation[f"other{j}.seen"], None] > 0.5
+            mine[:, self.names.pair(f"other{j}.d{{}}")] -= moved * seen
+            if pair := self.names.pair(f"other{j}.dv{{}}"):
+                mine[:, pair] -= faster * seen
+        if self.sorted and self.names.slots > 1:
+            self._sort(mine)
+
+    def _sort(self, mine: np.ndarray) -> None:
+        whats = [m[1] for n in self.names.observation if (m := re.fullmatch(r"other0\.(\w+)", n))]
+        entries = np.array([[self.names.observation[f"other{j}.{w}"] for w in whats] for j in range(self.names.slots)])
+        blocks = mine[:, entries]  # (W, K, C)
+        far = np.hypot(blocks[..., whats.index("dx")], blocks[..., whats.index("dy")])
+        if "seen" in whats:
+            far = np.where(blocks[..., whats.index("seen")] > 0.5, far, NOBODY)
+        order = np.argsort(far, -1, kind="stable")
+        mine[:, entries] = np.take_along_axis(blocks, order[..., None], 1)
+
+    def _as_others_see(self, x, moved, faster) -> None:
+        """What others see of the driven agent, in teams in which everybody sees everybody."""
+        n = self.names.agents
+        if self.names.slots != n - 1:
+            return
+        whose = others(n)
+        for j in range(n):
+            for slot, who in enumerate(whose[j]):
+                about = (self.driven == who)[:, None]
+                for pattern, change in ((f"other{slot}.d{{}}", moved), (f"other{slot}.dv{{}}", faster)):
+                    if pair := self.names.pair(pattern):
+                        x[:, j, pair] += change * about
+
+    def _whole(self, t: int, moved: np.ndarray, faster: np.ndarray) -> np.ndarray | None:
+        if self.state is None:
+            return None
+        state = np.array(self.state[:, t], np.float64)
+        for i in range(self.names.agents):
+            about = (self.driven == i)[:, None]
+            for pattern, change in ((f"agent{i}.{{}}", moved), (f"agent{i}.v{{}}", faster)):
+                if pair := self.names.state_pair(pattern):
+                    state[:, pair] += change * about
+        return state.astype(np.float32)
+
+
+def windows_of(
+    store: EpisodeStore, episodes: np.ndarray, steps: int, most: int, radius: float, dt: float, homogeneous: bool
+) -> tuple[Windows, int]:
+    """Windows of `steps` in the episodes (E,) that do not overlap, each agent driven in turn, at most `most` drawn
+    evenly; and how many were left out because they begin in contact."""
+    names = Names.of(store)
+    motion = motion_of(store, names)
+    first = np.concatenate([[0], store.episode_ends[:-1]])
+    found = [(e, s) for e in episodes for s in range(0, int(store.lengths[e]) - steps + 1, steps)]
+    if not found:
+        longest = int(store.lengths[episodes].max())
+        raise UserError(f"No held-out episode has {steps} steps (the longest has {longest}); give fewer with steps=.")
+    pairs = np.array([(e, s, i) for e, s in found for i in range(store.n_agents)])
+    row0 = first[pairs[:, 0]] + pairs[:, 0] + pairs[:, 1]
+    touching = np.linalg.norm(motion.offset[row0, pairs[:, 2]], axis=-1).min(-1) < radius
+    if touching.all():
+        raise UserError(f"All {len(pairs)} windows begin closer than radius={radius:g} m; give a smaller radius.")
+    left_out = int(touching.sum())
+    keep = np.flatnonzero(~touching)
+    if len(keep) > most:
+        keep = keep[np.linspace(0, len(keep) - 1, most).astype(int)]
+    pairs = pairs[keep]
+    episode, start, driven = pairs.T
+    rows = row0[keep, None] + np.arange(steps + 1)
+    at = (first[episode] + start)[:, None] + np.arange(steps)
+    place, velocity = _tracks(motion, rows, driven, dt)
+    goal = place[:, -1]
+    if pair := names.pair("goal.d{}"):
+        goal = place[:, 0] + store.observations[rows[:, 0], driven][:, pair]
+    made = Windows(
+        names=names,
+        sorted=homogeneous,
+        driven=driven,
+        episode=episode,
+        start=start,
+        observations=store.observations[rows],
+        state=None if store.state is None else store.state[rows],
+        actions=store.actions[at],
+        place=place,
+        velocity=velocity,
+        offset=motion.offset[rows, driven[:, None]],
+        goal=goal,
+        dt=dt,
+    )
+    return made, left_out
+
+
+def _tracks(motion: Motion, rows: np.ndarray, driven: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and velocities (W, L+1, 2) of the driven agents."""
+    who = driven[:, None]
+    place = None if motion.place is None else motion.place[rows, who]
+    if motion.velocity is not None:
+        velocity = motion.velocity[rows, who]
+    elif place is not None:
+        moved = np.diff(place, axis=1) / dt
+        velocity = np.concatenate([moved[:, :1], moved], 1)
+    else:
+        raise UserError("The logs hold neither places nor velocities of the driven agent; name own.vx and own.vy.")
+    if place is None:
+        middle = (velocity[:, 1:] + velocity[:, :-1]) / 2 * dt
+        place = np.concatenate([np.zeros_like(middle[:, :1]), middle.cumsum(1)], 1)
+    return place, velocity

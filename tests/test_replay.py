@@ -1,0 +1,143 @@
+"""Replay: one agent driven, the others as logged, on walkers whose contacts are known by construction."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+import ringfence
+from ringfence.cli import app
+from ringfence.errors import UserError
+from ringfence.evaluation.replay.judge import Played, check_view, radius_of, rows_of
+from ringfence.evaluation.replay.motion import kinematics_of
+from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
+from ringfence.evaluation.replay.stage import Stage
+from ringfence.logs.store import EpisodeStore
+from ringfence.world import save
+from ringfence.world.card import Verdict
+from tests.quick import QUICK_WORLD
+
+DT, STEPS, EPISODES, RADIUS = 0.1, 40, 12, 0.5
+NAMES = ["own.vx", "own.vy", "other0.dx", "other0.dy", "other0.dvx", "other0.dvy"]
+
+
+def walkers(reach=2.0, **card) -> EpisodeStore:
+    """Two walk at 1 m/s toward a crossing, each `reach` m away. The first one brakes and stands 0.8 m before it, the
+    second one walks on. So nobody touches as logged; who drives the first one straight on touches in every episode,
+    and who drives the second one straight on never does.
+    """
+    turns = np.random.default_rng(0).uniform(0, 2 * np.pi, EPISODES)
+    along = np.stack([np.stack([np.cos(turns), np.sin(turns)], -1), np.stack([-np.sin(turns), np.cos(turns)], -1)], 1)
+    speed = np.ones((STEPS + 1, 2))
+    speed[:, 0] = np.clip(1.0 - 0.1 * (np.arange(STEPS + 1) - 7), 0, 1)
+    velocity = speed[None, :, :, None] * along[:, None]
+    moved = (velocity[:, 1:] + velocity[:, :-1]) / 2 * DT
+    place = np.concatenate([np.zeros_like(moved[:, :1]), moved.cumsum(1)], 1) - reach * along[:, None]
+    relative = [x[:, :, ::-1] - x for x in (place, velocity)]
+    given = {"task": "walkers", "dt": DT, "action_low": -2.0, "action_high": 2.0, "observation_names": NAMES}
+    costs = (np.linalg.norm(relative[0][:, 1:, 0], axis=-1) < RADIUS).astype(float)
+    return EpisodeStore.from_episodes(
+        np.concatenate([velocity, *relative], -1).astype(np.float32),
+        (np.diff(velocity, axis=1) / DT).astype(np.float32),
+        np.zeros((EPISODES, STEPS, 2), np.float32),
+        costs,
+        card=given | card,
+    )
+
+
+def stage_of(store: EpisodeStore) -> Stage:
+    motion = motion_of(store, Names.of(store))
+    cut, _ = windows_of(store, np.arange(store.episodes), STEPS, 300, RADIUS, DT, store.card.homogeneous)
+    return Stage(cut, kinematics_of(None, store, motion, None, DT, 2.7), RADIUS, 0)
+
+
+def test_who_drives_blindly_touches_and_a_guard_prevents_or_causes():
+    stage = stage_of(walkers())
+    assert stage.kinematics.name == "double_integrator"
+    assert stage.kinematics.gain == pytest.approx(DT, rel=1e-3)
+    straight = stage.play("straight")
+    first = stage.windows.driven == 0
+    assert straight.contact[first].all() and not straight.contact[~first].any()
+    np.testing.assert_allclose(straight.place[~first], stage.windows.place[~first], atol=1e-4)  # as it walked
+    brake, seek = stage.play("straight", brake=True), stage.play("seek")
+    none, perfect, bad = rows_of(stage, Played("straight", straight, {"brake": brake, "seek": seek}))
+    assert (none.windows, none.logged, none.alone, none.contacts) == (2 * EPISODES, 0, EPISODES, EPISODES)
+    assert (perfect.contacts, perfect.prevented, perfect.caused) == (0, EPISODES, 0)
+    assert (bad.prevented, bad.caused) == (0, EPISODES)  # it leads the second one to the first one, who stands
+    assert perfect.prevented_interval == pytest.approx((0.7354, 1.0), abs=1e-3)  # Clopper and Pearson, 12 of 12
+
+
+def test_driven_agents_observe_what_they_would():
+    stage = stage_of(walkers())
+    w = stage.windows
+    moved, faster = np.array([0.3, -0.2]), np.array([0.1, 0.4])
+    seen, state = w.observed(5, w.place[:, 5] + moved, w.velocity[:, 5] + faster, np.zeros(w.count))
+    mine, logged = seen[np.arange(w.count), w.driven], w.observations[np.arange(w.count), 5, w.driven]
+    expected = np.concatenate([faster, -moved, -faster])
+    np.testing.assert_allclose(mine - logged, np.tile(expected, (w.count, 1)), atol=1e-5)
+    other = seen[np.arange(w.count), 1 - w.driven] - w.observations[np.arange(w.count), 5, 1 - w.driven]
+    np.testing.assert_allclose(other, np.tile([0, 0, *moved, *faster], (w.count, 1)), atol=1e-5)
+    assert state is None
+
+
+def test_a_world_guards_bad_drivers_in_the_command_and_on_a_page(tmp_path, capsys):
+    store = walkers(reach=0.9)
+    assert store.costs.any()  # of the second one, who passes closely
+    world = ringfence.fit(store, **QUICK_WORLD)
+    store.save(tmp_path / "walkers.h5")
+    save(world, tmp_path / "world.safetensors")
+    command = ["replay", str(tmp_path / "world.safetensors"), str(tmp_path / "walkers.h5"), "--every-episode"]
+    command += ["--anyway", "--windows", "6", "--radius", "0.1", "--out", str(tmp_path / "r.json")]
+    app.main([*command, "--report", str(tmp_path / "r.html")])
+    assert "straight" in capsys.readouterr().out
+    result = json.loads((tmp_path / "r.json").read_text())
+    assert result["radius_from"] == "given" and result["windows"] == 6
+    assert {row["filter"] for row in result["rows"]} == {"none", "shield", "formula", "brake"}
+    guarded = next(row for row in result["rows"] if row["filter"] == "shield")
+    assert {"agent", "contacts", "infeasible", "ood", "clearance"} <= guarded["by_agent"][0].keys()
+    page = (tmp_path / "r.html").read_text()
+    assert "<svg" in page and "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_the_radius_is_told_by_the_formula_or_by_costs():
+    store = walkers(reach=0.9)
+    motion = motion_of(store, Names.of(store))
+    radius, source = radius_of(store, motion, None)
+    assert source == "the logged costs" and radius == pytest.approx(RADIUS, abs=0.1)
+    assert radius_of(store, motion, 0.3) == (0.3, "given")
+    with pytest.raises(UserError, match="Nothing says how close is contact"):
+        radius_of(walkers(), motion, None)
+
+
+def test_what_cannot_be_replayed_is_refused_in_a_sentence():
+    store = walkers()
+    blind = dataclasses.replace(store, card=store.card.updated(observation_names=None))
+    with pytest.raises(UserError, match="hold no places"):
+        ringfence.replay(None, blind, radius=RADIUS)
+    alone = EpisodeStore.from_episodes(
+        np.zeros((12, 5, 1, 2)), np.zeros((12, 4, 1, 2)), np.zeros((12, 4, 1)), None, card={"task": "one", "dt": 0.1}
+    )
+    with pytest.raises(UserError, match="has one agent"):
+        ringfence.replay(None, alone, radius=RADIUS)
+    with pytest.raises(UserError, match="Nothing says which World"):
+        ringfence.replay(None, store, radius=RADIUS)
+    with pytest.raises(UserError, match="kinematics='rocket'"):
+        ringfence.replay(None, store, radius=RADIUS, guard="none", kinematics="rocket")
+
+
+@pytest.mark.verdicts
+def test_a_world_of_other_logs_or_unfit_is_refused():
+    store = walkers(reach=0.9)
+    world = ringfence.fit(store, **QUICK_WORLD)
+    check_view(world, store)
+    swapped = [NAMES[1], NAMES[0], *NAMES[2:]]
+    with pytest.raises(UserError, match="reads 'own.vx' where these logs hold 'own.vy'"):
+        check_view(world, dataclasses.replace(store, card=store.card.updated(observation_names=swapped)))
+    with pytest.raises(UserError, match="actions are within"):
+        check_view(world, dataclasses.replace(store, card=store.card.updated(action_high=3.0)))
+    verdict = Verdict("unfit", ("it is made up",), ("fit",))
+    unfit = dataclasses.replace(world, card=replace(world.card, verdict=verdict))
+    with pytest.raises(UserError, match="unfit to guard by: it is made up"):
+        ringfence.replay(None, store, world=unfit, radius=0.1)
