@@ -50,6 +50,7 @@ REFERENCE = {
         "ringfence.deploy.zoo",
     ),
     "Off-policy evaluation": ("ringfence.evaluation.ope.estimate", "ringfence.evaluation.ope.result"),
+    "Replay": ("ringfence.evaluation.replay.judge", "ringfence.evaluation.replay.result"),
     "Export": ("ringfence.deploy.export",),
     "World": ("ringfence.training.worlds", "ringfence.world"),
     "Parts of a World": (
