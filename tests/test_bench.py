@@ -71,7 +71,7 @@ def stamps(g) -> dict[Path, int]:
 
 def test_a_finished_grid_is_not_made_again(made):
     before = stamps(made)
-    assert len(before) == 4 * 4  # config, env, results, status
+    assert len(before) == 4 * 5  # config, env, episodes, results, status
     assert run_local(made, workers=1, quiet=True)["done"] == 4
     assert stamps(made) == before
 

@@ -558,7 +558,7 @@ KINDS = {
     "durations": np.arange(20).astype("timedelta64[s]"),
     "400 digits": np.array([10**400] * 20, object),
     "complex objects": np.array([1j] * 20, object),
-    "lists": np.array([[1.0]] * 20 + [None], object)[:20],
+    "lists of other lengths": np.array([[1.0], [1.0, 2.0]] * 10, object),
 }
 
 
