@@ -88,6 +88,10 @@ def test_a_world_guards_bad_drivers_in_the_command_and_on_a_page(tmp_path, capsy
     world = ringfence.fit(store, **QUICK_WORLD)
     store.save(tmp_path / "walkers.h5")
     save(world, tmp_path / "world.safetensors")
+    held_out = ringfence.replay(None, store, world=world, radius=0.1, drivers=())
+    assert held_out.windows == 2 * world.card.held_out.episodes < 2 * EPISODES
+    fresh = dataclasses.replace(store, rewards=store.rewards + 1)
+    assert ringfence.replay(None, fresh, world=world, radius=0.1, drivers=()).windows == 2 * EPISODES
     command = ["replay", str(tmp_path / "world.safetensors"), str(tmp_path / "walkers.h5"), "--every-episode"]
     command += ["--anyway", "--windows", "6", "--radius", "0.1", "--out", str(tmp_path / "r.json")]
     app.main([*command, "--report", str(tmp_path / "r.html")])
@@ -141,3 +145,39 @@ def test_a_world_of_other_logs_or_unfit_is_refused():
     unfit = dataclasses.replace(world, card=replace(world.card, verdict=verdict))
     with pytest.raises(UserError, match="unfit to guard by: it is made up"):
         ringfence.replay(None, store, world=unfit, radius=0.1)
+
+
+def test_kinematics_move_as_they_say():
+    store = walkers()
+    motion = motion_of(store, Names.of(store))
+    place, velocity, heading = np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.zeros(1)
+    unicycle = kinematics_of("unicycle", store, motion, None, DT, 2.7)
+    there, after, turned = unicycle.moved(place, velocity, heading, np.array([[2.0, 1.0]]), None)
+    assert turned == pytest.approx([DT]) and np.linalg.norm(after) == pytest.approx(unicycle.max_speed)
+    _, slower, _ = unicycle.moved(place, velocity, heading, np.array([[-2.0, 0.0]]), None)
+    assert slower == pytest.approx(np.array([[1 - 2 * DT, 0.0]]))
+    bicycle = kinematics_of("bicycle", store, motion, None, DT, 2.0)
+    _, _, turned = bicycle.moved(place, velocity, heading, np.array([[0.0, 0.3]]), None)
+    assert turned == pytest.approx([np.tan(0.3) / 2.0 * DT])
+    with pytest.raises(UserError, match="as kinematics='holonomic' would"):  # these actions are accelerations
+        kinematics_of("holonomic", store, motion, None, DT, 2.7)
+    speeds = dataclasses.replace(store, actions=np.float32(0.5) * store.observations[:-EPISODES, :, :2])
+    rows = np.arange(store.steps) + store.episode_of_step + 1
+    speeds.actions[:] = 0.5 * store.observations[rows][..., :2]
+    holonomic = kinematics_of("holonomic", speeds, motion, None, DT, 2.7)
+    assert holonomic.gain == pytest.approx(2.0, rel=1e-3)
+    _, after, _ = holonomic.moved(place, velocity, heading, np.array([[0.0, 0.25]]), None)
+    assert after == pytest.approx(np.array([[0.0, 0.5]]), rel=1e-3)
+
+
+def test_a_run_is_replayed_under_every_filter(tmp_path):
+    store = walkers(reach=0.9)
+    (run,) = ringfence.train("bc", store, seeds=(0,), out=tmp_path, changes={"num_updates": 5})
+    world = ringfence.fit(store, **QUICK_WORLD)
+    given = dict(world=world, radius=0.1, windows=4, every_episode=True, drivers=("seek",))
+    result = ringfence.replay(run, store, guard="shield", **given)
+    names = [(row.policy, row.filter) for row in result.rows]
+    filters = ("none", "shield", "formula", "brake")
+    assert names == [(policy, filter) for policy in ("bc", "seek") for filter in filters]
+    for row in result.rows:
+        assert row.contacts == row.alone - row.prevented + row.caused

@@ -515,8 +515,8 @@ def replay(
         radius: m between two agents below which they touch; by default the task's formula, else as costs tell it.
         windows: at most so many, drawn evenly.
         steps: of a window; 8 s by default.
-        every_episode: replay all episodes, not only those that a World of this seed held out.
-        seed: of which episodes were held out, and of what policies draw.
+        every_episode: replay the episodes that the World learned from, too.
+        seed: of what policies draw.
         out_file: write the result as JSON.
         report: write an HTML page.
     """

@@ -26,10 +26,11 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.training import worlds
 from ringfence.training.runs import Run
+from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
-from ringfence.world.logged import held_out
+from ringfence.world.logged import held_out, labels_of, unsafe_of
 
 SECONDS = 8.0  # of a window, by default
 LONG = 2.0  # s that the formula looks ahead
@@ -61,8 +62,8 @@ def replay(
 
     policy: a run, or None for the bad `drivers` alone, which hold speed and course (straight), speed up (accelerate),
     go to the goal as fast as any did (hasty), or to the nearest (seek). `world` guards (default: the run's), and
-    `options` are those of `load`. Windows of `steps` (8 s) do not overlap and lie in the episodes that a World of
-    `seed` held out, or in `every_episode`; each agent is driven in turn, in `windows` windows at most. Contact is being
+    `options` are those of `load`. Windows of `steps` (8 s) do not overlap and lie in episodes that the World did
+    not learn from, or in `every_episode`; each agent is driven in turn, in `windows` windows at most. Contact is being
     closer than `radius` m to another: by default the task's formula, else the distance that best tells the logged
     unsafe steps. `kinematics` is a name of KINEMATICS. `baselines` adds a brake that takes everybody's velocity for
     constant, and a guard that knows the formula, along 2 s.
@@ -91,21 +92,20 @@ def replay(
         store, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
     )
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
-    notes = [] if left_out == 0 else [f"{left_out} windows begin in contact and are left out."]
+    notes: list[str] = []
     if baselines and known_world is not None:
         formula = _formula(known_world, radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}
         notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
-    shown: list[Played] = []
+    players: dict[str, str | Policy] = {name: name for name in drivers}
     if run is not None:
-        plain = stage.play(resolve(PolicySpec.of(run)).policy)
-        under = {} if guarded is None else {guard: stage.play(guarded)}
-        shown.append(Played(run.config["algorithm"], plain, under))
-    for name in drivers:
-        under = {filter: stage.play(name, one) for filter, one in filters.items()}
+        players = {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy} | players
+    shown: list[Played] = []
+    for name, player in players.items():
+        under = {filter: stage.play(player, one) for filter, one in filters.items()}
         if baselines:
-            under["brake"] = stage.play(name, brake=True)
-        shown.append(Played(name, stage.play(name), under))
+            under["brake"] = stage.play(player, brake=True)
+        shown.append(Played(name, stage.play(player), under))
     return ReplayResult(
         task=store.card.task,
         radius=float(radius),
@@ -206,12 +206,22 @@ def _stage(
     if store.card.dt is None:
         raise UserError(f"The card of '{store.card.task}' does not say how long a step takes; give it dt (s).")
     dt = float(store.card.dt)
-    chosen = np.arange(store.episodes) if every_episode else np.flatnonzero(held_out(store, seed))
+    chosen = np.arange(store.episodes) if every_episode else _unlearned(world, store)
     longest = int(np.median(store.lengths[chosen]))
     steps = steps or max(1, min(round(SECONDS / dt), longest))
     cut, left_out = windows_of(store, chosen, steps, most, radius, dt, store.card.homogeneous)
     body = kinematics_of(kinematics, store, motion, world, dt, wheelbase)
     return Stage(cut, body, radius, seed), left_out
+
+
+def _unlearned(world: World | None, store: EpisodeStore) -> np.ndarray:
+    """The episodes that a World did not learn from: those that it held out of these logs, or all of other logs."""
+    if world is None or world.card.data.content != (store.card.content or store.content):
+        return np.arange(store.episodes)
+    settings = world.card.settings
+    hazard = constraints.bind_or_none(store.hazard, world.spec.feature_names, world.spec.n_agents)
+    labels = labels_of(store, world.map, settings, hazard) if settings.barrier else {}
+    return np.flatnonzero(held_out(store, world.card.seed, unsafe_of(labels) if labels else None))
 
 
 def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple[float, str]:

@@ -47,7 +47,7 @@ class Stage:
     seed: int
 
     def play(self, driver: str | Policy, guard: Guarded | None = None, brake: bool = False) -> Driven:
-        """`driver`: a name of DRIVERS, or a policy, which has its own guard; `guard` filters a named driver."""
+        """`driver`: a name of DRIVERS, or a policy; `guard` filters what it does, and so does the `brake`."""
         w = self.windows
         place = w.place[:, 0].copy()
         velocity = w.velocity[:, 0].copy()
@@ -55,6 +55,8 @@ class Stage:
         if {"own.cos", "own.sin"} <= set(w.names.observation):
             first = w.observations[np.arange(w.count), 0, w.driven]
             heading = np.arctan2(first[:, w.names.observation["own.sin"]], first[:, w.names.observation["own.cos"]])
+        if guard is not None and not isinstance(driver, str):
+            driver = Guarded(driver, guard.guard)
         actor = guard if isinstance(driver, str) else driver
         memory = None if actor is None else actor.initial_state(w.count)
         world = self.kinematics.world if self.kinematics.name == "world" else None
