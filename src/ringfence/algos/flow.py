@@ -120,18 +120,7 @@ def make_windows(
     """Windows, with their scores where the flow is told those."""
     if config.condition == "none":
         return WindowData(store, feature_map)
-    seen = None
-    values = None
-    if config.condition == "advantage" and world is not None:
-        seen = jnp.asarray(feature_map(store.observations, store.state), jnp.float32)
-        values = world.values
-    scores = conditions.scores_of(store, config.condition, config.horizon, config.discount, values, seen)
-    return WindowData(store, feature_map, scores)
-
-
-def world_settings(config: Config) -> dict | None:
-    """Values alone score an advantage."""
-    return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
+    return conditions.scored_windows(store, feature_map, world, config.condition, config.horizon, config.discount)
 
 
 def steps_there(batch: Batch) -> Array:
@@ -238,6 +227,6 @@ FLOW = Algorithm(
     {"default": {}, "return": {"condition": "return"}},
     cost_source=lambda config: "nothing",
     make_windows=make_windows,
-    world_settings=world_settings,
+    world_settings=conditions.world_settings,
     from_world=lambda world, config: {},
 )

@@ -242,11 +242,7 @@ def cost_source(config: Config) -> Literal["labels", "world", "nothing"]:
 
 def make_windows(store, config: Config, feature_map: features.FeatureMap, world: World) -> WindowData:
     """Windows with the condition that plans are drawn for."""
-    seen = feature_map(store.observations, store.state) if config.condition == "advantage" else None
-    if seen is not None:
-        seen = jnp.asarray(seen, jnp.float32)
-    found = conditions.scores_of(store, config.condition, config.horizon, config.discount, world.values, seen)
-    return WindowData(store, feature_map, found)
+    return conditions.scored_windows(store, feature_map, world, config.condition, config.horizon, config.discount)
 
 
 def world_settings(config: Config) -> dict:

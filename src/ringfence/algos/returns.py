@@ -87,19 +87,8 @@ def make_windows(
     store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None
 ) -> WindowData:
     """Windows with their scores."""
-    store = bc.within(store, config)
-    seen = None
-    values = None
-    if config.condition == "advantage" and world is not None:
-        seen = jnp.asarray(feature_map(store.observations, store.state), jnp.float32)
-        values = world.values
-    scores = conditions.scores_of(store, config.condition, config.ahead, config.discount, values, seen)
-    return WindowData(store, feature_map, scores)
-
-
-def world_settings(config: Config) -> dict | None:
-    """Values alone score an advantage."""
-    return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
+    kept = bc.within(store, config)
+    return conditions.scored_windows(kept, feature_map, world, config.condition, config.ahead, config.discount)
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
@@ -129,6 +118,6 @@ BC_RETURN = Algorithm(
     {"default": {}, "mujoco": {"num_updates": 8_000}, "advantage": {"condition": "advantage"}},
     cost_source=bc.cost_source,
     make_windows=make_windows,
-    world_settings=world_settings,
+    world_settings=conditions.world_settings,
     from_world=lambda world, config: {},
 )

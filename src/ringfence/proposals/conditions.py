@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtri
 
 from ringfence.logs.store import EpisodeStore
-from ringfence.logs.windows import returns_to_go
+from ringfence.logs.windows import WindowData, returns_to_go
+from ringfence.problem.features import FeatureMap
+from ringfence.world import World
 from ringfence.world.values import Values, values_of
 
 Condition = Literal["advantage", "return"]
@@ -31,6 +34,28 @@ def scores_of(
         value = values_of(values.critic, features)
         return normal_scores(advantages(value, team, row, last, horizon, discount))
     return return_scores(returns_to_go(team, store.lengths, discount), step - starts[episode])
+
+
+def scored_windows(
+    store: EpisodeStore,
+    feature_map: FeatureMap,
+    world: World | None,
+    condition: Condition,
+    horizon: int,
+    discount: float,
+) -> WindowData:
+    """Windows with their scores; an advantage is by the values of the World."""
+    seen = None
+    values = None
+    if condition == "advantage" and world is not None:
+        seen = jnp.asarray(feature_map(store.observations, store.state), jnp.float32)
+        values = world.values
+    return WindowData(store, feature_map, scores_of(store, condition, horizon, discount, values, seen))
+
+
+def world_settings(config: Any) -> dict | None:
+    """What an algorithm's config with a `condition` asks of a World: values alone score an advantage."""
+    return {"view": config.view, "discount": config.discount} if config.condition == "advantage" else None
 
 
 def advantages(

@@ -42,12 +42,18 @@ def _drawn(film: Film, radius: float, number: int) -> str:
             there = ((other > low) & (other < high)).all(-1)
             shown = np.where(there[:, None], other, np.nan)
             ax.plot(*shown.T, color=INK, linewidth=0.8, alpha=0.35, marker=".", markersize=3)
-        lines = {"as logged": (film.logged, (0, (1, 2))), "without guard": (film.alone, (0, (4, 2)))}
-        for name, (path, line) in (lines | {"with guard": (film.guarded, "-")}).items():
+        lines = {
+            "as logged": (film.logged, (0, (1, 2))),
+            "without guard": (film.alone, (0, (4, 2))),
+            "with guard": (film.guarded, "-"),
+        }
+        for name, (path, line) in lines.items():
             ax.plot(*path.T, color=INK, linewidth=1.6, linestyle=line, label=name)
-        for path in (film.alone, film.guarded):
+            if path is film.logged:
+                continue
             nearest = np.linalg.norm(film.others - path[:, None], axis=-1).min(-1).argmin()
-            ax.add_patch(Circle(tuple(path[nearest]), radius, fill=False, color=INK, linewidth=0.8))
+            around = Circle(tuple(path[nearest]), radius, fill=False, color=INK, linewidth=0.8, linestyle=line)
+            ax.add_patch(around)  # contact, where it was nearest to another
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])
         ax.set_aspect("equal")

@@ -115,6 +115,8 @@ class Explained:
 
 def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     """The cause, by what others leave unexplained."""
+    from scipy.ndimage import binary_dilation  # slow to import, and read by fits alone
+
     low, high, bins, _ = steps.cells(told_of(cause, ()))
     cell, agents = steps.picked(cause)
     size = bins**cause.width
@@ -135,22 +137,10 @@ def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     if not cause.length:
         seen = all_bad + all_fine - bad - fine > 0
         called |= _worst(steps, np.where(seen, 0.0, -1.0)[steps.fold[:, None], cell], agents) < 0
-    edge = _grown_by_one((others > CLEAR).reshape(FOLDS, *[bins] * cause.width)).reshape(FOLDS, size)
+    clear = (others > CLEAR).reshape(FOLDS, *[bins] * cause.width)
+    edge = binary_dilation(clear, np.ones((1, *[3] * cause.width))).reshape(FOLDS, size)
     near = _worst(steps, np.where(edge, -1.0, 0.0)[steps.fold[:, None], cell], agents) < 0
     return Counted(cells, safe, called, near, *gain(steps, explained, safe))
-
-
-def _grown_by_one(cells: np.ndarray) -> np.ndarray:
-    """Cells (FOLDS, bins, ...), and those next to them."""
-    for axis in range(1, cells.ndim):
-        ahead, behind = np.zeros_like(cells), np.zeros_like(cells)
-        inner = [slice(None)] * cells.ndim
-        first, last = inner.copy(), inner.copy()
-        first[axis], last[axis] = slice(1, None), slice(None, -1)
-        ahead[tuple(first)] = cells[tuple(last)]
-        behind[tuple(last)] = cells[tuple(first)]
-        cells = cells | ahead | behind
-    return cells
 
 
 def _by(values: np.ndarray, of: np.ndarray) -> np.ndarray:

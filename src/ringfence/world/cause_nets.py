@@ -1,10 +1,10 @@
 """ℓ by causes: a score for each cause that was found, the worst of them counts. Of one number it is the distance to
-where danger begins, of several a small network.
+where danger begins, which the logs tell, of several a small network, which is learned.
 
 Which agent and which cause made a step unsafe is not logged. Learning takes the soft minimum of all scores, from an
 average over causes to the sum of odds (noisy-or), with a small term by which every score explains the cost alone.
-What was never visited is taught, too (`Cells.beyond`): a distance is as unsafe as the nearest one that was, and any
-other place is unsafe, whether it lies deeper in a wall or merely where nobody went.
+What was never visited is taught to networks, too (`Cells.beyond`): it is unsafe, whether it lies deeper in a wall or
+merely where nobody went.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import optax
 
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
-from ringfence.problem.constraints import least
+from ringfence.problem.constraints import least, lowest
 from ringfence.types import Array, Key
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
@@ -66,15 +66,10 @@ class Distance(eqx.Module):
         offset = values / self.scale - self.bounds  # (..., m)
         passed = (offset > 0).sum(-1)
         safe = (passed % 2 == 1) == self.edge.inside
-        return jnp.exp(self.log_gain) * jnp.where(safe, 1.0, -1.0) * nearest(jnp.abs(offset))
+        return jnp.exp(self.log_gain) * jnp.where(safe, 1.0, -1.0) * lowest(jnp.abs(offset))
 
 
 Score = CauseNet | Distance
-
-
-def nearest(x: Array) -> Array:
-    """The least of the last axis."""
-    return least([x[..., k] for k in range(x.shape[-1])])
 
 
 def scores(net: Score, x: Array) -> Array:
@@ -134,6 +129,8 @@ def fit_causes(
     nets = tuple(_standardised(net, one) for net, one in zip(blank(found, width, key_nets), cells))
     rng = np.random.default_rng(0)
     few = batch // 4
+    if not any(isinstance(net, CauseNet) for net in nets):
+        return nets  # distances are read off the logs; nothing is left to learn
     about = [net.cause.holds(data[0].shape[1]) for net in nets]
     about = np.concatenate(about, -1)
     about = about if data[3].ndim == 2 else about.reshape(-1)

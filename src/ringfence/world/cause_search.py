@@ -22,7 +22,7 @@ from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gai
 from ringfence.world.causes import Cause, Edge, Found, candidates, only_of, told_of, wider
 from ringfence.world.cells import CELLS, Cells
 
-VERSION = 8  # of the search: what was found by another is looked for again
+VERSION = 9  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win

@@ -90,9 +90,10 @@ def told_of(cause: Cause, who: tuple[tuple[int, int], ...]) -> Cause:
     base = cause.name.split(" of agent ")[0]
     if not who:
         return replace(cause, name=base, who=()) if cause.who else cause
+    kind = base.removeprefix("length of ").split(".")[0]
     several = len(cause.things) > 1
-    each = [f"{agent} to its {thing}" if several else str(agent) for agent, thing in sorted(who)]
-    return replace(cause, name=f"{base} of agent {', '.join(each)}", who=tuple(sorted(who)))
+    each = [f"agent {agent}'s {kind}{thing}" if several else f"agent {agent}" for agent, thing in sorted(who)]
+    return replace(cause, name=f"{base} of {', '.join(each)}", who=tuple(sorted(who)))
 
 
 def offsets(names: Sequence[str]) -> list[Cause]:
