@@ -6,6 +6,7 @@ its words are no longer there.
 
 from __future__ import annotations
 
+import json
 import re
 import sys
 from collections import Counter
@@ -27,6 +28,7 @@ from ringfence.utils import stored
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
+POOL = "results/pooled/simple_spread-expert-pooled.json"
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,19 @@ def on_robots(row, paired, more: int, less: int) -> Callable[[], tuple[bool, str
         return (len(found), *map(len, sides)) == (9, more, less), f"{text}; {len(found[0].seeds)} to " + (
             f"{max(len(d.seeds) for d in found)} seeds"
         )
+
+    return check
+
+
+def of_a_pool(row: str, verdict: Callable[[dict, dict], bool]) -> Callable[[], tuple[bool, str]]:
+    """`verdict` of a row of `POOL` and of the data."""
+
+    def check():
+        found = json.loads((ROOT / POOL).read_text())
+        r = found["rows"][row]
+        low, high = r["return_norm_interval"]
+        text = f"{r['return_norm']:.3f} [{low:.3f}, {high:.3f}], data {found['data']['return_norm']:.3f}"
+        return verdict(r, found["data"]), text
 
     return check
 
@@ -486,6 +501,18 @@ CLAIMS = (
             ("bc-return", f"advantage{SHIELD}"),
             "return",
             lambda ds: all(d.mean < 0 for d in ds) and sum(d.holds for d in ds) >= 3,
+        ),
+    ),
+    Claim(
+        "docs/method.md",
+        "Over five seeds `flow` earns more than the data does",
+        POOL,
+        of_a_pool(
+            "flow",
+            lambda row, data: (
+                len(row["seeds"]) == 5
+                and min(row["return_norm_interval"][0], *row["return_norm_of_seeds"]) > data["return_norm"]
+            ),
         ),
     ),
 )

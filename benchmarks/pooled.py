@@ -1,9 +1,10 @@
-"""Logs of many drivers: what learns the pooled tiers, played as it is, one seed.
+"""Logs of many drivers: what learns the pooled tiers, played as it is.
 
     python benchmarks/pooled.py results/pooled [--tasks simple_spread-expert-pooled ...] [--rows flow bc ...]
 
-One file for each task. Rows that a file holds already are not made again. `runs/pooled` keeps the runs, so a row whose
-run is there is only played. Budgets are small, so that a laptop makes a row in minutes; each row says its own.
+One file for each task. Rows that a file holds already, of as many seeds (`--seeds`), are not made again; `runs/pooled`
+keeps the runs, so a row whose runs are there is only played. Budgets are small: a laptop makes a row in minutes, and
+each row says its own. At the end the table in docs/method.md is written anew; `--seeds 0` does that alone.
 """
 
 import argparse
@@ -14,17 +15,21 @@ from pathlib import Path
 import jax
 import numpy as np
 from _common import command, machine
+from readme import put
 
 import ringfence
 from ringfence.datasets.make import make
 from ringfence.datasets.recipes.spread import TURNS
 from ringfence.datasets.registry import TASKS
+from ringfence.datasets.task import Task
 from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.loading.resolve import load_job
 from ringfence.logs.store import EpisodeStore
-from ringfence.training import loop
+from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 
+RESULTS = Path(__file__).resolve().parent.parent / "results" / "pooled"
 EPISODES = 200  # test resets
 COLUMNS = ("return_mean", "return_norm", "cost_mean", "cost_safe_start", "train_seconds", "parameters")
 FLOW = {"num_updates": 4000}
@@ -35,6 +40,8 @@ ROWS = {
     "flow": ("flow", "default", FLOW, {}),
     "flow, the drivers' means": ("flow", "default", FLOW, {"sampling_steps": 1, "temperature": 0.0}),
     "flow, 4 steps": ("flow", "default", FLOW, {"sampling_steps": 4}),
+    "flow, 8 steps": ("flow", "default", FLOW, {"sampling_steps": 8}),
+    "flow, 8 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 8, "barrier_guidance": 1.0}),
     "flow, one driver": ("flow", "default", FLOW | {"drivers": 1}, {}),
     "flow, one driver, its mean": ("flow", "default", FLOW | {"drivers": 1}, {"sampling_steps": 1, "temperature": 0.0}),
     "flow, told the return": ("flow", "return", FLOW, {}),
@@ -44,6 +51,8 @@ ROWS = {
     "madiff": ("madiff", "default", {}, {}),
     "icbf": ("icbf", "split", {}, {}),
 }
+# Rows that are compared with another of the same runs, on the same resets.
+PAIRED = {"flow, 8 steps, guided by danger": "flow, 8 steps"}
 
 
 def purity(run: Run, store: EpisodeStore, episodes: int = 2000) -> float | None:
@@ -77,24 +86,82 @@ def milliseconds(run: Run, store: EpisodeStore, options: dict) -> float:
     return round(1000 * float(np.median(seconds[10:])), 2)
 
 
-def row(name: str, store: EpisodeStore, runs: Path) -> dict:
-    algorithm, preset, changes, options = ROWS[name]
-    told = "-".join(f"{k}-{v}" for k, v in changes.items()) or "default"
-    run = ringfence.train(algorithm, store, preset=preset, changes=changes, out=str(runs / preset / told), quiet=True)[
-        0
-    ]
-    result = evaluate(run, episodes=EPISODES, **options)
-    found = {k: round(float(result[k]), 4) for k in COLUMNS}
-    about = {"algorithm": algorithm, "preset": preset, "changes": changes, "played": options}
+def per_episode(results: list[dict], what: str) -> np.ndarray:
+    """(seeds, EPISODES)."""
+    return np.array([r["per_episode"][what] for r in results], float)
+
+
+def differences(results: list[dict], others: list[dict], task: Task) -> dict:
+    """What results have more than others of the same runs and resets: return, and cost of episodes that start safe."""
+    earned = task.normalised_return(per_episode(results, "return")) - task.normalised_return(
+        per_episode(others, "return")
+    )
+    spent = per_episode(results, "cost") - per_episode(others, "cost")
+    safe = 1.0 - per_episode(results, "unsafe_start")
     return {
-        **about,
-        "updates": run.config["config"]["num_updates"],
-        **found,
-        "drivers_purity": purity(run, store),
-        "milliseconds": milliseconds(run, store, options),
+        "return_norm": round(float(earned.mean()), 4),
+        "return_norm_interval": [round(x, 4) for x in mean_of_runs(earned)],
+        "cost_safe_start": round(float((spent * safe).sum() / safe.sum()), 4),
+        "cost_safe_start_interval": [round(x, 4) for x in mean_of_runs(spent, safe)],
+    }
+
+
+def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> dict:
+    """All seeds of a row: means over them, and 95 % intervals of what was earned and of what an episode cost."""
+    algorithm, preset, changes, options = ROWS[name]
+    changed = "-".join(f"{k}-{v}" for k, v in changes.items()) or "default"
+    trained = ringfence.train(
+        algorithm,
+        store,
+        preset=preset,
+        changes=changes,
+        seeds=tuple(range(seeds)),
+        out=str(runs / preset / changed),
+        quiet=True,
+    )
+    given = options
+    if "barrier_guidance" in options:
+        given = options | {"world": worlds.fit(store, task=task)}  # the same for all seeds
+    results = [evaluate(run, episodes=EPISODES, **given) for run in trained]
+    returns = task.normalised_return(per_episode(results, "return"))
+    paired = {}
+    if name in PAIRED:
+        others = [evaluate(run, episodes=EPISODES, **ROWS[PAIRED[name]][3]) for run in trained]
+        paired = {"paired": {"with": PAIRED[name]} | differences(results, others, task)}
+    return {
+        "algorithm": algorithm,
+        "preset": preset,
+        "changes": changes,
+        "played": options,
+        "seeds": list(range(seeds)),
+        "updates": trained[0].config["config"]["num_updates"],
+        **{k: round(float(np.mean([r[k] for r in results])), 4) for k in COLUMNS},
+        "return_norm_interval": [round(x, 4) for x in mean_of_runs(returns)],
+        "return_norm_of_seeds": [round(float(r["return_norm"]), 4) for r in results],
+        "cost_interval": [round(x, 4) for x in mean_of_runs(per_episode(results, "cost"), least=0.0)],
+        **paired,
+        "drivers_purity": purity(trained[0], store),
+        "milliseconds": milliseconds(trained[0], store, given),
         "command": command(),
         "machine": machine(),
     }
+
+
+def table() -> str:
+    """Rows of all tasks in the order of `ROWS`, the data first."""
+    lines = ["| | seeds | return, normalised | cost | of safe starts |", "|---|---|---|---|---|"]
+    for file in sorted(RESULTS.glob("*-pooled.json")):
+        found = json.loads(file.read_text())
+        lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
+        for name in ROWS:
+            if name in found["rows"]:
+                r = found["rows"][name]
+                interval = r.get("return_norm_interval")  # older rows tell none
+                within = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
+                words = f"`{r['algorithm']}`{name.removeprefix(r['algorithm'])}"
+                cost = f"{r['cost_mean']:.2f} | {r['cost_safe_start']:.2f}"
+                lines.append(f"| {words} | {len(r['seeds'])} | {r['return_norm']:.3f}{within} | {cost} |")
+    return "\n".join(lines)
 
 
 def main() -> None:
@@ -102,21 +169,25 @@ def main() -> None:
     reader.add_argument("out", type=Path)
     reader.add_argument("--tasks", nargs="*", default=["simple_spread-expert-pooled", "simple_spread-medium-pooled"])
     reader.add_argument("--rows", nargs="*", default=list(ROWS), choices=list(ROWS))
+    reader.add_argument("--seeds", type=int, default=1)
     reader.add_argument("--runs", type=Path, default=Path("runs/pooled"))
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    for task in given.tasks:
-        store, _ = make(TASKS[task])
-        file = given.out / f"{task}.json"
-        found = json.loads(file.read_text()) if file.exists() else {"task": task, "episodes": EPISODES, "seed": 0}
-        found["data"] = {"return_norm": round(float(TASKS[task].normalised_return(store.returns.mean())), 4)}
+    for name in given.tasks if given.seeds else ():
+        task = TASKS[name]
+        store, _ = make(task)
+        file = given.out / f"{name}.json"
+        found = json.loads(file.read_text()) if file.exists() else {"task": name, "episodes": EPISODES}
+        found["data"] = {"return_norm": round(float(task.normalised_return(store.returns.mean())), 4)}
         rows = found.setdefault("rows", {})
-        for name in given.rows:
-            if name in rows:
+        for which in given.rows:
+            if which in rows and len(rows[which]["seeds"]) >= given.seeds:
                 continue
-            rows[name] = row(name, store, given.runs)
-            print(task, name, rows[name], flush=True)
+            rows[which] = row(which, store, task, given.runs, given.seeds)
+            print(name, which, rows[which], flush=True)
             file.write_text(json.dumps(found, indent=1) + "\n")
+    if given.out.resolve() == RESULTS:
+        put("docs/method.md", "pooled", table())
 
 
 if __name__ == "__main__":

@@ -87,7 +87,10 @@ def test_cells_are_addressed_by_what_training_depends_on(made):
 
 
 def test_ids_of_cells_do_not_follow_the_names_of_settings():
-    """Those of committed results, whose settings had other names."""
+    """Those of committed results, whose settings had other names, and had none that are younger."""
+    assert grid.Cell("simple_spread-expert", "icbf", "split", 0).id == "8f346dc462"
+    told = grid.Cell("simple_spread-expert", "icbf", "split", 0, changes=(("drivers", 2),))
+    assert told.id != "8f346dc462"
     assert grid.Cell("crossing-hasty", "bc", "default", 0).id == "c6a6824abb"
     assert grid.Cell("simple_spread-expert", "bc-return", "default", 0).id == "7e05f0949f"
 

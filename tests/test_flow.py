@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.algos import flow
+from ringfence.algos import drivers
 from ringfence.errors import UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
+from ringfence.proposals.options import PlanOptions
 from ringfence.training import loop, worlds
+from ringfence.types import Spec
 from tests.quick import QUICK_WORLD
 
 EPISODES, LENGTH = 200, 10
@@ -39,12 +45,12 @@ def run(two_drivers, tmp_path_factory):
     return loop.train("flow", two_drivers, out=out, changes={**SMALL, "condition": "return"}, quiet=True)[0]
 
 
-def played(policy, steps: int = 3, batch: int = 64) -> np.ndarray:
+def played(policy, steps: int = 3, batch: int = 64, entries: int = 3) -> np.ndarray:
     """Actions (B, steps, N) at the same kind of states."""
     carry = policy.initial_state(batch)
     out = []
     for t in range(steps):
-        seen = jax.random.normal(jax.random.key(t), (batch, 2, 3))
+        seen = jax.random.normal(jax.random.key(t), (batch, 2, entries))
         carry, step = policy.act(carry, seen, None, jax.random.key(10 + t))
         out.append(np.asarray(step.action)[..., 0])
     return np.stack(out, 1)
@@ -71,7 +77,7 @@ def test_drivers_are_found_without_labels(run, two_drivers):
 def test_steps_outside_an_episode_are_left_out(two_drivers):
     data = WindowData(two_drivers, lambda seen, state: seen)
     batch = at(data.arrays, jnp.array([0, 4, LENGTH - 1, LENGTH]), 5, 4)
-    there = np.asarray(flow.steps_there(batch))
+    there = np.asarray(drivers.steps_there(batch))
     np.testing.assert_array_equal(there.sum(1), [4, 8, 5, 4])
     assert not there[0, :4].any() and there[0, 4:].all() and there[2, :5].all() and not there[2, 5:].any()
 
@@ -79,16 +85,16 @@ def test_steps_outside_an_episode_are_left_out(two_drivers):
 def test_shares_are_balanced():
     """Rows add up to one; a driver who explains all windows a little better does not get them all."""
     explained = jax.random.normal(jax.random.key(0), (40, 4)) + jnp.array([5.0, 0.0, 0.0, 0.0])
-    shares = np.asarray(flow.balanced(explained))
+    shares = np.asarray(drivers.balanced(explained))
     np.testing.assert_allclose(shares.sum(1), 1.0, atol=1e-5)
     np.testing.assert_allclose(shares.sum(0), 10.0, rtol=0.05)
 
 
 def test_drivers_that_nobody_needs_are_left(two_drivers, tmp_path):
     """With six for two, balance alone would give each a sixth: two explain all windows, and only they are drawn."""
-    config = flow.Config(num_updates=100, drivers=4, settled=0.5)
+    search = drivers.Search(4, num_updates=100, settled=0.5)
     explained = jnp.zeros((40, 4)).at[:, 0].set(9.0)
-    early, late = (np.asarray(flow.shares_of(config, explained, step)).mean(0) for step in (0, 60))
+    early, late = (np.asarray(drivers.shares_of(search, explained, step)).mean(0) for step in (0, 60))
     np.testing.assert_allclose(early, 0.25, atol=0.02)
     np.testing.assert_allclose(late, [1.0, 0.0, 0.0, 0.0], atol=0.01)
     run = loop.train("flow", two_drivers, out=tmp_path, changes={**SMALL, "drivers": 6}, quiet=True)[0]
@@ -135,3 +141,125 @@ def test_proposals_are_of_several_drivers(run, two_drivers):
     assert actions.shape == (5, 9, 2, 2, 1)
     ways = np.asarray(actions)[:, :, 0, 0, 0]
     assert ((ways.max(1) > 0.4) & (ways.min(1) < -0.4)).all()
+
+
+@pytest.fixture(scope="module")
+def two_drifts(two_drivers):
+    """As `two_drivers`, but an action moves what is seen of an agent, so that plans of states say what is done."""
+    pushed = np.cumsum(two_drivers.actions.reshape(EPISODES, LENGTH, 2, 1), 1)
+    begun = np.random.default_rng(1).normal(size=(EPISODES, 1, 2, 1))
+    seen = np.concatenate([begun, begun + pushed], 1).astype(np.float32)
+    actions = two_drivers.actions.reshape(EPISODES, LENGTH, 2, 1)
+    rewards = two_drivers.rewards.reshape(EPISODES, LENGTH, 2)
+    costs = np.zeros((EPISODES, LENGTH), np.float32)
+    return EpisodeStore.from_episodes(seen, actions, rewards, costs, card={"task": "two-drifts"})
+
+
+PLANS = dict(num_updates=500, batch=64, width=32, depth=2, horizon=5, diffusion_steps=20, inverse_width=32, ema=0.95)
+
+
+@pytest.mark.parametrize("net", ["attention", "residual"])
+def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path, net):
+    """Told the drivers, a planner goes one way through an episode, and both ways occur; guards get plans of both."""
+    changes = PLANS | {"net": net, "drivers": 2}
+    run = loop.train("madiff", two_drifts, out=tmp_path, changes=changes, world=QUICK_WORLD, quiet=True)[0]
+    assert run.metrics[-1]["drivers/sure"] > 0.95
+    policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
+    acts = played(policy, entries=1)
+    up = (acts > 0).reshape(len(acts), -1)
+    assert (up.all(1) | (~up).all(1)).mean() > 0.9
+    assert 0.2 < up.mean() < 0.8
+    world = worlds.fit(two_drifts, **QUICK_WORLD)
+    seen = jnp.zeros((5, 2, 1))
+    _, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world)
+    ways = np.asarray(actions)[:, :, 0, 0, 0]
+    assert ((ways.max(1) > 0.3) & (ways.min(1) < -0.3)).all()
+
+
+@pytest.mark.parametrize(
+    "changes, said",
+    [
+        ({"net": "unet"}, "drivers=2 are told to a plan of the whole team"),
+        ({"observe": "single"}, "drivers=2 are told to a plan of the whole team"),
+        ({"drivers": 65}, "drivers=65 share 64 windows"),
+    ],
+)
+def test_plans_that_drivers_cannot_be_told_to_are_refused(two_drifts, tmp_path, changes, said):
+    with pytest.raises(UserError, match=said):
+        loop.train("madiff", two_drifts, out=tmp_path, changes=PLANS | {"drivers": 2} | changes, quiet=True)
+
+
+def test_runs_from_before_drivers_are_gone_on_with(two_drifts, tmp_path):
+    settings = dict(out=tmp_path, changes=PLANS | {"num_updates": 4}, world=QUICK_WORLD, quiet=True)
+    run = loop.train("madiff", two_drifts, **settings)[0]
+    file = run.path / "config.json"
+    about = json.loads(file.read_text())
+    assert about["config"].pop("drivers") == 0
+    file.write_text(json.dumps(about))
+    assert loop.train("madiff", two_drifts, **settings)[0].path == run.path
+    load(run)
+
+
+class Line(eqx.Module):
+    """A World where an action moves a place by itself, and places above −0.5 lack the margin by as much."""
+
+    spec: Spec = eqx.field(static=True)
+    ood_threshold: float = 1.0
+
+    @property
+    def dynamics(self):
+        return self
+
+    @property
+    def barrier(self):
+        return self
+
+    def step(self, x, action):
+        return x + action, jnp.zeros(x.shape[:-1])
+
+    def apart(self, before, after):
+        return 0.5 - after
+
+    def ahead_apart(self, x):
+        return 0.5 - x
+
+
+def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
+    """Polyak's step is exact where scores are linear and agents lack the same; half of one goes half of the way; what
+    keeps the margin is left as it is."""
+    changes = SMALL | {"num_updates": 20}
+    run = loop.train("flow", two_drifts, out=tmp_path, changes=changes, quiet=True)[0]
+    policy = load(run)[1]
+    x = jnp.zeros((4, 2, 1))
+    driver = jnp.zeros(4, jnp.int32)
+
+    def drawn(share, present, steps=1):
+        options = PlanOptions(sampling_steps=steps, temperature=0.0, barrier_guidance=share)
+        asked = dataclasses.replace(policy, options=options).guided_by(Line(policy.spec))
+        return np.asarray(asked.draw(x, driver, jax.random.key(0), present))
+
+    free = drawn(0.0, x)
+    lacking = (free + 0.5).mean()
+    np.testing.assert_allclose(drawn(1.0, x).mean(), -0.5, atol=1e-4)
+    np.testing.assert_allclose(free.mean() - drawn(0.5, x).mean(), 0.5 * lacking, atol=1e-4)
+    np.testing.assert_array_equal(drawn(1.0, x - 2.0), free)
+    np.testing.assert_allclose(drawn(1.0, x, steps=4).max(), -0.5, atol=0.05)
+
+
+def test_guidance_reads_the_world_that_is_given(two_drifts, run, tmp_path):
+    changes = SMALL | {"num_updates": 4}
+    flows = loop.train("flow", two_drifts, out=tmp_path, changes=changes, quiet=True)[0]
+    world = worlds.fit(two_drifts, **QUICK_WORLD)
+    with pytest.raises(UserError, match="give one of the two"):
+        load(flows, barrier_guidance=1.0, guard="shield", world=world, anyway=True)
+    with pytest.raises(UserError, match="needs a World that knows danger"):
+        load(flows, barrier_guidance=1.0, world=world, anyway=True)
+    with pytest.raises(UserError, match="is unfit to guard by"):
+        load(flows, barrier_guidance=1.0, world=world)
+    with pytest.raises(UserError, match="world is read by nothing"):
+        load(flows, world=world)
+    plans = loop.train(
+        "madiff", two_drifts, out=tmp_path, changes=PLANS | {"num_updates": 4}, world=QUICK_WORLD, quiet=True
+    )
+    with pytest.raises(UserError, match="barrier_guidance=1.0 is of flow"):
+        load(plans[0], barrier_guidance=1.0)

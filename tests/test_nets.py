@@ -13,6 +13,7 @@ import pytest
 
 from ringfence.errors import UserError
 from ringfence.nets import MLP, agent_attention, build_denoiser
+from ringfence.nets.team import told_driver
 from ringfence.nets.unet import TemporalUNet
 
 ROWS, FEATURES = 5, 5  # rows do not halve: the U-Net pads them
@@ -51,6 +52,23 @@ def test_agents_are_interchangeable_and_their_number_is_free(kind):
         np.testing.assert_allclose(apply(net, x[:, :, order], *rest), out[:, :, order], atol=2e-5)
         other = apply(net, x.at[:, :, 0].add(1.0), *rest)
         assert (np.abs(other - out)[:, :, 1:].max((1, 3)) > 1e-5).all()  # what one does reaches the others
+
+
+def test_a_team_is_read_at_once():
+    """Entries that are not carried are not read; what one agent does reaches all; a driver means another plan, for
+    each half of a guided batch."""
+    carried = tuple(i for i in range(ROWS * FEATURES) if i != 3)
+    net = build_denoiser(jax.random.key(0), "residual", ROWS, FEATURES, 16, 2, carried, team=3, drivers=4)
+    x, *rest = inputs(3)
+    out = apply(net, x, *rest, jnp.array([0, 1]))
+    assert out.shape == x.shape and (out[:, 0, :, 3] == 0).all()
+    np.testing.assert_array_equal(apply(net, x.at[:, 0, :, 3].add(1.0), *rest, jnp.array([0, 1])), out)
+    moved = apply(net, x.at[:, 1, 0].add(1.0), *rest, jnp.array([0, 1]))
+    assert (np.abs(moved - out)[:, 1:].max((1, 3)) > 1e-5).all()
+    twice = told_driver(net, jnp.array([0, 3]))(*(jnp.concatenate([a, a]) for a in (x, *rest)))
+    np.testing.assert_allclose(twice[:2], twice[2:], atol=1e-6)
+    np.testing.assert_allclose(twice[0], out[0], atol=1e-6)
+    assert np.abs(twice[1] - out[1]).max() > 1e-4
 
 
 def test_limbs_of_one_body_are_told_apart():

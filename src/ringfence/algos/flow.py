@@ -26,15 +26,16 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.algos import actor_critic as ac
-from ringfence.errors import UserError
+from ringfence.algos import drivers
 from ringfence.logs.store import EpisodeStore
-from ringfence.logs.windows import NOT_ARRIVED, WindowData
+from ringfence.logs.windows import WindowData
 from ringfence.nets.optim import Optimiser, average, fresh
 from ringfence.nets.residual import ResidualMLP
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions
-from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action, driver_scores
+from ringfence.proposals.drivers import driver_scores
+from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import (
     AtLeastOne,
@@ -75,10 +76,6 @@ class Config:
     ema: Share = 0.998  # of the parameters; the policy uses the averages
 
 
-PRIOR_WIDTH = 64  # units of who drives, given a state
-SINKHORN = 6  # rounds that balance the shares of a batch
-
-
 def init(
     key: Key,
     spec: Spec,
@@ -98,7 +95,7 @@ def init(
         params = {
             "clones": ResidualMLP(kc, seen, config.drivers * acts, config.width, config.depth),
             "flow": ResidualMLP(kf, told, acts, config.width, config.depth, 0.1),
-            "prior": ResidualMLP(kp, seen + 2, config.drivers, PRIOR_WIDTH, 2, 0.1),
+            "prior": ResidualMLP(kp, seen + 2, config.drivers, drivers.PRIOR_WIDTH, 2, 0.1),
         }
         return fresh(_optimiser(config), params, "ema")
 
@@ -107,11 +104,7 @@ def init(
 
 def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
-    if config.drivers > config.batch:
-        raise UserError(
-            f"drivers={config.drivers} share {config.batch} windows equally, which are too few; raise batch or lower "
-            "drivers."
-        )
+    drivers.check(config.drivers, config.batch)
 
 
 def make_windows(
@@ -123,30 +116,8 @@ def make_windows(
     return conditions.scored_windows(store, feature_map, world, config.condition, config.horizon, config.discount)
 
 
-def steps_there(batch: Batch) -> Array:
-    """(B, T) which steps of the windows are the episode's own: neither before its start nor past its end."""
-    first = batch.costs == NOT_ARRIVED  # rows before the start repeat the first one
-    return batch.valid[:, 1:] & ~(first[:, :-1] & first[:, 1:])
-
-
-def balanced(explained: Array) -> Array:
-    """Shares (B, C) of windows in drivers, by log-likelihoods (B, C): rows add up to 1, columns nearly to B/C."""
-    for _ in range(SINKHORN):
-        explained = explained - jax.nn.logsumexp(explained, 0, keepdims=True)
-        explained = explained - jax.nn.logsumexp(explained, 1, keepdims=True)
-    return jax.nn.softmax(explained, -1)
-
-
-def shares_of(config: Config, explained: Array, step: Array) -> Array:
-    """Shares (B, C) at an update: balanced until `settled`, then what each driver explains."""
-    early = step < config.settled * config.num_updates
-    return jnp.where(early, balanced(explained), jax.nn.softmax(explained, -1))
-
-
-def spread(config: Config, step: Array) -> Array:
-    """σ at an update: it falls from `sigma_first` to `sigma`, geometrically."""
-    settled = jnp.clip(step / jnp.maximum(config.settled * config.num_updates, 1.0), 0.0, 1.0)
-    return config.sigma_first * (config.sigma / config.sigma_first) ** settled
+def search(config: Config) -> drivers.Search:
+    return drivers.Search(config.drivers, config.num_updates, config.sigma_first, config.sigma, config.settled)
 
 
 def make_loss(config: Config):
@@ -155,16 +126,10 @@ def make_loss(config: Config):
     def loss(params: PyTree, normaliser, batch: Batch, step: Array, key: Key) -> tuple[Array, Metrics]:
         k_driver, k_noise, k_time, k_keep = jax.random.split(key, 4)
         windows, steps = batch.actions.shape[:2]
-        there = steps_there(batch)
+        there = drivers.steps_there(batch)
         seen = normaliser.state(batch.features[:, :-1]).reshape(windows * steps, -1)
         actions = batch.actions.reshape(windows * steps, -1)
-
-        clones = params["clones"](seen).reshape(windows * steps, config.drivers, -1)
-        errors = ((clones - actions[:, None]) ** 2).sum(-1).reshape(windows, steps, -1) * there[..., None]
-        explained = -errors.sum(1) / (2 * spread(config, step) ** 2)
-        shares = shares_of(config, jax.lax.stop_gradient(explained), step)
-        count = jnp.maximum(there.sum(), 1)
-        clone_loss = (shares[:, None] * errors).sum() / count
+        shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
 
         driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
         told = jnp.repeat(jax.nn.one_hot(driver, config.drivers), steps, 0)
@@ -174,11 +139,10 @@ def make_loss(config: Config):
         tau = jax.random.uniform(k_time, (windows * steps,))
         noised = (1.0 - tau)[:, None] * noise + tau[:, None] * actions
         clean = clean_action(params["flow"], seen, noised, tau, told, score, jnp.repeat(kept, steps))
-        flow_loss = (((clean - actions) ** 2).sum(-1) * there.reshape(-1)).sum() / count
+        flow_loss = (((clean - actions) ** 2).sum(-1) * there.reshape(-1)).sum() / jnp.maximum(there.sum(), 1)
 
         guess = driver_scores(params["prior"], seen, score, jnp.repeat(kept, steps))
-        surprise = -(jnp.repeat(shares, steps, 0) * jax.nn.log_softmax(guess)).sum(-1)
-        prior_loss = (surprise * there.reshape(-1)).sum() / count
+        prior_loss = drivers.surprise(guess, shares, there)
         metrics = {"loss/clones": clone_loss, "loss/flow": flow_loss, "loss/prior": prior_loss}
         return clone_loss + flow_loss + prior_loss, metrics | {"drivers/sure": shares.max(-1).mean()}
 

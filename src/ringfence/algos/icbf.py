@@ -4,6 +4,7 @@ Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 6)
     L^C  the generator follows the World's barrier (`split`), or both learn as printed (`paper`, algos/joint.py; eq. 8)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
+    L^E, L^Q  who drives, where the log holds many drivers and `drivers` says so; a plan is of one  (algos/drivers.py)
 
 With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
 the planner is MADIFF's.
@@ -19,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.algos import drivers
 from ringfence.algos.joint import joint_losses
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData, at
@@ -26,10 +28,13 @@ from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import infer_action
 from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.nets.residual import ResidualMLP
+from ringfence.nets.team import told_driver
 from ringfence.problem import features, normalise
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions, diffusion
 from ringfence.proposals import retention as cbf
+from ringfence.proposals.drivers import driver_scores
 from ringfence.proposals.planner import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import BatchSize, Count, Depth, Natural, NonNegative, Positive, Rows, Share, Width
@@ -52,9 +57,12 @@ class Config:
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
     # --- denoiser ---
-    net: Literal["attention", "unet"] = "attention"  # agent attention over flat windows, or MADIFF's temporal U-Net
+    net: Literal["attention", "residual", "unet"] = "attention"  # of agents, of the whole team, MADIFF's temporal U-Net
     width: Width = 128  # channels
-    depth: Depth = 3  # blocks (attention) or resolutions (unet)
+    depth: Depth = 3  # blocks (attention), hidden layers (residual) or resolutions (unet)
+    drivers: Natural = (
+        0  # C that the log's windows are shared among; a plan is of one of them. 0: drivers are no matter
+    )
     diffusion_steps: Width = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
     snr_floor: NonNegative = 0.5  # x0-prediction: least weight of a noise level
@@ -94,6 +102,7 @@ class Config:
 
 
 INVERSE_STEPS = 3  # steps of every window that inverse dynamics learns from
+CLONES = (384, 3)  # units and hidden layers of the joint clones that share a log of many drivers
 
 
 _PAPER = {
@@ -166,19 +175,34 @@ def init(
     kd, kb, ki, _, ks = jax.random.split(key, 5)  # the fourth was forward dynamics': others start as they always did
     n = spec.n_agents
     d = spec.feature_dim
+    seen = n * d
     rows = config.horizon + config.history
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
 
     def networks() -> dict:
         params = {
             "denoiser": build_denoiser(
-                kd, config.net, rows, d, config.width, config.depth, carried, n if feature_map.joint else 0
+                kd,
+                config.net,
+                rows,
+                d,
+                config.width,
+                config.depth,
+                carried,
+                agents=n if feature_map.joint else 0,
+                team=n,
+                drivers=config.drivers,
             ),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True, acts=spec),
         }
         if config.barrier and config.routing == "paper":
             groups = n if config.scope == "individual" else 1
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
+        if config.drivers:
+            kc, kq = jax.random.split(jax.random.fold_in(key, 1))
+            acts = n * spec.action_dim
+            params["clones"] = ResidualMLP(kc, seen, config.drivers * acts, *CLONES)
+            params["prior"] = ResidualMLP(kq, seen + 2, config.drivers, drivers.PRIOR_WIDTH, 2, 0.1)
         return fresh(optimiser(config), params, "ema")
 
     if data is None:
@@ -223,6 +247,13 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError(f"width={config.width} must be a multiple of {4 * HEADS}, for {HEADS} heads of equal width.")
     if config.net == "unet":
         unet.check_sizes(config.history + config.horizon, config.width, config.depth)
+    if config.drivers:
+        drivers.check(config.drivers, config.batch)
+        if config.net == "unet" or config.observe != "all":
+            raise UserError(
+                f"drivers={config.drivers} are told to a plan of the whole team by the nets attention and residual; "
+                "leave observe='all' and choose one of these, or set drivers=0."
+            )
     if config.horizon < 2:
         raise UserError(f"horizon={config.horizon} holds no step to act on; use 2 or more.")
     for low, high in (("snr_floor", "snr_ceiling"), ("barrier_start", "barrier_full")):
@@ -277,7 +308,7 @@ def visible_agents(config: Config, key: Key, shape: tuple[int, int]) -> Array:
 
 def carries_own(config: Config, feature_map: features.FeatureMap) -> bool:
     """Whether plans hold own entries only; needs a view that knows how the rest follows."""
-    return config.carry == "own" and feature_map.reconcile is not None and config.net == "attention"
+    return config.carry == "own" and feature_map.reconcile is not None and config.net != "unet"
 
 
 def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndarray:
@@ -290,17 +321,47 @@ def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndar
     return carried
 
 
+def search(config: Config) -> drivers.Search:
+    return drivers.Search(config.drivers, config.num_updates)
+
+
+def driving(
+    params: PyTree, batch: Batch, norm: normalise.Normaliser, step: Array, key: Key, config: Config
+) -> tuple[Array, Array, Metrics]:
+    """(L^E + L^Q, driver (B,) of every window, drawn by its shares, metrics); algos/drivers.py."""
+    k_driver, k_keep = jax.random.split(key)
+    now = config.history
+    windows, steps = batch.actions[:, now:].shape[:2]
+    seen = norm.state(batch.features[:, now:-1]).reshape(windows * steps, -1)
+    actions = batch.actions[:, now:].reshape(windows * steps, -1)
+    there = batch.valid[:, now + 1 :]
+    shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
+    driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
+    keep = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,))
+    guess = driver_scores(params["prior"], seen, jnp.repeat(batch.score, steps), jnp.repeat(keep, steps))
+    prior_loss = drivers.surprise(guess, shares, there)
+    metrics = {"loss/clones": clone_loss, "loss/prior": prior_loss, "drivers/sure": shares.max(-1).mean()}
+    return clone_loss + prior_loss, driver, metrics
+
+
 def denoising(
-    params: PyTree, batch: Batch, plan: Array, key: Key, config: Config, alpha_bar: np.ndarray, carried: np.ndarray
+    params: PyTree,
+    batch: Batch,
+    plan: Array,
+    key: Key,
+    config: Config,
+    alpha_bar: np.ndarray,
+    carried: np.ndarray,
+    driver: Array | None = None,
 ) -> tuple[Array, tuple[Array, diffusion.Noised, Array]]:
-    """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted."""
+    """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted, of plans of drivers (B,)."""
     k1, k2, k3 = jax.random.split(key, 3)
     mask = diffusion.known_entries(
         visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1]
     )
     noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
     keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
-    output = params["denoiser"](noised.x, noised.k, batch.score, keep)
+    output = told_driver(params["denoiser"], driver)(noised.x, noised.k, batch.score, keep)
     weight = (~mask & batch.valid[..., None, None] & carried[:, None]).astype(jnp.float32)
     clip = (config.snr_floor, config.snr_ceiling)
     loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
@@ -339,8 +400,9 @@ def generated(
     key: Key,
     config: Config,
     alpha_bar: np.ndarray,
+    driver: Array | None = None,
 ) -> Generated:
-    """s̃^θ at the configured gradient depth."""
+    """s̃^θ at the configured gradient depth, of plans of drivers (B,)."""
     kind, n = gradient_depth(config.gradient)
     ret = retention(config)
     bar = alpha_bar
@@ -360,7 +422,8 @@ def generated(
     def inpaint(x: Array) -> Array:
         return jnp.where(mask, known, x)
 
-    predict = diffusion.guided(params["denoiser"], alpha_bar, batch.score[:b], 1.0, config.prediction, config.clip)
+    net = told_driver(params["denoiser"], None if driver is None else driver[:b])
+    predict = diffusion.guided(net, alpha_bar, batch.score[:b], 1.0, config.prediction, config.clip)
     if kind == "ddim":
         x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)
         return Generated(norm.invert(x), valid, zero, one)
@@ -418,14 +481,19 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
     def loss(params, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
         kd, kp, _, kg = jax.random.split(key, 4)
         norm = frozen["normaliser"]
+        driver = None
+        found = 0.0
+        metrics = {}
+        if config.drivers:
+            found, driver, metrics = driving(params, batch, norm, step, jax.random.fold_in(key, 1), config)
         denoise, (clean, noised, mask) = denoising(
-            params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried
+            params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried, driver
         )
         inverse = inverse_dynamics(params, batch, norm, kp, config)
-        metrics = {"loss/denoising": denoise, "loss/inverse": inverse}
-        total = parts[0] * denoise + inverse
+        metrics |= {"loss/denoising": denoise, "loss/inverse": inverse}
+        total = parts[0] * denoise + inverse + found
         if config.barrier:
-            made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar)
+            made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar, driver)
             if carries_own(config, feature_map):
                 # Where others will be is what *they* plan: a gradient must move bodies, not one's image of them.
                 made = made._replace(features=feature_map.agreed(made.features, config.history))
@@ -509,6 +577,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
         clip=config.clip,
         discount=config.discount,
         observe=config.observe,
+        drivers=config.drivers,
         carries_own=carries_own(config, feature_map),
         spec=spec,
         feature_map=feature_map,

@@ -81,11 +81,13 @@ class Cell:
         """Hash of what training depends on, under the names that fields had first; how the run is played does not
         count."""
         task = registry.get(self.task)
+        config = dataclasses.asdict(self.config)
+        as_before = {k for k, v in names.LATER_CONFIG.items() if config.get(k) == v}
         content = {
             "format": FORMAT,
             "data": [RECIPES, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
             "algorithm": self.algorithm,
-            "config": {_FIRST_NAMES.get(k, k): v for k, v in dataclasses.asdict(self.config).items()},
+            "config": {_FIRST_NAMES.get(k, k): v for k, v in config.items() if k not in as_before},
             "seed": self.seed,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]

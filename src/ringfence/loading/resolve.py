@@ -18,6 +18,7 @@ from ringfence.loading import oracle, run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
+from ringfence.proposals.flow import FlowPolicy
 from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
@@ -27,6 +28,7 @@ from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import policy_of_before, renamed
 from ringfence.world import World
+from ringfence.world.verdict import require
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,6 +100,8 @@ def resolve(spec: PolicySpec) -> Resolved:
     world = run_worlds.of_run(run) if job.reads_world else None
     step, policy = _trained(run, job, world, spec)
     plans = isinstance(policy, TakesPlanOptions)
+    if isinstance(policy, FlowPolicy) and policy.options.barrier_guidance:
+        policy = _guided(policy, run, job, world, spec)
     if spec.guarded and spec.barrier == oracle.ORACLE:
         team = team_policy(policy, job.team, job.task.homogeneous)
         policy = oracle.guarded(team, job.task, spec.guard, dict(spec.guard_options))
@@ -112,6 +116,20 @@ def resolve(spec: PolicySpec) -> Resolved:
     # Homogeneous agents see for themselves anyway.
     spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
+
+
+def _guided(policy: FlowPolicy, run: Run, job: Job, read: World | None, spec: PolicySpec) -> FlowPolicy:
+    """A flow whose sampling is guided by the World that would guard it."""
+    if spec.guarded:
+        raise UserError(
+            "barrier_guidance is for actions that are followed as they are drawn, and a guard corrects them anyway; "
+            "give one of the two."
+        )
+    execution = worlds.execution_of(job.task, None)
+    world = run_worlds.for_guard(run, execution, spec.world, read=read, quiet=False)
+    _check_width(job, world.map, "The World")
+    require(world.card, spec.anyway)
+    return policy.guided_by(world)
 
 
 def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple[int, Policy]:

@@ -101,7 +101,7 @@ class PolicySpec:
             agents=agents,
             anyway=anyway,
         )
-        if not spec.guarded:
+        if not spec.guarded and not options.get("barrier_guidance"):
             unread = {"barrier": barrier is not None, "world": world is not None}
             for name, given in unread.items():
                 if given:

@@ -40,21 +40,24 @@ class AgentAttention(eqx.Module):
         depth: int = 3,
         carried: tuple[int, ...] | None = None,
         agents: int = 0,
+        drivers: int = 0,
     ):
-        """`agents`: their number if they are to be distinguished, as limbs of one body are; 0: they are homogeneous."""
+        """`agents`: their number if they are to be distinguished, as limbs of one body are; 0: they are homogeneous.
+        `drivers`: how many it may be told to plan as."""
         keys = jax.random.split(key, depth + 3)
         self.carried = tuple(range(rows * features)) if carried is None else carried
         flat = len(self.carried)
-        self.condition = Condition(keys[0], width)
+        self.condition = Condition(keys[0], width, drivers)
         self.inlet = _normal(keys[1], flat, width)
         self.outlet = _normal(keys[2], width, flat, 0.1)
         self.blocks = [_block(k, width) for k in keys[3:]]
         self.which = jnp.zeros((agents, width)) if agents else None
 
-    def __call__(self, x: Array, k: Array, y: Array, keep: Array) -> Array:
-        """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool -> (B, H, N, D)."""
+    def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
+        """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
+        those it may be told -> (B, H, N, D)."""
         b, h, n, d = x.shape
-        c = self.condition(k, y, keep)
+        c = self.condition(k, y, keep, driver)
         carried = np.array(self.carried)
         token = jnp.moveaxis(x, 1, 2).reshape(b * n, h * d)[:, carried] @ self.inlet
         if self.which is not None:

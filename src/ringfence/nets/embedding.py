@@ -26,16 +26,21 @@ class Condition(eqx.Module):
     step: MLP
     target: MLP
     null: Array  # (width,)
+    drivers: Array | None  # (C, width), where the log holds several
 
-    def __init__(self, key: Key, width: int):
+    def __init__(self, key: Key, width: int, drivers: int = 0):
         k1, k2, k3 = jax.random.split(key, 3)
+        self.drivers = jax.random.normal(jax.random.fold_in(key, 1), (drivers, width)) if drivers else None
         self.step = MLP(k1, (64, width, width))
         self.target = MLP(k2, (16, width, width))
         self.null = 0.02 * jax.random.normal(k3, (width,))
 
-    def __call__(self, k: Array, y: Array, keep: Array) -> Array:
-        """Diffusion step k (B,), return score y (B,), keep (B,) bool: false drops the condition."""
+    def __call__(self, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
+        """Diffusion step k (B,), return score y (B,), keep (B,) bool: false drops the condition; driver (B,)."""
         # Scores live in about [-4, 4]; the sine features resolve them, the raw value lets them be extrapolated.
         features = jnp.concatenate([y[:, None], sinusoidal(y * 100.0, 15 + 1)[:, :15]], -1)
         target = jnp.where(keep[:, None], self.target(features), self.null)
-        return jax.nn.silu(self.step(sinusoidal(k, 64)) + target)
+        told = self.step(sinusoidal(k, 64)) + target
+        if self.drivers is not None:
+            told = told + self.drivers[driver]
+        return jax.nn.silu(told)

@@ -2,10 +2,14 @@
 
 noise ε (N·A) ──┐
 state, driver ──┼─► clean action â(a_τ, τ)   a_τ+Δ = a_τ + Δ (â − a_τ)/(1 − τ)    τ = 0 .. 1 in 1 to 4 steps
+
+With `barrier_guidance` w, every step moves â by w of Polyak's step to where a World's danger keeps its margin:
+f(â) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins, ŝ' = f_φ(s, â), â ← â − w f ∇f / ‖∇f‖².
 """
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -15,14 +19,18 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
+from ringfence.problem.constraints import lowest
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
-from ringfence.proposals.base import from_unit, rolled
+from ringfence.proposals.base import from_unit, in_bounds_of, rolled
+from ringfence.proposals.drivers import asked, drawn, driver_scores
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
 
 WAVES = 4  # sines and cosines of τ
+MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
+LEAST_SLOPE = 1e-6  # no step is longer than by this
 UNREAD = ("sampler", "value_guidance", "persist", "reconcile", "replan", "execution")  # options of plans of states
 
 
@@ -35,23 +43,7 @@ def time_entries(tau: Array) -> Array:
 def clean_action(net: Any, seen: Array, action: Array, tau: Array, driver: Array, score: Array, keep: Array) -> Array:
     """â (B, N·A) of a noised action (B, N·A) at τ (B,): `seen` (B, N·D) standardised, `driver` (B, C) one of C, `score`
     (B,) the condition y where `keep` (B,) says so."""
-    return net(jnp.concatenate([seen, action, time_entries(tau), driver, _asked(seen, score, keep)], -1))
-
-
-def driver_scores(net: Any, seen: Array, score: Array, keep: Array) -> Array:
-    """Logits (B, C) of who drives at standardised states (B, N·D), given y (B,) where `keep` (B,) says so."""
-    return net(jnp.concatenate([seen, _asked(seen, score, keep)], -1))
-
-
-def _asked(seen: Array, score: Array, keep: Array) -> Array:
-    """(B, 2): y and whether it is told."""
-    return jnp.stack([jnp.where(keep, score, 0.0), keep.astype(seen.dtype)], -1)
-
-
-def _gumbel(normal: Array) -> Array:
-    """Gumbel noise from normal noise, the only one that exported files can be given."""
-    share = jnp.clip(0.5 * (1.0 + jax.lax.erf(normal / 2**0.5)), 1e-6, 1.0 - 1e-6)
-    return -jnp.log(-jnp.log(share))
+    return net(jnp.concatenate([seen, action, time_entries(tau), driver, asked(seen, score, keep)], -1))
 
 
 class FlowPolicy(eqx.Module):
@@ -64,6 +56,7 @@ class FlowPolicy(eqx.Module):
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
+    world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
 
     def __check_init__(self):
         usual = PlanOptions()
@@ -87,7 +80,8 @@ class FlowPolicy(eqx.Module):
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds."""
         x = self.feature_map(observations, state)
         carry, key = self._with_driver(carry, x, key)
-        action = self.draw(x, carry["driver"], key)
+        present = None if self.world is None else self.world.map(observations, state)
+        action = self.draw(x, carry["driver"], key, present)
         return carry, PolicyStep(from_unit(action, self.spec), {})
 
     def propose(
@@ -108,8 +102,15 @@ class FlowPolicy(eqx.Module):
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
-    def draw(self, x: Array, driver: Array, key: Key) -> Array:
-        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,)."""
+    def guided_by(self, world: World) -> FlowPolicy:
+        """The same, its sampling guided by the danger that this World has learned."""
+        if world.barrier is None:
+            raise UserError("barrier_guidance needs a World that knows danger; fit one on logs with costs.")
+        return dataclasses.replace(self, world=in_bounds_of(self.spec, world))
+
+    def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None) -> Array:
+        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,); guided from `present` (B, N, D'), the
+        same in the World's view."""
         o, s = self.options, self.spec
         batch = x.shape[0]
         seen = self.normaliser.state(x).reshape(batch, -1)
@@ -123,9 +124,33 @@ class FlowPolicy(eqx.Module):
 
         action = o.temperature * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
         for k in range(o.sampling_steps):
-            tau = k / o.sampling_steps
-            action = action + (clean(action, jnp.full(batch, tau)) - action) / (o.sampling_steps - k)
+            aim = clean(action, jnp.full(batch, k / o.sampling_steps))
+            if present is not None:
+                aim = self._clear(present, aim)
+            action = action + (aim - action) / (o.sampling_steps - k)
         return s.own(jnp.clip(action, -1.0, 1.0).reshape(batch, s.n_agents, s.action_dim))
+
+    def _clear(self, present: Array, action: Array) -> Array:
+        """Joint actions (B, N·A), moved towards those after which danger keeps its margin."""
+        s = self.spec
+
+        def missing(action: Array) -> Array:
+            return self._missing(present, s.own(jnp.clip(action, -1.0, 1.0).reshape(-1, s.n_agents, s.action_dim)))
+
+        short, back = jax.vjp(missing, action)
+        slope = back(jnp.ones_like(short))[0]
+        size = jnp.maximum((slope**2).sum(-1), LEAST_SLOPE)
+        return action - self.options.barrier_guidance * (short / size)[:, None] * slope
+
+    def _missing(self, present: Array, action: Array) -> Array:
+        """(B,) what the next states lack of the margin, in all: 0 or negative. As guards do, it trusts less where the
+        ensemble disagrees."""
+        world = self.world
+        assert world is not None and world.barrier is not None, "checked by guided_by"
+        after, spread = world.dynamics.step(present, action)
+        score = jnp.minimum(world.barrier.apart(present, after), world.barrier.ahead_apart(after))
+        doubt = jnp.maximum(spread / world.ood_threshold - 1.0, 0.0)
+        return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
     def _guided(self, told: Callable[[Array, Array], Array], batch: int) -> Array:
         """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y, whether it is told)."""
@@ -150,4 +175,4 @@ class FlowPolicy(eqx.Module):
         batch = x.shape[0]
         seen = self.normaliser.state(x).reshape(batch, -1)
         logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
-        return jnp.argmax(logits + _gumbel(jax.random.normal(key, logits.shape)), -1).astype(jnp.int32)
+        return drawn(logits, jax.random.normal(key, logits.shape))

@@ -22,6 +22,7 @@ class PlanOptions:
     value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
+    barrier_guidance: NonNegative = 0.0  # share of a step to the World's margin, in every sampling step; 0: none
     replan: AtLeastOne = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 
@@ -41,7 +42,7 @@ class TakesPlanOptions(Protocol):
 def plan_defaults(config) -> dict:
     """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, and a flow
     needs few steps."""
-    if hasattr(config, "drivers"):
+    if hasattr(config, "drivers") and not hasattr(config, "diffusion_steps"):
         return {"sampling_steps": 2}
     return {"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {}
 

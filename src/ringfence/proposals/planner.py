@@ -20,10 +20,12 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.nets.heads import infer_action
+from ringfence.nets.team import told_driver
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
+from ringfence.proposals.drivers import drawn, driver_scores
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
@@ -36,7 +38,7 @@ MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviat
 class Planner(HadStart, eqx.Module):
     """Receding-horizon diffusion planner."""
 
-    networks: dict[str, Any]  # denoiser, inverse
+    networks: dict[str, Any]  # denoiser, inverse; and prior, where there are drivers
     normaliser: Normaliser
     critic: Critic  # what states are worth
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
@@ -46,6 +48,7 @@ class Planner(HadStart, eqx.Module):
     clip: float = eqx.field(static=True)
     discount: float = eqx.field(static=True)
     observe: str = eqx.field(static=True)  # whose present was known in training
+    drivers: int = eqx.field(static=True)  # that it may plan as, one for an episode; 0: nobody in particular
     carries_own: bool = eqx.field(static=True)  # plans hold own entries only; the rest is recomputed
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
@@ -56,6 +59,11 @@ class Planner(HadStart, eqx.Module):
         if o.replan > self.horizon - 1:
             raise UserError(
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
+            )
+        if o.barrier_guidance:
+            raise UserError(
+                f"barrier_guidance={o.barrier_guidance} is of flow, which draws actions; a diffusion planner follows a "
+                "barrier by training (icbf)."
             )
         if self.carries_own and not o.reconcile:
             raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
@@ -68,7 +76,8 @@ class Planner(HadStart, eqx.Module):
     def initial_state(self, batch: int) -> PyTree:
         n, d = self.spec.n_agents, self.spec.feature_dim
         rows = self.history + self.horizon
-        return {
+        driver = {"driver": jnp.zeros(batch, jnp.int32)} if self.drivers else {}
+        return driver | {
             "past": jnp.zeros((batch, self.history, n, d)),
             "plan": jnp.zeros((batch, rows, n, d)),
             "age": jnp.zeros((), jnp.int32),
@@ -77,12 +86,14 @@ class Planner(HadStart, eqx.Module):
     def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         """observations (B, N, O), state (B, S) -> joint action (B, N, A) within the task's bounds, of one plan."""
         o, (past, present) = self.options, self._context(carry, observations, state)
+        carry = self._with_driver(carry, present, key)
+        driver = carry["driver"] if self.drivers else None
         if o.replan == 1:
-            plan = self.plans(past, present, key, 1)[:, 0]
+            plan = self.plans(past, present, key, 1, driver)[:, 0]
             ahead = plan[:, self.history + 1]
         else:
             fresh = carry["age"] % o.replan == 0
-            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1)[:, 0], lambda: carry["plan"])
+            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1, driver)[:, 0], lambda: carry["plan"])
             ahead = jnp.take(plan, self.history + 1 + carry["age"] % o.replan, axis=1)
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
@@ -101,7 +112,8 @@ class Planner(HadStart, eqx.Module):
                 "longer horizon."
             )
         past, present = self._context(carry, observations, state)
-        plans = self.plans(past, present, key, count)
+        carry = self._with_driver(carry, present, key)
+        plans = self.plans(past, present, key, count, self._several(carry, present, key, count))
         flat = plans.reshape(-1, *plans.shape[2:])
         x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
         for row in range(self.history + 1, self.history + 1 + rows):
@@ -121,11 +133,37 @@ class Planner(HadStart, eqx.Module):
     def _kept(self, carry: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
         if self.history:
             past = jnp.concatenate([past[:, 1:], present[:, None]], 1)
-        return {"past": past, "plan": plan, "age": carry["age"] + 1}
+        return {**carry, "past": past, "plan": plan, "age": carry["age"] + 1}
 
-    def plans(self, past: Array, present: Array, key: Key, count: int) -> Array:
-        """(B, count, rows, N, D) plans from the present (B, N, D). Decentralised, every agent imagines the whole team,
-        n times the work, and keeps its own part."""
+    def _with_driver(self, carry: PyTree, present: Array, key: Key) -> PyTree:
+        """What is carried, with the driver that this episode's first state (B, N, D) draws."""
+        if not self.drivers:
+            return carry
+        driver = jnp.where(carry["age"] == 0, self._drawn(present, jax.random.fold_in(key, 1)), carry["driver"])
+        return {**carry, "driver": driver}
+
+    def _several(self, carry: PyTree, present: Array, key: Key, count: int) -> Array | None:
+        """(B · count,) whose plans to make: the episode's own driver's first, then of such as may drive here."""
+        if not self.drivers:
+            return None
+        others = self._drawn(jnp.repeat(present, count - 1, 0), jax.random.fold_in(key, 2))
+        own = carry["driver"][:, None]
+        return jnp.concatenate([own, others.reshape(len(own), count - 1)], 1).reshape(-1)
+
+    def _drawn(self, present: Array, key: Key) -> Array:
+        """(B,) who drives at states (B, N, D), drawn, for the return that is asked for."""
+        o, batch = self.options, present.shape[0]
+        seen = self.normaliser.state(present).reshape(batch, -1)
+        score, everyone = jnp.full(batch, o.target_return), jnp.ones(batch, bool)
+        logits = driver_scores(self.networks["prior"], seen, score, everyone)
+        if o.cfg_scale != 1.0:
+            free = driver_scores(self.networks["prior"], seen, score, ~everyone)
+            logits = free + o.cfg_scale * (logits - free)
+        return drawn(logits, jax.random.normal(key, logits.shape))
+
+    def plans(self, past: Array, present: Array, key: Key, count: int, driver: Array | None = None) -> Array:
+        """(B, count, rows, N, D) plans from the present (B, N, D), of drivers (B · count,) where there are some.
+        Decentralised, every agent imagines the whole team, n times the work, and keeps its own part."""
         (b, n, d), rows = present.shape, self.history + self.horizon
         context = jnp.concatenate([past, present[:, None]], 1)
         local = self.options.execution == "decentralized"
@@ -133,14 +171,14 @@ class Planner(HadStart, eqx.Module):
         visible = jnp.ones((b, copies, n), bool)
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
-        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, driver)
         if not local:
             return x.reshape(b, count, rows, n, d)
         own = x.reshape(b, n, count, rows, n, d)
         return jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)
 
-    def sample(self, context: Array, visible: Array, key: Key) -> Array:
-        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D)."""
+    def sample(self, context: Array, visible: Array, key: Key, driver: Array | None = None) -> Array:
+        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), of drivers (B,)."""
         o, (b, _, n, d) = self.options, context.shape
         rows = self.history + self.horizon
         known = self.normaliser.state(context)
@@ -148,7 +186,8 @@ class Planner(HadStart, eqx.Module):
         known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
         bar = np.asarray(self.alpha_bar)
         target = jnp.full(b, o.target_return)
-        predict = diffusion.guided(self.networks["denoiser"], bar, target, o.cfg_scale, self.prediction, self.clip)
+        net = told_driver(self.networks["denoiser"], driver)
+        predict = diffusion.guided(net, bar, target, o.cfg_scale, self.prediction, self.clip)
 
         def inpaint(x: Array) -> Array:
             return jnp.where(mask, known, x)

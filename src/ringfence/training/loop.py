@@ -31,6 +31,7 @@ from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
+from ringfence.utils import stored
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
@@ -398,6 +399,8 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
         older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team")}  # that older runs do not tell
         there = older | run.config
         there["spec"] = {"homogeneous": False} | there.get("spec", {})
+        later = {k: v for k, v in stored.LATER_CONFIG.items() if k in mine["config"]}
+        there["config"] = later | there["config"]
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

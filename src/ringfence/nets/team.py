@@ -1,0 +1,66 @@
+"""A denoiser of whole teams: everybody's window in one vector, through a residual network.
+
+It learns a team of a few agents faster than attention does (docs/method.md, logs of many drivers); its weights are for
+one number of agents, whom it tells apart.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.nets.embedding import Condition
+from ringfence.nets.residual import ResidualMLP
+from ringfence.types import Array, Key
+
+TOLD = 64  # units of what the network is told: diffusion step, return, driver
+
+
+class TeamDenoiser(eqx.Module):
+    """F(x_k, k, y) as `AgentAttention`."""
+
+    condition: Condition
+    net: ResidualMLP
+    carried: tuple[int, ...] = eqx.field(static=True)  # entries of a flattened window (H·D) that are read and written
+
+    def __init__(
+        self,
+        key: Key,
+        rows: int,
+        features: int,
+        width: int,
+        depth: int,
+        carried: tuple[int, ...] | None,
+        agents: int,
+        drivers: int = 0,
+    ):
+        """For teams of `agents`; `drivers`: how many it may be told to plan as."""
+        k1, k2 = jax.random.split(key)
+        self.carried = tuple(range(rows * features)) if carried is None else carried
+        flat = agents * len(self.carried)
+        self.condition = Condition(k1, TOLD, drivers)
+        self.net = ResidualMLP(k2, flat + TOLD, flat, width, depth, 0.1)
+
+    def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
+        """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
+        those it may be told -> (B, H, N, D)."""
+        b, h, n, d = x.shape
+        carried = np.array(self.carried)
+        windows = jnp.moveaxis(x, 1, 2).reshape(b, n, h * d)
+        seen = windows[..., carried].reshape(b, -1)
+        clean = self.net(jnp.concatenate([seen, self.condition(k, y, keep, driver)], -1))
+        out = jnp.zeros_like(windows).at[..., carried].set(clean.reshape(b, n, -1))
+        return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
+
+
+def told_driver(denoiser, driver: Array | None):
+    """F(x, k, y, keep) that plans as `driver` (B,), also where guidance asks it twice at once; None: as anybody."""
+    if driver is None:
+        return denoiser
+
+    def net(x: Array, k: Array, y: Array, keep: Array) -> Array:
+        return denoiser(x, k, y, keep, jnp.tile(driver, x.shape[0] // driver.shape[0]))
+
+    return net
