@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import tempfile
 from importlib.metadata import version
+from pathlib import Path
 
-# The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give.
+# The tests compile many programs and run each a few times, so the compiler's optimisations cost twice what they give,
+# and so do threads: each worker has a core.
 # Set before JAX starts; whoever sets XLA_FLAGS himself, even to nothing, tests with those.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true --xla_cpu_multi_thread_eigen=false"
     # one that does not know a flag ends at once
-    + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
+    + " --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+    * version("jaxlib").startswith("0.10."),
 )
+os.environ.setdefault("NPROC", "1")  # threads of XLA
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # of NumPy
 
 # Programs that several tests compile alike (a resumed training, a policy loaded again) are compiled once.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("JAX_COMPILATION_CACHE_DIR") or tempfile.mkdtemp(
@@ -42,6 +48,9 @@ from ringfence.world import validate
 # more than half of what a small World's fit takes. Tests ask of fewer.
 validate.ENTERED = 20
 
+# Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
+gc.set_threshold(50_000, 20, 20)
+
 
 def pytest_unconfigure(config):
     """Leave nothing in the folder for temporary files; workers share the cache of the process that began them."""
@@ -50,6 +59,17 @@ def pytest_unconfigure(config):
     for name, ours in (("RINGFENCE_TESTS_HOME", "ringfence-home-"), ("JAX_COMPILATION_CACHE_DIR", "ringfence-tests-")):
         if ours in os.environ[name]:
             shutil.rmtree(os.environ[name], ignore_errors=True)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forget_programs():
+    """A process may map so many pieces of memory and no more, and each program takes some: before they run out, what
+    was compiled is forgotten. Programs that files share stay until then."""
+    yield
+    maps, limit = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
+    if limit.exists() and len(maps.read_bytes().splitlines()) > int(limit.read_text()) // 3:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture(scope="session")
