@@ -14,6 +14,7 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import BarrierSource, Guard, GuardOptions
+from ringfence.guards.correction import fixed_plans
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
@@ -70,6 +71,35 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
         return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin).sum((1, 2))
 
     assert (missing(eqx.filter_jit(guard.shielded)(present, plan, margin)) >= missing(plan) - 1e-5).all()
+
+
+def test_a_correction_that_falls_short_is_begun_again(small_world, bound, present):
+    """No plan becomes worse, some become better, and none leaves its bounds."""
+    plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-0.3, maxval=0.3)
+    margin = jnp.full((64, 1), 3.0)
+    missing = {}
+    for restarts in (0, 1):
+        guard = make(small_world, bound, correction_steps=3, correction_restarts=restarts, max_correction=0.8)
+        found = eqx.filter_jit(guard.shielded)(present, plan, margin)
+        assert (jnp.abs(found - plan) <= 0.8 + 1e-6).all() and (jnp.abs(found) <= 1).all()
+        rows, spread = guard.predict(present, found[:, None])
+        clear = guard.clear(rows, spread, margin)[:, 0]
+        missing[restarts] = np.asarray(guard.missing(present, clear, margin).sum((1, 2)))
+    assert (missing[1] >= missing[0] - 1e-5).all()
+    assert (missing[1] > missing[0] + 1e-2).any()
+
+
+@pytest.mark.parametrize("dim", [1, 2, 3, 6])
+def test_every_agent_begins_from_every_fixed_plan(dim):
+    plans = fixed_plans(rows=3, agents=2, dim=dim, rounds=2)
+    many = plans.shape[1]
+    assert plans.shape == (2, many, 3, 2, dim) and many <= 1 + 26 * 3 * 2
+    sets = [np.unique(plans[r, :, :, n].reshape(many, -1), axis=0) for r in range(2) for n in range(2)]
+    assert all(np.array_equal(sets[0], one) for one in sets)
+    assert np.abs(plans).max() == 1.0 and (plans == 0).all((2, 3, 4)).sum() < many
+    if dim <= 3:  # into each direction by all that an agent can do, for all rows
+        for corner in ([1.0] * dim, [-1.0] * dim):
+            assert (plans[0, :, :, 0] == np.array(corner)).all((1, 2)).any()
 
 
 def test_many_plans_are_corrected_as_few_are(small_world, bound, present):

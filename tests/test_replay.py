@@ -23,17 +23,17 @@ DT, STEPS, EPISODES, RADIUS = 0.1, 40, 12, 0.5
 NAMES = ["own.vx", "own.vy", "other0.dx", "other0.dy", "other0.dvx", "other0.dvy"]
 
 
-def walkers(reach=2.0, **card) -> EpisodeStore:
+def walkers(reach=2.0, late=0.5, **card) -> EpisodeStore:
     """Two walk at 1 m/s toward a crossing, each `reach` m away. The first one brakes and stands 0.8 m before it, the
     second one walks on. So nobody touches as logged; who drives the first one straight on touches in every episode,
-    and who drives the second one straight on never does.
+    and who drives the second one straight on never does. `late` is how much of a step they go with the next velocity.
     """
     turns = np.random.default_rng(0).uniform(0, 2 * np.pi, EPISODES)
     along = np.stack([np.stack([np.cos(turns), np.sin(turns)], -1), np.stack([-np.sin(turns), np.cos(turns)], -1)], 1)
     speed = np.ones((STEPS + 1, 2))
     speed[:, 0] = np.clip(1.0 - 0.1 * (np.arange(STEPS + 1) - 7), 0, 1)
     velocity = speed[None, :, :, None] * along[:, None]
-    moved = (velocity[:, 1:] + velocity[:, :-1]) / 2 * DT
+    moved = (late * velocity[:, 1:] + (1 - late) * velocity[:, :-1]) * DT
     place = np.concatenate([np.zeros_like(moved[:, :1]), moved.cumsum(1)], 1) - reach * along[:, None]
     relative = [x[:, :, ::-1] - x for x in (place, velocity)]
     given = {"task": "walkers", "dt": DT, "action_low": -2.0, "action_high": 2.0, "observation_names": NAMES}
@@ -145,6 +145,18 @@ def test_a_world_of_other_logs_or_unfit_is_refused():
     unfit = dataclasses.replace(world, card=replace(world.card, verdict=verdict))
     with pytest.raises(UserError, match="unfit to guard by: it is made up"):
         ringfence.replay(None, store, world=unfit, radius=0.1)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
+def test_bodies_go_with_the_velocity_that_the_logs_have_them_go_with(late):
+    store = walkers(late=late)
+    motion = motion_of(store, Names.of(store))
+    assert motion.late == late
+    stage = stage_of(store)
+    first = stage.windows.driven == 0
+    np.testing.assert_allclose(stage.play("straight").place[~first], stage.windows.place[~first], atol=1e-4)
+    there, _, _ = stage.kinematics.moved(np.zeros((1, 2)), np.zeros((1, 2)), np.zeros(1), np.array([[1.0, 0.0]]), None)
+    assert there == pytest.approx(np.array([[late * DT**2, 0.0]]), abs=1e-6)
 
 
 def test_kinematics_move_as_they_say():

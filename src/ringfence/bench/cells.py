@@ -145,13 +145,16 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     if not spec.guarded:
         return not guard
     usual = names.guard_options(dataclasses.asdict(GuardOptions()))
+    asked = dict(spec.guard_options)
     played = {**usual, **guard}  # an option newer than the result had its default then
+    newer = usual.keys() - guard.keys() - asked.keys()  # a named guard that has since learned more was that guard
     if spec.barrier == oracle.ORACLE:
-        return bool(guard) and played == dataclasses.asdict(oracle.options(spec.guard, task, dict(spec.guard_options)))
-    options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **dict(spec.guard_options)))
-    wanted = names.guard_options(dataclasses.asdict(options))
+        wanted = dataclasses.asdict(oracle.options(spec.guard, task, asked))
+        return bool(guard) and played == wanted | {name: played[name] for name in newer}
+    options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **asked))
+    wanted = names.guard_options(dataclasses.asdict(options)) | {name: played[name] for name in newer}
     if task.guard_by_card:  # how far the guard looked was the World's affair
-        looked = {"horizon", "terminal_value"} - set(dict(spec.guard_options))
+        looked = {"horizon", "terminal_value"} - asked.keys()
         wanted |= {name: played[name] for name in looked}
     world = Settings(**worlds.usual(task, worlds.execution_of(task, spec.execution)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it

@@ -6,7 +6,8 @@
     adapt    move the margin by what happens: up after a cost, down while there is none
 
 The shield asks the paper's condition (3) of predicted rows, h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k), or a margin; its correction is
-the supremum over actions. Where no action meets it, the best one found is taken, and counted as infeasible.
+the supremum over actions. A slope may lead nowhere where a step aside would do, so a correction that falls short is
+begun again from fixed plans. Where none meets the condition, the best one found is taken, and counted as infeasible.
 """
 
 from __future__ import annotations
@@ -19,18 +20,16 @@ import jax.numpy as jnp
 import optax
 
 from ringfence.guards.barrier import BarrierSource
+from ringfence.guards.correction import TOLERANCE, Corrector
 from ringfence.guards.options import GuardOptions
 from ringfence.nets.mlp import MLP
 from ringfence.problem.constraints import lowest
-from ringfence.problem.homogeneous import team_sum
 from ringfence.types import Array, Key
 from ringfence.world import World
 from ringfence.world.dynamics import Dynamics
 
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
-TOGETHER = 32  # teams whose plans are corrected at once
-TOLERANCE = 1e-3  # of the condition, in margins: less is not counted as infeasible
 
 
 class Decision(NamedTuple):
@@ -43,16 +42,6 @@ class Decision(NamedTuple):
     first: Array  # (B, N) the same of its first row alone
     short: Array  # (B, N) bool: the condition is not met along it
     ood: Array  # (B, N) bool: the first action leads out of distribution
-
-
-class Correction(NamedTuple):
-    """Plans while they are corrected."""
-
-    plan: Array  # (B, K, N, A)
-    best: Array  # (B, K, N, A) of those so far
-    least: Array  # (B, 1 or N) shortfall of the best
-    short: Array  # (B, 1 or N) shortfall of the plan before the last correction
-    round: Array  # () int
 
 
 class Guard(eqx.Module):
@@ -183,62 +172,18 @@ class Guard(eqx.Module):
 
     def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
-        otherwise.
+        otherwise, within `max_correction` of what they were."""
+        options = self.options
 
-        Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖², within
-        `max_correction` of the plan. Where the condition cannot be met, larger actions throw robots over. Where nothing
-        is missing the plan is kept as it is. Most plans are of that kind, so those of many teams are sorted, and
-        corrected a few teams at a time as long as there is something to correct.
-        """
-        batch = plan.shape[0]
-        if batch <= TOGETHER:
-            return self._corrected(present, plan, margin)
-        padded = -batch % TOGETHER
-        order = jnp.argsort((self._shortfall(present, plan, margin) < 0).any(1), descending=True)
-        order = jnp.concatenate([order, jnp.repeat(order[-1:], padded)])
-        given = [x[order].reshape(-1, TOGETHER, *x.shape[1:]) for x in (present, plan, margin)]
+        def missing(present: Array, plans: Array, margin: Array) -> Array:
+            clear = self.clear(*self.predict(present, plans), margin)
+            return jax.vmap(lambda clear: self.missing(present, clear, margin), 1, 1)(clear)
 
-        def few(given: tuple[Array, Array, Array]) -> Array:
-            short = (self._shortfall(*given) < 0).any()
-            return jax.lax.cond(short, lambda: self._corrected(*given), lambda: given[1])
+        def within(plan: Array) -> tuple[Array, Array]:
+            return self._within(plan, options.max_correction)
 
-        done = jax.lax.map(few, tuple(given)).reshape(-1, *plan.shape[1:])
-        return plan.at[order].set(done)
-
-    def _shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
-        """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
-        rows, spread = self.predict(present, plan[:, None])
-        short = self.missing(present, self.clear(rows, spread, margin)[:, 0], margin)
-        return team_sum(short, (1,), self.world.alone)
-
-    def _corrected(self, present: Array, plan: Array, margin: Array) -> Array:
-        """`shielded`, of all teams at once."""
-        low, high = self._within(plan, self.options.max_correction)
-
-        def shortfall(plan: Array) -> Array:
-            return self._shortfall(present, plan, margin)
-
-        def correct(c: Correction) -> Correction:
-            f, back = jax.vjp(shortfall, c.plan)
-            slope = back(jnp.ones_like(f))[0]
-            better = (f > c.least)[:, None, :, None]
-            size = team_sum(slope**2, (1, 3), self.world.alone)
-            moved = c.plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
-            return Correction(
-                plan=jnp.clip(moved, low, high),
-                best=jnp.where(better, c.plan, c.best),
-                least=jnp.maximum(f, c.least),
-                short=f,
-                round=c.round + 1,
-            )
-
-        def goes_on(c: Correction) -> Array:  # until the round after the last in which something was missing
-            return (c.round < self.options.correction_steps) & (c.short < 0).any()
-
-        nothing = jnp.full_like(team_sum(plan, (1, 3), self.world.alone), -jnp.inf)
-        begun = Correction(plan, plan, nothing, nothing, jnp.asarray(0))
-        found = jax.lax.while_loop(goes_on, correct, begun)
-        return jnp.where((shortfall(found.plan) >= found.least)[:, None, :, None], found.plan, found.best)
+        correct = Corrector(missing, within, self.world.alone, options.correction_steps, options.correction_restarts)
+        return correct(present, plan, margin)
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has

@@ -14,6 +14,7 @@ Samples = Annotated[int, Meta(ge=1, le=10_000)]
 Rounds = Annotated[int, Meta(ge=0, le=10**6)]
 Fall = Annotated[float, Meta(gt=0, le=1, description="lie in (0, 1]: at 0 a barrier could never fall")]
 Late = Annotated[int, Meta(ge=0, le=100)]
+Few = Annotated[int, Meta(ge=0, le=100)]
 CostRate = Annotated[float, Meta(gt=0, lt=1, description="be a share of steps between 0 and 1")]
 Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions lie in [-1, 1]")]
 
@@ -30,6 +31,7 @@ class GuardOptions:
     trust_radius: Distance = 2.0  # how far refining may take an action from its proposal; 2: anywhere
     safety_weight: NonNegative = 10.0  # weight of danger in what is climbed, in deviations of value per margin
     correction_steps: Rounds = 0  # rounds of correction; 0: none
+    correction_restarts: Few = 0  # times that one which falls short is begun again from fixed plans
     max_correction: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
     horizon: Samples = 3  # predicted rows that are judged
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
@@ -59,7 +61,7 @@ class GuardOptions:
         return self.select or self.optimizer_steps > 0 or self.correction_steps > 0
 
 
-_SHIELD = {"correction_steps": 10}
+_SHIELD = {"correction_steps": 10, "correction_restarts": 1}
 
 # Named sets of choices; "none" follows the proposal.
 GUARDS: dict[str, dict[str, Any]] = {

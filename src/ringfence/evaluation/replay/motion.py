@@ -32,6 +32,7 @@ class Kinematics:
     low: np.ndarray  # (A,) bounds of actions
     high: np.ndarray
     max_speed: float  # m/s: the fastest of the logs
+    late: float = 0.5  # share of a step that is gone with the next velocity
     gain: float = 1.0
     drag: float = 0.0
     explained: float = float("nan")  # share of the logged changes of velocity
@@ -52,7 +53,7 @@ class Kinematics:
         after = after * np.minimum(1.0, self.max_speed / np.maximum(speed, 1e-9))
         if self.name in ("world", *LINEAR):
             heading = np.where(speed[:, 0] > SLOW, np.arctan2(after[:, 1], after[:, 0]), heading)
-        return place + (velocity + after) / 2 * self.dt, after, heading
+        return place + ((1 - self.late) * velocity + self.late * after) * self.dt, after, heading
 
     def _turned(self, velocity, heading, action) -> tuple[np.ndarray, np.ndarray]:
         speed = (velocity * _unit(heading)).sum(-1)
@@ -107,7 +108,7 @@ def kinematics_of(
     low, high = _bounds(store)
     speeds = np.zeros(1) if motion.velocity is None else np.linalg.norm(motion.velocity, axis=-1)
     fastest = float(np.quantile(speeds, 0.999)) or 1.0
-    made = Kinematics(name or KINEMATICS[0], dt, low, high, fastest, wheelbase=wheelbase, world=world)
+    made = Kinematics(name or KINEMATICS[0], dt, low, high, fastest, motion.late, wheelbase=wheelbase, world=world)
     if name in ("unicycle", "bicycle"):
         return made
     fitted = _fitted(made, store, motion) if size == 2 else made

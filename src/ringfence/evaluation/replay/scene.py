@@ -84,6 +84,7 @@ class Motion:
     velocity: np.ndarray | None  # (M, N, 2) m/s; None: by differences
     offset: np.ndarray  # (M, N, K, 2) m to others, NOBODY where nobody is seen
     seen: np.ndarray  # (M, N, K) bool
+    late: float = 1.0  # share of a step that a body goes with its next velocity; the rest with this one
 
 
 def motion_of(store: EpisodeStore, names: Names) -> Motion:
@@ -107,7 +108,44 @@ def motion_of(store: EpisodeStore, names: Names) -> Motion:
         assert place is not None, "checked before"
         offset = place[:, others(n)] - place[:, :, None]
     offset = np.where(seen[..., None], offset, NOBODY)
-    return Motion(place, _velocities(store, names, x), offset, seen)
+    velocity = _velocities(store, names, x)
+    return Motion(place, velocity, offset, seen, _late(store, names, x, place, velocity, offset, seen))
+
+
+def _late(
+    store: EpisodeStore,
+    names: Names,
+    x: np.ndarray,
+    place: np.ndarray | None,
+    velocity: np.ndarray | None,
+    offset: np.ndarray,
+    seen: np.ndarray,
+) -> float:
+    """The share of a step that bodies go with their next velocity, as most of the logged steps have it. Logs differ: a
+    velocity is what a simulator goes on with, or the difference to the place before."""
+    if velocity is None:
+        return 1.0  # it is made of differences to the place before
+    row = np.arange(store.steps) + store.episode_of_step
+    drift = names.pairs("other{}.dv{{}}", names.slots) if place is None else None
+    if place is not None:
+        moved, before, after = place[row + 1] - place[row], velocity[row], velocity[row + 1]
+    elif drift:
+        both = seen[row] & seen[row + 1]
+        moved = (offset[row + 1] - offset[row])[both]
+        before, after = (x[r][..., np.array(drift)][both] for r in (row, row + 1))
+    else:
+        return 0.5
+    dt = float(store.card.dt or 1.0)
+    change = ((after - before) * dt).ravel()
+    rest = (moved - before * dt).ravel()
+    turns = np.abs(change) > 0.01 * np.abs(velocity).max() * dt
+    if not turns.any():
+        return 0.5
+    share = rest[turns] / change[turns]
+    tried = np.linspace(0, 1, 21)
+    # the most frequent, not the mean: where others are listed by distance, a place in the list may change its owner
+    agree = [(np.abs(share - one) < 0.025).sum() for one in tried]
+    return float(tried[int(np.argmax(agree))])
 
 
 def _velocities(store: EpisodeStore, names: Names, x: np.ndarray) -> np.ndarray | None:
@@ -303,6 +341,6 @@ def _tracks(motion: Motion, rows: np.ndarray, driven: np.ndarray, dt: float) -> 
     else:
         raise UserError("The logs hold neither places nor velocities of the driven agent; name own.vx and own.vy.")
     if place is None:
-        middle = (velocity[:, 1:] + velocity[:, :-1]) / 2 * dt
-        place = np.concatenate([np.zeros_like(middle[:, :1]), middle.cumsum(1)], 1)
+        moved = (motion.late * velocity[:, 1:] + (1 - motion.late) * velocity[:, :-1]) * dt
+        place = np.concatenate([np.zeros_like(moved[:, :1]), moved.cumsum(1)], 1)
     return place, velocity
