@@ -189,7 +189,9 @@ def test_agents_that_are_alone_hear_of_nobody(small_store, present):
     assert world.alone and world.map.view == "decentralized"
     seen = jnp.asarray(small_store.observations[:16])
     bound = constraints.bind(constraints.Separation(), world.spec.feature_names, 3)
-    guard = make(world, bound, correction_steps=4, optimizer_steps=3, num_restarts=3, select=True)
+    guard = make(
+        world, bound, correction_steps=4, correction_restarts=1, optimizer_steps=3, num_restarts=3, select=True
+    )
     plan = jax.random.uniform(jax.random.key(1), (16, 2, 3, 3, 2), minval=-1, maxval=1)
     last, margin, key = jnp.zeros((16, 3, 3, 2)), jnp.ones((16, 3, 1)), jax.random.key(0)
     here = world.map(seen, None)
@@ -270,6 +272,9 @@ def test_any_callable_is_guarded(small_world, small_store):
     seen, state = small_store.observations[0], small_store.state[0]
     pilot = ringfence.guard(lambda observations, state: np.zeros((3, 2)), small_world)
     assert pilot.act(seen, state).shape == (3, 2) and {"infeasible", "ood"} <= set(pilot.info)
+    assert pilot.info["agent_clearance"].shape == pilot.info["agent_ood"].shape == (3,)
+    assert pilot.info["clearance"] == pilot.info["agent_clearance"].min()
+    assert pilot.info["infeasible"] == pilot.info["agent_infeasible"].any()
     pilot.reset()
     pilot.act(seen, state, cost=1.0)
     for wrong, said in (

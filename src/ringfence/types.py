@@ -110,7 +110,7 @@ class PolicyStep(NamedTuple):
     """A joint action and what led to it."""
 
     action: Array  # (B, N, A)
-    info: dict[str, Array]  # e.g. `clearance`, `infeasible` (B,), `plans` (B, P, H, N, D), `chosen` (B,)
+    info: dict[str, Array]  # e.g. `clearance`, `infeasible` (B,), `agent_infeasible` (B, N), `plans` (B, P, H, N, D)
 
 
 @runtime_checkable

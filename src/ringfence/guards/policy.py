@@ -128,6 +128,9 @@ class Guarded(HadStart, eqx.Module):
             "next_clearance": found.first.min(-1),
             "infeasible": found.short.any(-1),
             "ood": found.ood.any(-1),
+            "agent_clearance": found.safety,
+            "agent_infeasible": found.short,
+            "agent_ood": found.ood,
         }
         spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)

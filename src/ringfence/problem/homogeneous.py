@@ -70,6 +70,7 @@ def merge_agents(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     for name in ("clearance", "next_clearance"):
         if name in step.info:
             info[name] = step.info[name].reshape(shape).min(1)
+    info |= {name: value.reshape(shape) for name, value in step.info.items() if name.startswith("agent_")}
     return PolicyStep(step.action.reshape(*shape, -1), info)
 
 
