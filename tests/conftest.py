@@ -52,6 +52,22 @@ validate.ENTERED = 20
 gc.set_threshold(50_000, 20, 20)
 
 
+# Files that take longest, begun first: one of them begun last would leave the other workers idle.
+LONGEST = (
+    "guard crossing export proving ope replay causes algorithms constraints spread_alike world bench cli limits stress "
+    "notebooks precision bounds flow parallel behaviour"
+).split()
+
+
+def pytest_configure(config):
+    config.option.loadscopereorder = False  # pytest-xdist would begin with the files of most tests
+
+
+def pytest_collection_modifyitems(items):
+    place = {f"test_{name}": k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
 def pytest_unconfigure(config):
     """Leave nothing in the folder for temporary files; workers share the cache of the process that began them."""
     if hasattr(config, "workerinput"):

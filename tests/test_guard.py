@@ -5,6 +5,7 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 import pytest
 
@@ -24,7 +25,7 @@ from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
 from ringfence.types import PolicyStep
-from ringfence.world.card import Avoidable, BarrierScores, Card
+from ringfence.world.card import Avoidable, BarrierScores, Card, Verdict
 from tests.quick import QUICK_WORLD
 
 
@@ -232,6 +233,19 @@ def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
     np.testing.assert_allclose(carry["margin"][:, 0], expected, rtol=1e-5)
 
 
+@pytest.mark.parametrize("guard", ["shield", "adapt"])
+def test_one_program_acts_in_every_step(small_world, small_store, guard):
+    """What is carried has the same types after a step as before the first, and when a cost was observed."""
+    policy = build(Constant(small_world.spec), small_world, constraints.Separation(), guard, "analytic")
+    carry = policy.initial_state(2)
+    after, _ = jax.eval_shape(policy.act, carry, small_store.observations[:2], small_store.state[:2], jax.random.key(0))
+    types = [
+        jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), later)
+        for later in (carry, after, jax.eval_shape(policy.observe_cost, after, jnp.zeros(2)))
+    ]
+    assert types[0] == types[1] == types[2]
+
+
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
     barrier = BarrierSource(small_world, "learned", None, False)
     rows = jnp.stack([present, present], 1)[:, None]
@@ -293,11 +307,11 @@ def test_any_callable_is_guarded(small_world, small_store):
 
 
 @pytest.mark.verdicts
-def test_a_world_of_other_data_is_refused(small_store, tmp_path):
+def test_a_world_of_other_data_is_refused(small_store, small_world, tmp_path):
     tiny = dict(changes={"num_updates": 2, "width": 8}, quiet=True, out=tmp_path)
     run = loop.train("bc", small_store, **tiny)[0]
-    card = small_store.card.updated(task="other")
-    other = worlds.fit(dataclasses.replace(small_store, card=card), **QUICK_WORLD)
+    data = msgspec.structs.replace(small_world.card.data, task="other")
+    other = dataclasses.replace(small_world, card=msgspec.structs.replace(small_world.card, data=data))
     with pytest.raises(UserError, match="The World is of 'other', the run .* of other data"):
         load(run, guard="shield", world=other)
     with pytest.raises(UserError, match="needs the World of its data"):
@@ -307,7 +321,8 @@ def test_a_world_of_other_data_is_refused(small_store, tmp_path):
         UserError, match="fitted with execution=decentralized, the guard is to have execution=centralized"
     ):
         load(run, guard="shield", world=alone)
-    same = worlds.fit(small_store, causes=False, **QUICK_WORLD)
+    unfit = msgspec.structs.replace(small_world.card, verdict=Verdict("unfit", ("it knows little",)))
+    same = dataclasses.replace(small_world, card=unfit)
     with pytest.raises(UserError, match="unfit to guard by"):
         evaluate(run, episodes=2, guard="shield", world=same)
     result = evaluate(run, episodes=2, guard="shield", world=same, anyway=True)

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 import ringfence
 from ringfence.cli import app
 from ringfence.errors import UserError
+from ringfence.evaluation.replay import judge
 from ringfence.evaluation.replay.judge import Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
@@ -53,6 +54,20 @@ def stage_of(store: EpisodeStore) -> Stage:
     return Stage(cut, kinematics_of(None, store, motion, None, DT, 2.7), RADIUS, 0)
 
 
+@pytest.fixture(scope="module")
+def close():
+    """Logs of walkers of whom the second one passes closely, and their World."""
+    store = walkers(reach=0.9)
+    assert store.costs.any()
+    return store, ringfence.fit(store, **QUICK_WORLD)
+
+
+@pytest.fixture(autouse=True)
+def shortsighted(monkeypatch):
+    """The formula's guard looks five rows ahead, not twenty, which take long to compile."""
+    monkeypatch.setattr(judge, "LONG", 5 * DT)
+
+
 def test_who_drives_blindly_touches_and_a_guard_prevents_or_causes():
     stage = stage_of(walkers())
     assert stage.kinematics.name == "double_integrator"
@@ -82,10 +97,8 @@ def test_driven_agents_observe_what_they_would():
     assert state is None
 
 
-def test_a_world_guards_bad_drivers_in_the_command_and_on_a_page(tmp_path, capsys):
-    store = walkers(reach=0.9)
-    assert store.costs.any()  # of the second one, who passes closely
-    world = ringfence.fit(store, **QUICK_WORLD)
+def test_a_world_guards_bad_drivers_in_the_command_and_on_a_page(close, tmp_path, capsys):
+    store, world = close
     store.save(tmp_path / "walkers.h5")
     save(world, tmp_path / "world.safetensors")
     held_out = ringfence.replay(None, store, world=world, radius=0.1, drivers=())
@@ -132,9 +145,8 @@ def test_what_cannot_be_replayed_is_refused_in_a_sentence():
 
 
 @pytest.mark.verdicts
-def test_a_world_of_other_logs_or_unfit_is_refused():
-    store = walkers(reach=0.9)
-    world = ringfence.fit(store, **QUICK_WORLD)
+def test_a_world_of_other_logs_or_unfit_is_refused(close):
+    store, world = close
     check_view(world, store)
     swapped = [NAMES[1], NAMES[0], *NAMES[2:]]
     with pytest.raises(UserError, match="reads 'own.vx' where these logs hold 'own.vy'"):
@@ -182,10 +194,9 @@ def test_kinematics_move_as_they_say():
     assert after == pytest.approx(np.array([[0.0, 0.5]]), rel=1e-3)
 
 
-def test_a_run_is_replayed_under_every_filter(tmp_path):
-    store = walkers(reach=0.9)
+def test_a_run_is_replayed_under_every_filter(close, tmp_path):
+    store, world = close
     (run,) = ringfence.train("bc", store, seeds=(0,), out=tmp_path, changes={"num_updates": 5})
-    world = ringfence.fit(store, **QUICK_WORLD)
     given = dict(world=world, radius=0.1, windows=4, every_episode=True, drivers=("seek",))
     result = ringfence.replay(run, store, guard="shield", **given)
     names = [(row.policy, row.filter) for row in result.rows]

@@ -55,10 +55,11 @@ class Guarded(HadStart, eqx.Module):
         shape = (batch, spec.n_agents, constraints) if self.guard.world.alone else (batch, constraints)
         carry = {
             "inner": self.proposal.initial_state(batch),
-            "margin": jnp.full(shape, options.margin),
+            # typed: a carry of other types than the one that follows is another program
+            "margin": jnp.full(shape, options.margin, jnp.float32),
             "last": jnp.zeros((batch, options.horizon, spec.n_agents, spec.action_dim)),
             "before": jnp.zeros((batch, spec.n_agents, spec.feature_dim)),
-            "cost": jnp.full(batch, jnp.nan),
+            "cost": jnp.full(batch, jnp.nan, jnp.float32),
             "age": jnp.zeros((), jnp.int32),
         }
         if options.delay + options.max_age:
@@ -68,7 +69,7 @@ class Guarded(HadStart, eqx.Module):
             carry["sent"] = jnp.broadcast_to(nothing, shape)  # the oldest first
             carry["observed_age"] = jnp.zeros((batch, spec.n_agents), jnp.int32)
         if constraints > 1:
-            carry["costs"] = jnp.full((batch, constraints), jnp.nan)
+            carry["costs"] = jnp.full((batch, constraints), jnp.nan, jnp.float32)
         return carry
 
     def observe_cost(self, carry: PyTree, cost: Cost) -> PyTree:
