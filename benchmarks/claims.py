@@ -515,6 +515,15 @@ CLAIMS = (
             ),
         ),
     ),
+    Claim(
+        "docs/method.md",
+        "Guided by danger `flow` costs nothing from safe starts and earns no less",
+        POOL,
+        of_a_pool(
+            "flow, 8 steps, guided by danger",
+            lambda row, data: row["cost_safe_start"] == 0.0 and row["paired"]["return_norm_interval"][0] >= 0.0,
+        ),
+    ),
 )
 
 

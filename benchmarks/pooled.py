@@ -10,6 +10,7 @@ each row says its own. At the end the table in docs/method.md is written anew; `
 import argparse
 import json
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import jax
@@ -24,6 +25,7 @@ from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.statistics import mean_of_runs
+from ringfence.loading import run_worlds
 from ringfence.loading.resolve import load_job
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
@@ -40,6 +42,7 @@ ROWS = {
     "flow": ("flow", "default", FLOW, {}),
     "flow, the drivers' means": ("flow", "default", FLOW, {"sampling_steps": 1, "temperature": 0.0}),
     "flow, 4 steps": ("flow", "default", FLOW, {"sampling_steps": 4}),
+    "flow, guided by danger": ("flow", "default", FLOW, {"barrier_guidance": 1.0}),
     "flow, 8 steps": ("flow", "default", FLOW, {"sampling_steps": 8}),
     "flow, 8 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 8, "barrier_guidance": 1.0}),
     "flow, one driver": ("flow", "default", FLOW | {"drivers": 1}, {}),
@@ -52,27 +55,52 @@ ROWS = {
     "icbf": ("icbf", "split", {}, {}),
 }
 # Rows that are compared with another of the same runs, on the same resets.
-PAIRED = {"flow, 8 steps, guided by danger": "flow, 8 steps"}
+PAIRED = {"flow, guided by danger": "flow", "flow, 8 steps, guided by danger": "flow, 8 steps"}
 
 
-def purity(run: Run, store: EpisodeStore, episodes: int = 2000) -> float | None:
-    """Share of whole episodes that the flow gives a driver who is mostly one learner; the card says whose they are."""
-    if run.config["algorithm"] != "flow" or store.card.extra.get("driver_of_episode") != TURNS:
+@dataclass(frozen=True)
+class Drivers:
+    """What a run found in the first episodes of a log whose card says whose they are."""
+
+    store: EpisodeStore  # those episodes
+    clones: np.ndarray  # (T, C, N·A) what each driver's clone does at every step
+    found: np.ndarray  # (E,) driver of every episode
+    counts: np.ndarray  # (C, L) episodes of each driver and learner
+
+    @property
+    def purity(self) -> float:
+        """Share of episodes whose driver is mostly their learner."""
+        return round(float(self.counts.max(1).sum() / self.store.episodes), 4)
+
+
+def drivers_of(run: Run, store: EpisodeStore, episodes: int = 2000) -> Drivers | None:
+    """None of a run that looks for no drivers, or of a log that does not say whose its episodes are."""
+    if not run.config["config"].get("drivers") or store.card.extra.get("driver_of_episode") != TURNS:
         return None
     job = load_job(run)
     a = job.algorithm
-    blank = lambda: loop.learned(a.init(jax.random.key(0), job.spec, job.config, None, job.feature_map, job.hazard))  # noqa: E731
+    read = {"world": run_worlds.of_run(run)} if job.reads_world else {}
+    about = (job.spec, job.config, None, job.feature_map, job.hazard)
+    blank = lambda: loop.learned(a.init(jax.random.key(0), *about, **read))  # noqa: E731
     _, state = run.load_checkpoint(jax.eval_shape(blank))
     some = store.select(np.arange(store.episodes) < episodes)
     row = np.arange(some.steps) + some.episode_of_step
     x = job.feature_map(some.observations[row], some.state[row])
-    clones = state["ema"]["clones"](state["frozen"]["normaliser"].state(x).reshape(some.steps, -1))
     actions = some.actions.reshape(some.steps, 1, -1)
-    errors = ((np.asarray(clones).reshape(some.steps, -1, actions.shape[-1]) - actions) ** 2).sum(-1)
+    clones = state["ema"]["clones"](state["frozen"]["normaliser"].state(x).reshape(some.steps, -1))
+    clones = np.asarray(clones).reshape(some.steps, -1, actions.shape[-1])
+    errors = ((clones - actions) ** 2).sum(-1)
     found = np.add.reduceat(errors, np.concatenate([[0], some.episode_ends[:-1]])).argmin(1)
-    learner = np.arange(some.episodes) % len(some.card.extra["drivers"])
-    table = np.array([np.bincount(learner[found == c], minlength=5) for c in range(errors.shape[-1])])
-    return round(float(table.max(1).sum() / some.episodes), 4)
+    learners = len(some.card.extra["drivers"])
+    learner = np.arange(some.episodes) % learners
+    counts = np.array([np.bincount(learner[found == c], minlength=learners) for c in range(errors.shape[-1])])
+    return Drivers(some, clones, found, counts)
+
+
+def purity(run: Run, store: EpisodeStore) -> float | None:
+    """Of the drivers that a run found, where that can be said."""
+    drivers = drivers_of(run, store)
+    return None if drivers is None else drivers.purity
 
 
 def milliseconds(run: Run, store: EpisodeStore, options: dict) -> float:

@@ -56,6 +56,27 @@ def test_a_unicycle_moves_along_its_heading():
     np.testing.assert_allclose(still.velocity, 0.0)  # it does not back up
 
 
+def test_drivers_of_the_pool_keep_to_their_sides():
+    """Somebody comes head on: two of the four go to one side each, the others do as their certificates say; with nobody
+    near all go straight. All four drive equally often, and the card says who."""
+    env = Crossing(n_agents=2)
+    state = env.reset(jax.random.key(0), 1)
+    way = jnp.array([[[1.0, 0.0], [-1.0, 0.0]]])
+    for gap, turned in ((0.6, True), (2.9, False)):
+        place = jnp.array([[[0.0, 0.0], [gap, 0.0]]])
+        here = state._replace(position=place, velocity=jnp.zeros((1, 2, 2)), goal=place + 9.0 * way)
+        aside = {name: recipe._aside(env, here, way, jnp.full((1, 2), d.side)) for name, d in recipe.HABITS.items()}
+        across = {name: float(push[0, 0, 1]) for name, push in aside.items()}
+        assert across["careful"] == across["hasty"] == 0.0
+        assert (across["keeps right"] < -0.2 and across["keeps left"] > 0.2) == turned
+        assert float(aside["keeps right"][0, 1, 1]) == -across["keeps right"], "each to its own right"
+    numbers = np.asarray(recipe._drivers("pooled", jax.random.key(0), 8, 8))
+    assert [int((numbers[..., -1] == side).sum()) for side in (0.5, -0.5, 0.0)] == [16, 16, 32]
+    store, _ = make(registry.get("crossing-pooled"), 4000, must_keep=False)
+    assert store.card.extra["drivers"] == ["careful", "hasty", "keeps right", "keeps left"]
+    assert store.episodes == 40 and store.returns.mean() > 2.0
+
+
 @pytest.mark.parametrize("room", [{}, {"n_agents": 64}, {"n_agents": 3, "obstacles": 4, "walls": True}])
 def test_everybody_starts_at_rest_and_free_and_the_state_tells_all(room):
     env = Crossing(**room)

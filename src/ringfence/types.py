@@ -105,6 +105,11 @@ class Batch(NamedTuple):
     rewards: Array  # (B, H-1, N) of the step between rows h and h+1 (0 where padded)
     terminated: Array  # (B, H-1) bool: that step ended the task itself
 
+    def rows_from(self, first: int) -> Batch:
+        """The same windows without the rows before `first`."""
+        score = self.score
+        return Batch(*(x if x is score else x[:, first:] for x in self))
+
 
 class PolicyStep(NamedTuple):
     """A joint action and what led to it."""

@@ -60,9 +60,8 @@ class Config:
     net: Literal["attention", "residual", "unet"] = "attention"  # of agents, of the whole team, MADIFF's temporal U-Net
     width: Width = 128  # channels
     depth: Depth = 3  # blocks (attention), hidden layers (residual) or resolutions (unet)
-    drivers: Natural = (
-        0  # C that the log's windows are shared among; a plan is of one of them. 0: drivers are no matter
-    )
+    distinguish_agents: bool = False  # attention learns a vector of each agent; of limbs of one body it does anyway
+    drivers: Natural = 0  # that a log of many is searched for; a plan is of one of them. 0: nobody is searched for
     diffusion_steps: Width = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
     snr_floor: NonNegative = 0.5  # x0-prediction: least weight of a noise level
@@ -100,7 +99,13 @@ class Config:
     grad_clip: NonNegative = 1.0  # global norm, per network; 0: no bound
     ema: Share = 0.995  # of all parameters; the policy uses the averages
 
+    @property
+    def window_history(self) -> int:
+        """Rows of the past that training draws: those of a plan, and before them those that tell who drives."""
+        return self.history + (DRIVER_HISTORY if self.drivers else 0)
 
+
+DRIVER_HISTORY = 8  # rows before a plan's own that tell whose it is; seven steps alone tell too little
 INVERSE_STEPS = 3  # steps of every window that inverse dynamics learns from
 CLONES = (384, 3)  # units and hidden layers of the joint clones that share a log of many drivers
 
@@ -189,7 +194,7 @@ def init(
                 config.width,
                 config.depth,
                 carried,
-                agents=n if feature_map.joint else 0,
+                agents=n if feature_map.joint or config.distinguish_agents else 0,
                 team=n,
                 drivers=config.drivers,
             ),
@@ -247,6 +252,8 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError(f"width={config.width} must be a multiple of {4 * HEADS}, for {HEADS} heads of equal width.")
     if config.net == "unet":
         unet.check_sizes(config.history + config.horizon, config.width, config.depth)
+    if config.distinguish_agents and config.net == "unet":
+        raise UserError("distinguish_agents is of the net attention; leave it out with net='unet'.")
     if config.drivers:
         drivers.check(config.drivers, config.batch)
         if config.net == "unet" or config.observe != "all":
@@ -330,11 +337,10 @@ def driving(
 ) -> tuple[Array, Array, Metrics]:
     """(L^E + L^Q, driver (B,) of every window, drawn by its shares, metrics); algos/drivers.py."""
     k_driver, k_keep = jax.random.split(key)
-    now = config.history
-    windows, steps = batch.actions[:, now:].shape[:2]
-    seen = norm.state(batch.features[:, now:-1]).reshape(windows * steps, -1)
-    actions = batch.actions[:, now:].reshape(windows * steps, -1)
-    there = batch.valid[:, now + 1 :]
+    windows, steps = batch.actions.shape[:2]
+    seen = norm.state(batch.features[:, :-1]).reshape(windows * steps, -1)
+    actions = batch.actions.reshape(windows * steps, -1)
+    there = drivers.steps_there(batch)
     shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
     driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
     keep = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,))
@@ -486,6 +492,7 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
         metrics = {}
         if config.drivers:
             found, driver, metrics = driving(params, batch, norm, step, jax.random.fold_in(key, 1), config)
+            batch = batch.rows_from(DRIVER_HISTORY)
         denoise, (clean, noised, mask) = denoising(
             params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried, driver
         )

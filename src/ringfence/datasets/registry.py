@@ -188,6 +188,7 @@ TASKS = {
         *(_robot(*facts) for facts in _ROBOT_TIERS),
         *(_robot(*facts, quantile=True) for facts in _ROBOT_TIERS),
         *(_crossing(tier, body) for body in _CERTIFIED for tier in crossing.TIERS),
+        _crossing("pooled"),
         _spread_alike("expert"),
         _spread_alike("medium"),
         *(_proving(name, system) for name, system in TEST.items()),

@@ -168,6 +168,11 @@ class _Lessons:
         return self.last[1:]
 
 
+def window_history(config: Any) -> int:
+    """Rows of the past in the windows that training draws: an algorithm's own, or more where its config says so."""
+    return getattr(config, "window_history", config.history)
+
+
 def windows_of(job: Job, store: EpisodeStore, world: World | None = None) -> WindowData:
     """What a job draws its batches from."""
     if job.algorithm.make_windows is None:
@@ -202,7 +207,7 @@ def make_program(job: Job) -> Program:
     def one(state: PyTree, root: Key, arrays: Arrays, scores: Array) -> tuple[PyTree, Metrics]:
         arrays = arrays | {"scores": scores}
         draw_key, update_key = jax.random.split(jax.random.fold_in(root, state["step"]))
-        batch = draw(arrays, draw_key, config.batch, config.horizon, config.history)
+        batch = draw(arrays, draw_key, config.batch, config.horizon, window_history(config))
         return update(state, batch, update_key)
 
     def advance(state: PyTree, roots: Key, arrays: Arrays, scores: Array, count: int) -> tuple[PyTree, Metrics]:
@@ -229,7 +234,7 @@ def make_program(job: Job) -> Program:
     def diagnose(state: PyTree, roots: Key, arrays: Arrays, scores: Array) -> Metrics:
         def of(state: PyTree, root: Key, scores: Array) -> Metrics:
             draw_key, key = jax.random.split(jax.random.fold_in(root, state["step"]))
-            batch = draw(arrays | {"scores": scores}, draw_key, config.batch, config.horizon, config.history)
+            batch = draw(arrays | {"scores": scores}, draw_key, config.batch, config.horizon, window_history(config))
             return look(state, batch, key)
 
         return jax.vmap(of)(state, roots, scores)

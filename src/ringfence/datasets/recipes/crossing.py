@@ -1,7 +1,7 @@
 """Crossing's data sets: the safety barrier certificates of Wang, Ames and Egerstedt (2017, "Safety barrier certificates
 for collisions-free multirobot systems", IEEE T-RO 33(3)), decentralised as in their section V, around a controller that
 heads for its goal: with room to spare and slowly (`careful`), or at full speed, with none, by somebody who trusts the
-brakes too much and steers with an unsteady hand (`hasty`)."""
+brakes too much and steers with an unsteady hand (`hasty`); or by four with habits of their own (`pooled`)."""
 
 from __future__ import annotations
 
@@ -36,6 +36,7 @@ class Driver:
     room: float  # m between rims that it keeps
     haste: float  # γ of the certificate: how fast it may be used up
     unsteady: float  # deviation of its hand
+    side: float = 0.0  # of full push to the right of its way while somebody ahead is near; below 0 to the left
 
 
 DRIVERS = {
@@ -44,6 +45,14 @@ DRIVERS = {
 }
 STEADY = Driver(1.0, 0.9, 0.1, 2.0, 0.0)
 TIERS = ("careful", "hasty", "mixed", "random")
+# Those of the tier `pooled`: no state tells who it is, and the mean of the last two does neither.
+HABITS = DRIVERS | {
+    "keeps right": Driver(0.8, 1.0, 0.05, 1.0, 0.05, side=0.5),
+    "keeps left": Driver(0.8, 1.0, 0.05, 1.0, 0.05, side=-0.5),
+}
+TURNS = "its number, and the agent's, modulo 4"
+SIDELESS = 5  # fields of a driver without `side`
+NEAR = 2.0  # m: who is nearer and ahead is kept to one side of
 
 
 def about(task: Task) -> Card:
@@ -66,7 +75,7 @@ class Driven(eqx.Module):
         if state is None:
             raise UserError("The certificates read the global state; pass it.")
         now = self.env.from_global_state(state)
-        driver = jnp.broadcast_to(jnp.array(astuple(self.driver)), (*observations.shape[:2], 5))
+        driver = jnp.broadcast_to(jnp.array(astuple(self.driver)[:SIDELESS]), (*observations.shape[:2], SIDELESS))
         return carry, PolicyStep(drive(self.env, now, driver, key), {})
 
 
@@ -102,7 +111,8 @@ def collect(task: Task, transitions: int, seed: int, card: Card) -> EpisodeStore
             "transitions": transitions,
             "collected": _how(task.tier),
             "observation_names": list(env.observation_names),
-        },
+        }
+        | ({"drivers": list(HABITS), "driver_of_episode": TURNS} if task.tier == "pooled" else {}),
     )
 
 
@@ -112,6 +122,8 @@ def _how(tier: str) -> str:
         return "pushes that change ten times an episode"
     if tier == "mixed":
         return "a driver for each agent and episode, between careful and hasty"
+    if tier == "pooled":
+        return f"safety barrier certificates around drivers of four habits ({', '.join(HABITS)}), in turn"
     return f"safety barrier certificates, {DRIVERS.get(tier)}"
 
 
@@ -139,28 +151,43 @@ def _played(env: Crossing, tier: str, key: Key, batch: int) -> dict[str, Array]:
 
 
 def _drivers(tier: str, key: Key, batch: int, agents: int) -> Array:
-    """(B, N, 5) a driver for each agent and episode."""
+    """(B, N, 5) a driver for each agent and episode, (B, N, 6) of those who keep to a side."""
+    if tier == "pooled":
+        turn = (jnp.arange(batch)[:, None] + jnp.arange(agents)) % len(HABITS)  # batches hold all of them equally
+        return jnp.array([astuple(d) for d in HABITS.values()])[turn]
     if tier != "mixed":
-        return jnp.broadcast_to(jnp.array(astuple(DRIVERS[tier])), (batch, agents, 5))
-    careful = jnp.array(astuple(DRIVERS["careful"]))
-    hasty = jnp.array(astuple(DRIVERS["hasty"]))
+        return jnp.broadcast_to(jnp.array(astuple(DRIVERS[tier])[:SIDELESS]), (batch, agents, SIDELESS))
+    careful = jnp.array(astuple(DRIVERS["careful"])[:SIDELESS])
+    hasty = jnp.array(astuple(DRIVERS["hasty"])[:SIDELESS])
     share = jax.random.uniform(key, (batch, agents, 1))
     return careful + share * (hasty - careful)
 
 
 def drive(env: Crossing, state: CrossingState, driver: Array, key: Key) -> Array:
-    """Actions (B, N, 2) of drivers (B, N, 5): towards the goal, as near to it as the certificates allow."""
-    speed, brake, room, haste, unsteady = jnp.moveaxis(driver, -1, 0)
+    """Actions (B, N, 2) of drivers (B, N, 5 or 6): towards the goal, as near to it as the certificates allow."""
+    speed, brake, room, haste, unsteady = jnp.moveaxis(driver[..., :SIDELESS], -1, 0)
     key_push, key_hand = jax.random.split(key)
     ahead = state.goal - state.position
     far = length(ahead)
     wanted = ahead / far[..., None] * jnp.minimum(speed, jnp.sqrt(1.6 * far))[..., None]
     push = _bounded(0.5 * (wanted - state.velocity) / (DT * PUSH))
     push = push + STUBBORN * jax.random.normal(key_push, push.shape)
+    if driver.shape[-1] > SIDELESS:
+        push = _bounded(push + _aside(env, state, ahead / far[..., None], driver[..., SIDELESS]))
     push = certified(env, state, push, brake[..., None], room[..., None], haste[..., None])
     if env.body == "unicycle":
         push = steered(state, push)
     return jnp.clip(push + unsteady[..., None] * jax.random.normal(key_hand, push.shape), -1.0, 1.0)
+
+
+def _aside(env: Crossing, state: CrossingState, way: Array, side: Array) -> Array:
+    """(B, N, 2) the push to one `side` (B, N) of one's `way` (B, N, 2), stronger the nearer somebody ahead is."""
+    offset, _ = env.nearest(state)
+    far = length(offset)
+    ahead = (offset * way[..., None, :]).sum(-1) > 0.5 * far  # within 60 degrees of the way
+    near = jnp.where(ahead, jnp.maximum(1.0 - far / NEAR, 0.0), 0.0).max(-1)
+    right = jnp.stack([way[..., 1], -way[..., 0]], -1)
+    return (side * near)[..., None] * right
 
 
 def steered(state: CrossingState, push: Array) -> Array:
