@@ -140,6 +140,15 @@ class ObservesCost(Protocol):
 
 
 @runtime_checkable
+class ObservesDelay(Policy, Protocol):
+    """A policy that knows how old its observations (B, N) are, and what was sent of its actions (B, N, A)."""
+
+    def observe_age(self, carry: PyTree, age: Array) -> PyTree: ...
+
+    def observe_sent(self, carry: PyTree, action: Array) -> PyTree: ...
+
+
+@runtime_checkable
 class Proposes(Policy, Protocol):
     """A policy that knows several steps ahead: (carry, actions (B, P, K, N, A) in [−1, 1], info)."""
 

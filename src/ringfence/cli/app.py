@@ -340,9 +340,9 @@ def stress(
     for run in found:
         with refusals.of(run):
             result = run_stress(run, faults, **given)
-            told = " (told)" if compensate else ""
+            mark = " (told)" if compensate else ""
             first, guard, *rest = _played(run, result)
-            table.add_row(first, shown, f"{guard}{told}", *rest)
+            table.add_row(first, shown, f"{guard}{mark}", *rest)
     _say(table, refusals, len(found))
 
 

@@ -23,7 +23,7 @@ from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import told
+from ringfence.evaluation.stress import compensation
 from ringfence.faults import Faults, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards import Guard
@@ -63,7 +63,7 @@ def certify(
     _check(confidence, quantile, calibration, episodes)
     options = {**options, "guard": guard}
     if compensate:
-        options |= told(faults, options)
+        options |= compensation(faults, options)
     keep_programs()
     resolved = _resolved(run, options)
     rounds: list[dict[str, float]] = []

@@ -43,7 +43,7 @@ def stress(
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     if compensate:
-        options |= told(faults, options)
+        options |= compensation(faults, options)
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
     resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
@@ -60,7 +60,7 @@ def stress(
     return result
 
 
-def told(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
+def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
     """What a guard is told of faults, as its options."""
     guarded = options.get("guard", "none") != "none"
     if not guarded:

@@ -8,7 +8,7 @@ not. A policy that wants to know is told: `observe_age(carry, age)` how many ste
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,19 +18,10 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.faults.faults import Faults
 from ringfence.proposals.base import with_cost
-from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
+from ringfence.types import Array, Key, ObservesDelay, Policy, PolicyStep, PyTree
 
 EXACT = ("seen", "draw")  # entries that are no measurements, by the ends of their names
 OWN_KEY = 39  # folded into the policy's key, whose own draws stay what they are without faults
-
-
-@runtime_checkable
-class KnowsItsLink(Policy, Protocol):
-    """A policy that is told how old its observations are, and what was sent of its actions."""
-
-    def observe_age(self, carry: PyTree, age: Array) -> PyTree: ...
-
-    def observe_sent(self, carry: PyTree, action: Array) -> PyTree: ...
 
 
 class Faulty(eqx.Module):
@@ -64,12 +55,12 @@ class Faulty(eqx.Module):
         if state is not None:
             state = np.asarray(carry["state"]) if outside else carry["state"]
         inner = carry["inner"]
-        if isinstance(self.policy, KnowsItsLink):
+        if isinstance(self.policy, ObservesDelay):
             age = carry["age"] if state is None else jnp.maximum(carry["age"], carry["state_age"][:, None])
             inner = self.policy.observe_age(inner, age)
         inner, step = self.policy.act(inner, seen, state, key)
         sent = jnp.where(self._decides(carry["step"]), jnp.asarray(step.action), carry["sent"])
-        if isinstance(self.policy, KnowsItsLink):
+        if isinstance(self.policy, ObservesDelay):
             inner = self.policy.observe_sent(inner, sent)
         queue = jnp.concatenate([carry["queue"], sent[:, None]], 1)
         done = jnp.clip(self.faults.gain * queue[:, 0], self.low, self.high)

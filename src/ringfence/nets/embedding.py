@@ -40,7 +40,7 @@ class Condition(eqx.Module):
         # Scores live in about [-4, 4]; the sine features resolve them, the raw value lets them be extrapolated.
         features = jnp.concatenate([y[:, None], sinusoidal(y * 100.0, 15 + 1)[:, :15]], -1)
         target = jnp.where(keep[:, None], self.target(features), self.null)
-        told = self.step(sinusoidal(k, 64)) + target
+        embedded = self.step(sinusoidal(k, 64)) + target
         if self.drivers is not None:
-            told = told + self.drivers[driver]
-        return jax.nn.silu(told)
+            embedded = embedded + self.drivers[driver]
+        return jax.nn.silu(embedded)

@@ -40,10 +40,10 @@ class MLP(eqx.Module):
 
     def __call__(self, x: Array) -> Array:
         """(..., N, F_out)"""
-        out = self._told(x)
+        out = self._applied(x)
         return out if self.spec is None else self.spec.own(out)
 
-    def _told(self, x: Array) -> Array:
+    def _applied(self, x: Array) -> Array:
         shape = x.shape
         groups = self.weights[0].shape[0]
         if groups == 1:

@@ -38,8 +38,8 @@ class Bounds(NamedTuple):
             ) from None
         if not sound:
             raise StoreError(
-                f"The card has action_low={_told(found.low)} and action_high={_told(found.high)}; the first must be "
-                "the smaller one" + (" in every entry." if least.ndim or greatest.ndim else ".")
+                f"The card has action_low={_written(found.low)} and action_high={_written(found.high)}; "
+                "the first must be the smaller one" + (" in every entry." if least.ndim or greatest.ndim else ".")
             )
         return found
 
@@ -75,7 +75,7 @@ class Bounds(NamedTuple):
         return max(np.ndim(self.low), np.ndim(self.high)) > 1
 
     def __str__(self) -> str:
-        return f"{_told(self.low)} to {_told(self.high)}"
+        return f"{_written(self.low)} to {_written(self.high)}"
 
 
 def stored(bound: Bound) -> float | list:
@@ -105,9 +105,9 @@ def _shortest(name: str, given: Any) -> Bound:
     return as_tuples(numbers.tolist())
 
 
-def _told(bound: Bound) -> str:
+def _written(bound: Bound) -> str:
     """A bound in few letters."""
     if not isinstance(bound, tuple):
         return f"{bound:g}"
-    text = "[" + ", ".join(_told(one) for one in bound) + "]"
+    text = "[" + ", ".join(_written(one) for one in bound) + "]"
     return text if len(text) <= SHOWN else text[: SHOWN - 1] + "…"

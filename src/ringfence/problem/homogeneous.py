@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.problem.features import FeatureMap, X
-from ringfence.types import Array, Key, ObservesCost, PolicyStep, PyTree
+from ringfence.types import Array, Key, ObservesCost, ObservesDelay, PolicyStep, PyTree
 from ringfence.utils.renamed import HadStart
 
 
@@ -47,11 +47,11 @@ class PerAgent(HadStart, eqx.Module):
 
     def observe_age(self, carry: PyTree, age: Array) -> PyTree:
         """Ages (B, N) of observations, to each agent its own."""
-        return self.one.observe_age(carry, age.reshape(-1, 1)) if hasattr(self.one, "observe_age") else carry
+        return self.one.observe_age(carry, age.reshape(-1, 1)) if isinstance(self.one, ObservesDelay) else carry
 
     def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
         """What was sent (B, N, A), to each agent its own."""
-        return self.one.observe_sent(carry, split_agents(action)) if hasattr(self.one, "observe_sent") else carry
+        return self.one.observe_sent(carry, split_agents(action)) if isinstance(self.one, ObservesDelay) else carry
 
 
 def team_policy(policy: Any, agents: int, homogeneous: bool) -> Any:

@@ -133,10 +133,10 @@ def _fitted(
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
     searches = {name: _Search(logged.by(name), parts.seed) for name in labels}
-    told = {name: _told(search, moved, acts, parts, quiet) for name, search in searches.items()}
-    found_by = {name: found for name, (found, _) in told.items()}
+    fitted = {name: _label_of(search, moved, acts, parts, quiet) for name, search in searches.items()}
+    found_by = {name: found for name, (found, _) in fitted.items()}
     each = [
-        _with_future(told[name][1], search, moved, found_by[name], parts, quiet) for name, search in searches.items()
+        _with_future(fitted[name][1], search, moved, found_by[name], parts, quiet) for name, search in searches.items()
     ]
     barrier = None
     if each:
@@ -269,7 +269,7 @@ def _digest(array: np.ndarray) -> str:
     return hashlib.blake2b(array.tobytes(), digest_size=8).hexdigest()
 
 
-def _told(
+def _label_of(
     search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool
 ) -> tuple[Found, cbf.Barrier]:
     """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out

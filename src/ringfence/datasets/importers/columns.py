@@ -46,7 +46,7 @@ def read(given: dict | str | os.PathLike) -> Columns:
                 raise ValueError(f"'{file}' is larger than {LARGEST / 2**20:.0f} MiB")
             raw = file.read_bytes()
         else:  # ranges and arrays of Python's become lists
-            raw = json.dumps(given, default=lambda x: x.tolist() if hasattr(x, "tolist") else list(x))
+            raw = json.dumps(given, default=lambda x: x.tolist() if isinstance(x, np.ndarray | np.generic) else list(x))
         columns: Columns = schemas.decode(raw, _KIND)
         for name, agent in columns.items():
             if extra := sorted(agent.keys() - {"observation", "action"}):

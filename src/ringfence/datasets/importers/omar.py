@@ -134,9 +134,9 @@ def _follows(store: EpisodeStore) -> tuple[bool, bool]:
     step = np.arange(min(store.steps, CHECKED))
     row = step + store.episode_of_step[step]
     before = env.from_global_state(jnp.asarray(store.state[row]))
-    after, told = jax.jit(env.step)(before, jnp.asarray(store.actions[step]))
+    after, outcome = jax.jit(env.step)(before, jnp.asarray(store.actions[step]))
     moved = np.abs(np.asarray(env.global_state(after)) - store.state[row + 1]).max(-1)
-    paid = np.abs(np.asarray(told.reward) - store.rewards[step]).max(-1)
+    paid = np.abs(np.asarray(outcome.reward) - store.rewards[step]).max(-1)
     return bool(np.median(moved) <= STATE_SLACK), bool(np.median(paid) <= REWARD_SLACK)
 
 

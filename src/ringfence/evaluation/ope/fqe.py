@@ -100,11 +100,11 @@ def fitted_q(
     at_starts = jax.jit(lambda nets, x, action: jax.vmap(lambda q: q(x, action).mean(0))(nets))
     found = np.asarray(at_starts(fast, view(starts), jnp.asarray(first_actions)), np.float64)  # (M, 2)
     found = (found * deviation + mean) / (1 - settings.discount)
-    returns, costs = (_told(found[:, k], earned[:, k] / (1 - settings.discount)) for k in range(2))
+    returns, costs = (_bounded(found[:, k], earned[:, k] / (1 - settings.discount)) for k in range(2))
     return Values(returns, costs)
 
 
-def _told(found: np.ndarray, always: np.ndarray) -> Mean:
+def _bounded(found: np.ndarray, always: np.ndarray) -> Mean:
     """The estimate, or that there is none: a sum of discounted steps lies between always earning the least that was
     logged, or nothing, and always the most; an ensemble that leaves that by far has diverged."""
     low = min(float(always.min()), 0.0)

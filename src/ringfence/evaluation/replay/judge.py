@@ -79,11 +79,11 @@ def replay(
     run = None if policy is None else Run.of(policy)
     if run is not None and run.config["task"] != store.card.task:
         raise UserError(f"The run is of '{run.config['task']}', the logs are of '{store.card.task}'; replay its own.")
-    told: dict[str, Any] = {"barrier": barrier} if barrier else {}
+    given: dict[str, Any] = {"barrier": barrier} if barrier else {}
     if world is not None:
-        told["world"] = world if isinstance(world, World) else worlds.load(world)
-    guarded = _guarded(run, task, guard, told | options, anyway) if guard != "none" else None
-    known_world = guarded.guard.world if guarded is not None else told.get("world")
+        given["world"] = world if isinstance(world, World) else worlds.load(world)
+    guarded = _guarded(run, task, guard, given | options, anyway) if guard != "none" else None
+    known_world = guarded.guard.world if guarded is not None else given.get("world")
     if known_world is not None:
         check_view(known_world, store)
     motion = motion_of(store, names)
@@ -232,9 +232,9 @@ def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple
         return float(given), "given"
     hazard = store.hazard
     parts = hazard.hazards if isinstance(hazard, constraints.All) else (hazard,)
-    told = [part.radius for part in parts if isinstance(part, constraints.Separation)]
-    if told:
-        return told[0], "the task's formula"
+    radii = [part.radius for part in parts if isinstance(part, constraints.Separation)]
+    if radii:
+        return radii[0], "the task's formula"
     row = np.arange(store.steps) + store.episode_of_step + 1
     distance = np.linalg.norm(motion.offset[row], axis=-1).min(-1)  # (T, N)
     unsafe = store.costs > 0
@@ -300,8 +300,8 @@ def _by_agent(driven: np.ndarray, found: Driven) -> tuple[dict[str, Any], ...]:
     made = []
     for agent in np.unique(driven):
         own = driven == agent
-        told = {name: float(value[own].mean()) for name, value in found.info.items()}
-        made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **told})
+        info = {name: float(value[own].mean()) for name, value in found.info.items()}
+        made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
     return tuple(made)
 
 

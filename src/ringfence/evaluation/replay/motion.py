@@ -40,11 +40,11 @@ class Kinematics:
     world: World | None = field(default=None, repr=False)
 
     def moved(
-        self, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray, action: np.ndarray, told: Any
+        self, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray, action: np.ndarray, predicted: Any
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(place, velocity, heading) after actions (W, A); `told` is the World's next velocity where it says so."""
+        """(place, velocity, heading) after actions (W, A); `predicted` is the next velocity by the World, if asked."""
         if self.name == "world":
-            after = told
+            after = predicted
         elif self.name in LINEAR:
             after = (1 - self.drag) * velocity + self.gain * action
         else:

@@ -60,8 +60,8 @@ class Names:
     @cached_property
     def placed(self) -> bool:
         """Whether everybody's place is known."""
-        told = self.pair("own.{}") is not None and self.agents > 1
-        return told or (self.agents > 1 and self.state_pairs("agent{}.{{}}") is not None)
+        named = self.pair("own.{}") is not None and self.agents > 1
+        return named or (self.agents > 1 and self.state_pairs("agent{}.{{}}") is not None)
 
     def check(self, task: str) -> None:
         """Refuse logs that cannot be replayed."""

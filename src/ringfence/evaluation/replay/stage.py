@@ -69,10 +69,10 @@ class Stage:
             seen = w.observed(t, place, velocity, heading)
             now = self._now(t, place, velocity, heading)
             key, step_key = jax.random.split(key)
-            memory, action, told = self._action(driver, guard, memory, t, seen, now, step_key)
+            memory, action, step_info = self._action(driver, guard, memory, t, seen, now, step_key)
             if brake:
-                action, told["braked"] = braked(now, action, self.kinematics, self.radius)
-            for name, value in told.items():
+                action, step_info["braked"] = braked(now, action, self.kinematics, self.radius)
+            for name, value in step_info.items():
                 info.setdefault(name, []).append(np.asarray(value))
             after = None
             if world is not None and foresee is not None:
