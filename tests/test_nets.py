@@ -13,7 +13,7 @@ import pytest
 
 from ringfence.errors import UserError
 from ringfence.nets import MLP, agent_attention, build_denoiser
-from ringfence.nets.team import told_driver
+from ringfence.nets.team import planning_as
 from ringfence.nets.unet import TemporalUNet
 
 ROWS, FEATURES = 5, 5  # rows do not halve: the U-Net pads them
@@ -65,7 +65,7 @@ def test_a_team_is_read_at_once():
     np.testing.assert_array_equal(apply(net, x.at[:, 0, :, 3].add(1.0), *rest, jnp.array([0, 1])), out)
     moved = apply(net, x.at[:, 1, 0].add(1.0), *rest, jnp.array([0, 1]))
     assert (np.abs(moved - out)[:, 1:].max((1, 3)) > 1e-5).all()
-    twice = told_driver(net, jnp.array([0, 3]))(*(jnp.concatenate([a, a]) for a in (x, *rest)))
+    twice = planning_as(net, jnp.array([0, 3]))(*(jnp.concatenate([a, a]) for a in (x, *rest)))
     np.testing.assert_allclose(twice[:2], twice[2:], atol=1e-6)
     np.testing.assert_allclose(twice[0], out[0], atol=1e-6)
     assert np.abs(twice[1] - out[1]).max() > 1e-4

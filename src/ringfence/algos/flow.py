@@ -89,12 +89,12 @@ def init(
     kc, kf, kp, kw = jax.random.split(key, 4)
     seen = spec.n_agents * spec.feature_dim
     acts = spec.n_agents * spec.action_dim
-    told = seen + acts + 2 * WAVES + config.drivers + 2
+    inputs = seen + acts + 2 * WAVES + config.drivers + 2
 
     def networks() -> dict:
         params = {
             "clones": ResidualMLP(kc, seen, config.drivers * acts, config.width, config.depth),
-            "flow": ResidualMLP(kf, told, acts, config.width, config.depth, 0.1),
+            "flow": ResidualMLP(kf, inputs, acts, config.width, config.depth, 0.1),
             "prior": ResidualMLP(kp, seen + 2, config.drivers, drivers.PRIOR_WIDTH, 2, 0.1),
         }
         return fresh(_optimiser(config), params, "ema")
@@ -132,13 +132,13 @@ def make_loss(config: Config):
         shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
 
         driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
-        told = jnp.repeat(jax.nn.one_hot(driver, config.drivers), steps, 0)
+        which = jnp.repeat(jax.nn.one_hot(driver, config.drivers), steps, 0)
         score = jnp.repeat(batch.score, steps)
         kept = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,)) & (config.condition != "none")
         noise = jax.random.normal(k_noise, actions.shape)
         tau = jax.random.uniform(k_time, (windows * steps,))
         noised = (1.0 - tau)[:, None] * noise + tau[:, None] * actions
-        clean = clean_action(params["flow"], seen, noised, tau, told, score, jnp.repeat(kept, steps))
+        clean = clean_action(params["flow"], seen, noised, tau, which, score, jnp.repeat(kept, steps))
         flow_loss = (((clean - actions) ** 2).sum(-1) * there.reshape(-1)).sum() / jnp.maximum(there.sum(), 1)
 
         guess = driver_scores(params["prior"], seen, score, jnp.repeat(kept, steps))

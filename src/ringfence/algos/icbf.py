@@ -29,7 +29,7 @@ from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import infer_action
 from ringfence.nets.optim import Optimiser, average, fresh
 from ringfence.nets.residual import ResidualMLP
-from ringfence.nets.team import told_driver
+from ringfence.nets.team import planning_as
 from ringfence.problem import features, normalise
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions, diffusion
@@ -367,7 +367,7 @@ def denoising(
     )
     noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
     keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
-    output = told_driver(params["denoiser"], driver)(noised.x, noised.k, batch.score, keep)
+    output = planning_as(params["denoiser"], driver)(noised.x, noised.k, batch.score, keep)
     weight = (~mask & batch.valid[..., None, None] & carried[:, None]).astype(jnp.float32)
     clip = (config.snr_floor, config.snr_ceiling)
     loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
@@ -428,7 +428,7 @@ def generated(
     def inpaint(x: Array) -> Array:
         return jnp.where(mask, known, x)
 
-    net = told_driver(params["denoiser"], None if driver is None else driver[:b])
+    net = planning_as(params["denoiser"], None if driver is None else driver[:b])
     predict = diffusion.guided(net, alpha_bar, batch.score[:b], 1.0, config.prediction, config.clip)
     if kind == "ddim":
         x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)

@@ -15,7 +15,7 @@ from ringfence.nets.embedding import Condition
 from ringfence.nets.residual import ResidualMLP
 from ringfence.types import Array, Key
 
-TOLD = 64  # units of what the network is told: diffusion step, return, driver
+CONDITION = 64  # units of the condition: diffusion step, return, driver
 
 
 class TeamDenoiser(eqx.Module):
@@ -40,8 +40,8 @@ class TeamDenoiser(eqx.Module):
         k1, k2 = jax.random.split(key)
         self.carried = tuple(range(rows * features)) if carried is None else carried
         flat = agents * len(self.carried)
-        self.condition = Condition(k1, TOLD, drivers)
-        self.net = ResidualMLP(k2, flat + TOLD, flat, width, depth, 0.1)
+        self.condition = Condition(k1, CONDITION, drivers)
+        self.net = ResidualMLP(k2, flat + CONDITION, flat, width, depth, 0.1)
 
     def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
@@ -55,7 +55,7 @@ class TeamDenoiser(eqx.Module):
         return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
 
 
-def told_driver(denoiser, driver: Array | None):
+def planning_as(denoiser, driver: Array | None):
     """F(x, k, y, keep) that plans as `driver` (B,), also where guidance asks it twice at once; None: as anybody."""
     if driver is None:
         return denoiser

@@ -117,10 +117,10 @@ class FlowPolicy(eqx.Module):
         which = jax.nn.one_hot(driver, self.drivers)
 
         def clean(action: Array, tau: Array) -> Array:
-            def told(score: Array, keep: Array) -> Array:
+            def answer(score: Array, keep: Array) -> Array:
                 return clean_action(self.networks["flow"], seen, action, tau, which, score, keep)
 
-            return self._guided(told, batch)
+            return self._guided(answer, batch)
 
         action = o.temperature * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
         for k in range(o.sampling_steps):
@@ -152,16 +152,16 @@ class FlowPolicy(eqx.Module):
         doubt = jnp.maximum(spread / world.ood_threshold - 1.0, 0.0)
         return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
-    def _guided(self, told: Callable[[Array, Array], Array], batch: int) -> Array:
+    def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
         """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y, whether it is told)."""
         o = self.options
         score, everyone = jnp.full(batch, o.target_return), jnp.ones(batch, bool)
         if not self.conditioned:
-            return told(score, ~everyone)
-        asked = told(score, everyone)
+            return answer(score, ~everyone)
+        asked = answer(score, everyone)
         if o.cfg_scale == 1.0:
             return asked
-        free = told(score, ~everyone)
+        free = answer(score, ~everyone)
         return free + o.cfg_scale * (asked - free)
 
     def _with_driver(self, carry: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:

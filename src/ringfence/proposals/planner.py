@@ -20,7 +20,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.nets.heads import infer_action
-from ringfence.nets.team import told_driver
+from ringfence.nets.team import planning_as
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
@@ -186,7 +186,7 @@ class Planner(HadStart, eqx.Module):
         known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
         bar = np.asarray(self.alpha_bar)
         target = jnp.full(b, o.target_return)
-        net = told_driver(self.networks["denoiser"], driver)
+        net = planning_as(self.networks["denoiser"], driver)
         predict = diffusion.guided(net, bar, target, o.cfg_scale, self.prediction, self.clip)
 
         def inpaint(x: Array) -> Array:
