@@ -71,6 +71,31 @@ def test_danger_that_nothing_tells_has_no_cause(logged):
     assert cause_search.find(x, chance, episode, NAMES)[0].causes == ()
 
 
+def scarce(logged, episodes: int):
+    """The logged steps with contacts in so many episodes alone, one of which holds most of them."""
+    x, _, episode = logged
+    pairs = x[..., [5, 6, 7, 8]].reshape(*x.shape[:2], 2, 2)
+    near = (np.linalg.norm(pairs, axis=-1) < NEAR).any((1, 2))
+    touched = np.unique(episode[near], return_counts=True)
+    some = [touched[0][touched[1].argmax()], *touched[0][touched[1] == 2][: episodes - 1]]
+    kept = np.isin(episode, some) | ~np.isin(episode, touched[0])
+    return x[kept], near[kept], episode[kept]
+
+
+def test_scarce_danger_has_a_cause_that_tells_all_of_it(logged, monkeypatch):
+    """Seven episodes are too few for any standard error, but not where a distance tells each from what the others say;
+    three are."""
+    x, unsafe, episode = scarce(logged, 7)
+    found, _ = cause_search.find(x, unsafe, episode, NAMES)
+    assert [c.name for c in found.causes] == ["length of other.dx, other.dy"]
+    assert found.edges[0].at == pytest.approx(NEAR, abs=0.03)
+    chance = unsafe[np.random.default_rng(1).permutation(len(unsafe))]
+    assert not cause_search.find(x, chance, episode, NAMES)[0].causes
+    assert not cause_search.find(*scarce(logged, 3), NAMES)[0].causes
+    monkeypatch.setattr(cause_search, "NEARLY_ALL", 2.0)
+    assert not cause_search.find(x, unsafe, episode, NAMES)[0].causes
+
+
 def test_what_holds_for_some_agents_alone_is_found(logged):
     """The first two must not drift apart; the third may go where it likes."""
     x, _, episode = logged

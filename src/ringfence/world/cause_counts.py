@@ -7,7 +7,7 @@ nothing by steps that it knows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -48,6 +48,11 @@ class Steps:
         cell = self.cells(told_of(cause, ()))[-1]
         agents, things = np.nonzero(cause.holds(cell.shape[1]))
         return cell[:, agents, things], agents
+
+    def part(self, some: np.ndarray) -> Steps:
+        """Those of the steps, `some` (T,) bool."""
+        taken = {name: getattr(self, name)[some] for name in ("x", "unsafe", "fold", "episode")}
+        return replace(self, **taken, seen={})
 
     @property
     def each(self) -> bool:
@@ -106,6 +111,10 @@ class Explained:
         nothing = np.zeros(steps.unsafe.shape)
         safe = np.minimum.reduce([nothing, *[one.safe for one in chosen]])
         return cls(safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
+
+    def part(self, some: np.ndarray) -> Explained:
+        """What is told of some of the steps (T,) bool."""
+        return Explained(self.safe[some], self.near[some])
 
     def left(self, unsafe: np.ndarray) -> np.ndarray:
         """(T,) or (T, N) how much of each unsafe step is still to be explained. At the edge of a cause that is nothing:

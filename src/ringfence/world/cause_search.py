@@ -22,13 +22,15 @@ from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gai
 from ringfence.world.causes import Cause, Edge, Found, candidates, only_of, told_of, wider
 from ringfence.world.cells import CELLS, Cells
 
-VERSION = 9  # of the search: what was found by another is looked for again
+VERSION = 10  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
 SURE = 3.0  # standard errors, over episodes, by which a gain has to exceed nothing
 NEEDED = 2.0  # standard errors, by which one that is kept beside all others has to
 AROUND = 3.0  # cells to either side that an edge is looked for in
+NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
+FEW = 6  # episodes with danger, below which anything is
 
 
 def radius(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, cause: Cause) -> Edge:
@@ -82,12 +84,38 @@ def _added(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> list[C
     while len(chosen) < MOST:
         explained = Explained.by(steps, chosen)
         best = _simplest(steps, pool, explained)
-        if best is None or best.gain < max(least, SURE * best.error):
+        if best is None or best.gain < least:
+            break
+        if best.gain < SURE * best.error and not _tells_nearly_all(steps, best, explained):
             break
         if best.cause.who:
             best = _gathered(steps, best, pool, explained)
         chosen.append(best)
     return chosen
+
+
+def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
+    """Whether a cause of one number tells nearly all that is left, of episodes that its edges were not read off. Danger
+    that is scarce lies in a few episodes, of which some hold most of it; no gain is many standard errors there."""
+    left = explained.left(steps.unsafe) > 0.5
+    if not one.cells.edge.bounds or len(np.unique(steps.episode[left if left.ndim == 1 else left.any(1)])) < FEW:
+        return False
+    safe = np.zeros(steps.unsafe.shape)
+    for fold in np.unique(steps.fold):
+        rest, own = steps.part(steps.fold != fold), steps.part(steps.fold == fold)
+        edge = refined(rest, one.cells.edge, one.cause, explained.part(steps.fold != fold))
+        called = _within(rest, one.cause, edge)
+        share = min(rest.unsafe[called].mean(), 0.999) if called.any() else 0.0
+        safe[steps.fold == fold] = np.where(_within(own, one.cause, edge), np.log1p(-share), 0.0)
+    to_win = -likelihood(steps, explained.safe).mean() * (1 if steps.unsafe.ndim == 1 else steps.unsafe.shape[1])
+    return gain(steps, explained, safe)[0] > NEARLY_ALL * to_win
+
+
+def _within(steps: Steps, cause: Cause, edge: Edge) -> np.ndarray:
+    """(T,) or (T, N) bool: somebody is in danger by a cause of one number."""
+    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
+    score = signed(cause.of(steps.x)[:, agents, things, 0], edge)
+    return _of_the_worst(steps, score, score, agents) < 0
 
 
 def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
