@@ -209,3 +209,16 @@ def test_a_view_of_the_state_needs_it(rows):
         SimpleSpread().feature_map("pruned")(rows[0], None)
     with pytest.raises(UserError, match="did you mean 'pruned'"):
         SimpleSpread().feature_map("prune")
+
+
+def test_in_a_crowd_somebody_is_always_seen():
+    """Entries that say who is seen are left out of a view where they never vary; one of them may be, and all."""
+    x = np.array([[[0.0, 3.0, 4.0, 0.3, 0.4, 1.0]]])
+    for names in (
+        ("own.vx", "other0.dx", "other0.dy", "other1.dx", "other1.dy", "goal.dx"),
+        ("own.vx", "other0.dx", "other0.dy", "other1.dx", "other1.dy", "other1.seen"),
+    ):
+        bound = constraints.bind(constraints.Separation(0.2), names, 1)
+        np.testing.assert_allclose(bound.clearance(x), [[0.3]], atol=1e-6)
+    with pytest.raises(UserError, match="needs at least 2 agents"):
+        constraints.bind(constraints.Separation(0.2), ("own.vx", "own.vy"), 1)

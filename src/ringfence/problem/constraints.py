@@ -151,13 +151,15 @@ def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> Bound
 
 
 def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
-    nearest_only = "other0.seen" in names  # an agent sees not all others, but those who come nearest
+    slots = 0
+    while f"other{slots}.dx" in names:
+        slots += 1
+    # An agent may see not all others, but those who come nearest; in a crowd somebody is always seen, and no entry
+    # needs to say so.
+    nearest_only = any(re.fullmatch(r"other\d+\.seen", name) for name in names) or (n_agents < 2 and slots > 0)
     if n_agents < 2 and not nearest_only:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
-    others = n_agents - 1
-    if nearest_only:
-        others = sum(bool(re.fullmatch(r"other\d+\.seen", name)) for name in names)
-    offsets = _offsets(names, n_agents, others)
+    offsets = _offsets(names, n_agents, slots if nearest_only else n_agents - 1)
 
     def clearance(x: Numbers) -> Array:
         squared = (offsets(x) ** 2).sum(-1)
