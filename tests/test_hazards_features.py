@@ -222,3 +222,25 @@ def test_in_a_crowd_somebody_is_always_seen():
         np.testing.assert_allclose(bound.clearance(x), [[0.3]], atol=1e-6)
     with pytest.raises(UserError, match="needs at least 2 agents"):
         constraints.bind(constraints.Separation(0.2), ("own.vx", "own.vy"), 1)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
+def test_places_go_by_the_velocity_that_the_logs_have_them_go_by(late):
+    """Of agents who know velocities alone; the map is stored, and says nothing where it is the next velocity."""
+    rng = np.random.default_rng(0)
+    dt, rows = 0.2, 400
+    velocity = np.cumsum(rng.normal(0, 0.3, (rows, 2)), 0)
+    theirs = np.cumsum(rng.normal(0, 0.3, (rows, 2)), 0)
+    gone = [((1 - late) * v[:-1] + late * v[1:]) * dt for v in (velocity, theirs)]
+    place, there = (np.concatenate([np.zeros((1, 2)), moved.cumsum(0)]) for moved in gone)
+    names = ("own.vx", "own.vy", "goal.dx", "goal.dy", "other0.dx", "other0.dy", "other0.dvx", "other0.dvy")
+    x = np.concatenate([velocity, 3 - place, there - place, theirs - velocity], -1)[:, None]
+    map = features.from_data("decentralized", x, None, names, (), np.array([0]), homogeneous=True, dt=dt)
+    assert map.late == late and features.from_dict(features.to_dict(map)) == map
+    assert ("late" in features.to_dict(map)) == (late < 1)
+    plan = x[10:14][None].copy()
+    plan[0, 1:, :, 2:] = 0.0  # what follows from own velocities
+    found = np.asarray(map.reconcile(jnp.asarray(plan, jnp.float32)))[0, :, 0]
+    np.testing.assert_allclose(found[:, 2:4], x[10:14, 0, 2:4], atol=1e-5)
+    seen = there[10] + np.arange(4)[:, None] * dt * theirs[10] - place[10:14]  # as if it kept its velocity
+    np.testing.assert_allclose(found[:, 4:6], seen, atol=1e-5)

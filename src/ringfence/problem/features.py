@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
+from ringfence.problem.kinematics import late_share
 from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
@@ -50,6 +51,7 @@ class FeatureMap:
     decentralized: bool = False  # what follows does so from the agent's own movement alone
     models_others: bool = False  # what comes next depends on what others see and do, which has to be guessed
     dt: float | None = None  # s, of a decentralized map: the step that velocities are predicted by
+    late: float = 1.0  # of a decentralized map: the share of that step that is gone with the next velocity
     # D weights of the standardised entries that the critic reads; None: all the same
     critic_weight: tuple[float, ...] | None = None
 
@@ -194,22 +196,15 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     return replace(map, own=own, reconcile=_relative(how, map.names, map.plus.shape[0]), follows=tuple(how))
 
 
-def constant_velocity(map: FeatureMap, dt: float) -> FeatureMap:
+def constant_velocity(map: FeatureMap, dt: float, late: float = 1.0) -> FeatureMap:
     """A map of agents who know where they are by their speed alone: everything named `goal.dx`, `obstacle0.dx` moves
-    by `own.vx` in a step of `dt` seconds, and `other0.dx`, `other0.dvx` as if that other kept its velocity. So what is
-    predicted of an agent is its own velocity, whoever the others are and however many; what else is known of things
-    (`obstacle0.radius`) stays."""
-    names = {name: d for d, name in enumerate(map.names)}
-    axes = [c for c in "xyz" if f"own.v{c}" in names]
-    rules = []  # entry of the place, entry of the relative velocity or -1, entry of the own velocity
-    for name, d in names.items():
-        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
-        if match is None or match[2] not in axes:
-            continue
-        thing, axis = match.groups()
-        rules.append((d, names.get(f"{thing}.dv{axis}", -1), names[f"own.v{axis}"]))
+    by `own.vx` in a step of `dt` seconds, for the share `late` of it by the next row's. `other0.dx`, `other0.dvx` move
+    as if that other kept its velocity. So what is predicted of an agent is its own velocity, whoever the others are and
+    however many; what else is known of things (`obstacle0.radius`) stays."""
+    rules = _moves(map.names)
     if not rules:
         return map
+    names = {name: d for d, name in enumerate(map.names)}
     moved = {place for place, _, _ in rules} | {speed for _, speed, _ in rules if speed >= 0}
     stays = {d for name, d in names.items() if d not in moved and not name.startswith("own.")}
     follows = tuple(sorted(moved | stays))
@@ -220,8 +215,21 @@ def constant_velocity(map: FeatureMap, dt: float) -> FeatureMap:
         follows=follows,
         decentralized=True,
         dt=dt,
-        reconcile=_reconcile_constant_velocity(tuple(rules), tuple(sorted(stays)), dt),
+        late=late,
+        reconcile=_reconcile_constant_velocity(rules, tuple(sorted(stays)), dt, late),
     )
+
+
+def _moves(names: Sequence[str]) -> tuple[tuple[int, int, int], ...]:
+    """(entry of a place, entry of its relative velocity or −1, entry of the own velocity) of what is named so."""
+    entries = {name: d for d, name in enumerate(names)}
+    rules = []
+    for name, d in entries.items():
+        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
+        if match is not None and f"own.v{match[2]}" in entries:
+            thing, axis = match.groups()
+            rules.append((d, entries.get(f"{thing}.dv{axis}", -1), entries[f"own.v{axis}"]))
+    return tuple(rules)
 
 
 def decentralized(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
@@ -234,7 +242,7 @@ def decentralized(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
 
 @functools.cache
 def _reconcile_constant_velocity(
-    rules: tuple[tuple[int, int, int], ...], stays: tuple[int, ...], dt: float
+    rules: tuple[tuple[int, int, int], ...], stays: tuple[int, ...], dt: float, late: float
 ) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that moves everything by the rows' own velocities; the
     same one for the same rules."""
@@ -248,9 +256,12 @@ def _reconcile_constant_velocity(
         steps = later.shape[-3]
         own = later[..., mine]
         theirs = jnp.where(relative, start[..., speed] + start[..., mine], 0.0)  # their velocity, which they keep
+        gone = own
+        if late < 1:
+            gone = late * own + (1 - late) * jnp.concatenate([start[..., mine], own[..., :-1, :, :]], -3)
         count = jnp.arange(1, steps + 1, dtype=x.dtype)[:, None, None]
         later = later.at[..., still].set(start[..., still])
-        later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(own, axis=-3)))
+        later = later.at[..., place].set(start[..., place] + dt * (count * theirs - jnp.cumsum(gone, axis=-3)))
         if relative.any():
             later = later.at[..., speed[relative]].set((theirs - own)[..., relative])
         return jnp.concatenate([start, later], -3)
@@ -338,9 +349,10 @@ def from_data(
     if view == "centralized":
         return plain
     if homogeneous and not any(f"own.{c}" in plain.names for c in "xyz"):
-        dt = dt or _step_of(plain, _logged_steps(plain, observations, None, first_rows))
+        steps = _logged_steps(plain, observations, None, first_rows)
+        dt = dt or _step_of(plain, steps)
         if dt is not None:
-            return constant_velocity(plain, dt)
+            return constant_velocity(plain, dt, _late(plain, steps, dt))
     return following(plain, _confirmed(plain, _logged_steps(plain, observations, state, first_rows)))
 
 
@@ -458,6 +470,18 @@ def _step_of(map: FeatureMap, steps: _Steps | None) -> float | None:
     return float(np.round(np.median(found), 6)) if found else None
 
 
+def _late(map: FeatureMap, steps: _Steps | None, dt: float) -> float:
+    """The share of a step that is gone with the next velocity; all of it where the logged steps do not say."""
+    rules = _moves(map.names)
+    if steps is None or not rules:
+        return 1.0
+    place, speed, mine = np.array(rules).T
+    before, after = (np.asarray(x, np.float64) for x in (steps.before, steps.after))
+    was, became = (np.where(speed >= 0, x[..., speed], -x[..., mine]) for x in (before, after))
+    share = late_share(after[..., place] - before[..., place], was, became, dt)
+    return 1.0 if share is None else share
+
+
 def _observed_too(
     observations: np.ndarray, state: np.ndarray, keep: set[str], names: tuple[str, ...], rows: int = 4000
 ) -> set[int]:
@@ -521,10 +545,12 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
         raise UserError("The run's feature map is damaged: it reads entries before the first; train the run again.")
     if data.get("dt") is not None and not 0 < data["dt"] < math.inf:
         raise UserError(f"The run's feature map is damaged: steps of {data['dt']} s are none; train the run again.")
+    if not 0 <= data.get("late", 1.0) <= 1:
+        raise UserError(f"The run's feature map is damaged: {data['late']} is no share of a step; train the run again.")
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
     if data.get("dt") is not None:
-        return constant_velocity(map, data["dt"])
+        return constant_velocity(map, data["dt"], data.get("late", 1.0))
     kept = set(data.get("follows", ()))
     rules = derived(map.names, map.plus.shape[0])
     return following(map, {d: rule for d, rule in rules.items() if d in kept})
@@ -541,4 +567,5 @@ def to_dict(map: FeatureMap) -> dict[str, Any]:
         "joint": isinstance(map, _Joint),
         "follows": list(map.follows),
         **({} if map.dt is None else {"dt": map.dt}),
+        **({} if map.late == 1 else {"late": map.late}),
     }

@@ -11,6 +11,7 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import others
+from ringfence.problem.kinematics import late_share
 
 AXES = ("x", "y")
 NOBODY = 1e6  # m: how far away is who is not there
@@ -121,8 +122,7 @@ def _late(
     offset: np.ndarray,
     seen: np.ndarray,
 ) -> float:
-    """The share of a step that bodies go with their next velocity, as most of the logged steps have it. Logs differ: a
-    velocity is what a simulator goes on with, or the difference to the place before."""
+    """The share of a step that bodies go with their next velocity, as most of the logged steps have it."""
     if velocity is None:
         return 1.0  # it is made of differences to the place before
     row = np.arange(store.steps) + store.episode_of_step
@@ -135,17 +135,8 @@ def _late(
         before, after = (x[r][..., np.array(drift)][both] for r in (row, row + 1))
     else:
         return 0.5
-    dt = float(store.card.dt or 1.0)
-    change = ((after - before) * dt).ravel()
-    rest = (moved - before * dt).ravel()
-    turns = np.abs(change) > 0.01 * np.abs(velocity).max() * dt
-    if not turns.any():
-        return 0.5
-    share = rest[turns] / change[turns]
-    tried = np.linspace(0, 1, 21)
-    # the most frequent, not the mean: where others are listed by distance, a place in the list may change its owner
-    agree = [(np.abs(share - one) < 0.025).sum() for one in tried]
-    return float(tried[int(np.argmax(agree))])
+    share = late_share(moved, before, after, float(store.card.dt or 1.0))
+    return 0.5 if share is None else share
 
 
 def _velocities(store: EpisodeStore, names: Names, x: np.ndarray) -> np.ndarray | None:
