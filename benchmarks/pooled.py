@@ -107,7 +107,8 @@ def milliseconds(run: Run, store: EpisodeStore, options: dict) -> float:
     """Of one joint action, the median of 200."""
     pilot = ringfence.Controller(run, **options)
     seconds = []
-    blind = store.state is None or run.config["spec"]["homogeneous"]  # agents who see for themselves are given no state
+    # Homogeneous agents see for themselves and are given no state.
+    blind = store.state is None or TASKS[run.config["task"]].homogeneous
     for k in range(210):
         begun = time.perf_counter()
         pilot.act(store.observations[k], None if blind else store.state[k])
