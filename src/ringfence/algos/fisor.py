@@ -118,6 +118,12 @@ def proposed(actor: MLP, x: Array, noisy: Array, k: Array) -> Array:
     return actor(jnp.concatenate([x, noisy, level], -1))
 
 
+def danger_of(hazard: BoundHazard, batch: Batch) -> Array:
+    """h (N, B) of the states that the steps lead to."""
+    unsafe, _ = hazard.labels(batch.features[:, 1], batch.costs[:, 1])
+    return jnp.where(unsafe, DANGER, -1.0).T
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; one Adam step on every network."""
     opt = optimiser(config)
@@ -127,8 +133,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         frozen = state["frozen"]
         target = state["target"]
         t = ac.transitions(batch, frozen["normaliser"])
-        unsafe, _ = hazard.labels(batch.features[:, 1], batch.costs[:, 1])
-        danger = jnp.where(unsafe, DANGER, -1.0).T  # (N, B)
+        danger = danger_of(hazard, batch)
         q_reward = target["reward"](t.x, t.action).min(1)
         q_danger = target["danger"](t.x, t.action).max(1)
         alive = t.bootstrap.T

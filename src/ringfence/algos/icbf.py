@@ -13,6 +13,7 @@ the planner is MADIFF's.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -433,10 +434,19 @@ def generated(
     if kind == "ddim":
         x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)
         return Generated(norm.invert(x), valid, zero, one)
-    # chain:n, one noise level for the sub-batch: n ancestral steps down from x_k, then the clean estimate there
-    k1, k2, k3 = jax.random.split(key, 3)
-    top = jax.random.randint(k1, (), n, len(bar))
     bars = jnp.asarray(bar, jnp.float32)
+    x, top = _chained(predict, inpaint, known, bars, key, n)
+    weight = bars[top - n] * one if config.weigh_by_signal else one
+    return Generated(norm.invert(x), valid, etas[top - n] * one, weight)
+
+
+def _chained(
+    predict: diffusion.Predict, inpaint: Callable[[Array], Array], known: Array, bars: Array, key: Key, n: int
+) -> tuple[Array, Array]:
+    """One noise level for all of `known` (B, H, N, D): n ancestral steps down from it, then the clean plan that is
+    estimated there; and that level."""
+    k1, k2, k3 = jax.random.split(key, 3)
+    top = jax.random.randint(k1, (), n, len(bars))
     x = jnp.sqrt(bars[top]) * known + jnp.sqrt(1 - bars[top]) * jax.random.normal(k2, known.shape)
 
     @jax.checkpoint
@@ -444,7 +454,7 @@ def generated(
         i, key = i_key
         k = top - i
         x = inpaint(x)
-        x0 = inpaint(predict(x, jnp.full(b, k)))
+        x0 = inpaint(predict(x, jnp.full(x.shape[0], k)))
         a = bars[k]
         before = bars[k - 1]
         ratio = a / before
@@ -453,9 +463,7 @@ def generated(
         return mean + deviation * jax.random.normal(key, x.shape), None
 
     x, _ = jax.lax.scan(down, x, (jnp.arange(n), jax.random.split(k3, n)))
-    x = inpaint(predict(inpaint(x), jnp.full(b, top - n)))
-    weight = bars[top - n] * one if config.weigh_by_signal else one
-    return Generated(norm.invert(x), valid, etas[top - n] * one, weight)
+    return inpaint(predict(inpaint(x), jnp.full(x.shape[0], top - n))), top
 
 
 def followed(barrier: Barrier, made: Generated, config: Config) -> tuple[Array, Metrics]:

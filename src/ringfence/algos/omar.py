@@ -125,17 +125,73 @@ def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Co
     return jnp.where((q.max(-1) > rival)[..., None], top, own)
 
 
+def noisy(key: Key, action: Array, config: Config) -> tuple[Array, Array]:
+    """Samples (B, N, S, A) around the actors' actions, and their log densities (B, N, S)."""
+    shape = (*action.shape[:2], config.cql_samples, action.shape[-1])
+    noise = config.cql_noise * jax.random.normal(key, shape)
+    density = -0.5 * (noise / config.cql_noise) ** 2 - jnp.log(config.cql_noise) - 0.5 * jnp.log(2 * jnp.pi)
+    return jnp.clip(action[:, :, None] + noise, -1.0, 1.0), density.sum(-1)
+
+
+def sampled(
+    actor: PyTree, t: ac.Transitions, keys: tuple[Key, Key, Key], uniform_density: Array, config: Config
+) -> tuple[Array, Array]:
+    """Actions (B, N, S, A) whose values CQL holds down, and their log densities (B, N, S)."""
+    ku, kp, kn = keys
+    b, n, a = t.action.shape
+    drawn = jax.random.uniform(ku, (b, 1, config.cql_samples, a), minval=-1.0, maxval=1.0)
+    drawn = jnp.broadcast_to(drawn, (b, n, config.cql_samples, a))
+    densities = jnp.full((b, n, config.cql_samples), uniform_density)
+    if config.cql_actions == "policy":
+        here, d_here = noisy(kp, ac.act(actor, t.x), config)
+        ahead, d_ahead = noisy(kn, ac.act(actor, t.ahead), config)
+        drawn = jnp.concatenate([drawn, here, ahead], 2)
+        densities = jnp.concatenate([densities, d_here, d_ahead], 2)
+    return drawn, densities
+
+
+def make_critic_slope(config: Config):
+    """slope(critic, x, asked, goal, densities) -> the gradient of L_Q, metrics."""
+
+    def critic_loss(critic, x, asked, goal, densities) -> tuple[Array, Metrics]:
+        q = critic(x, asked)  # (N, 2, B, 1 + S)
+        logged = q[..., 0]
+        others = q[..., 1:] - jnp.moveaxis(densities, 0, 1)[:, None]
+        error = ((logged - goal.T[:, None]) ** 2).mean(2).sum()
+        conservative = (jax.nn.logsumexp(others, -1) - logged).mean(2).sum()
+        loss = error + config.cql_weight * conservative
+        return loss, {"loss/critic": error, "loss/conservative": conservative, "value": logged.mean()}
+
+    return jax.grad(critic_loss, has_aux=True)
+
+
+def make_actor_slope(config: Config, spec: Spec):
+    """slope(actor, critic, t, searched) -> the gradient of L_π, metrics; `searched` (B, N, A) is â."""
+
+    def actor_loss(actor, critic: ac.Critics, t: ac.Transitions, searched: Array) -> tuple[Array, Metrics]:
+        logits = actor(t.x)
+        own = jnp.tanh(logits)
+        loss = config.action_penalty * (own**2).mean((0, 2)).sum()
+        # A saturated actor learns nothing any more, and at the study's rate some agent of most runs saturates.
+        effort = config.logit_penalty * (logits**2).mean((0, 2))
+        if config.coefficient > 0:
+            gap = ((own - searched) ** 2).mean((0, 2))
+            loss = loss + config.coefficient * (gap + effort).sum()
+        if config.coefficient < 1:
+            q = critic.first(spec.n_agents)(t.x, own)[:, 0]
+            size = jax.lax.stop_gradient(jnp.abs(q).mean(1))
+            loss = loss + (1.0 - config.coefficient) * (size * effort - q.mean(1)).sum()
+        return loss, {"loss/actor": loss, "imitation_gap": ((own - t.action) ** 2).mean()}
+
+    return jax.grad(actor_loss, has_aux=True)
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
     opt = optimiser(config)
     uniform_density = -spec.action_dim * jnp.log(2.0)
-
-    def noisy(key: Key, action: Array) -> tuple[Array, Array]:
-        """Samples (B, N, S, A) around the actors' actions, and their log densities (B, N, S)."""
-        shape = (*action.shape[:2], config.cql_samples, action.shape[-1])
-        noise = config.cql_noise * jax.random.normal(key, shape)
-        density = -0.5 * (noise / config.cql_noise) ** 2 - jnp.log(config.cql_noise) - 0.5 * jnp.log(2 * jnp.pi)
-        return jnp.clip(action[:, :, None] + noise, -1.0, 1.0), density.sum(-1)
+    critic_slope = make_critic_slope(config)
+    actor_slope = make_actor_slope(config, spec)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         ku, kp, kn, ks = jax.random.split(key, 4)
@@ -145,30 +201,14 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](
             t.ahead, ac.act(target["actor"], t.ahead)
         ).min(1)
-        b, n, a = t.action.shape
-        drawn = jax.random.uniform(ku, (b, 1, config.cql_samples, a), minval=-1.0, maxval=1.0)
-        drawn = jnp.broadcast_to(drawn, (b, n, config.cql_samples, a))
-        densities = jnp.full((b, n, config.cql_samples), uniform_density)
-        if config.cql_actions == "policy":
-            here, d_here = noisy(kp, ac.act(params["actor"], t.x))
-            ahead, d_ahead = noisy(kn, ac.act(params["actor"], t.ahead))
-            drawn = jnp.concatenate([drawn, here, ahead], 2)
-            densities = jnp.concatenate([densities, d_here, d_ahead], 2)
+        b, _, a = t.action.shape
+        drawn, densities = sampled(params["actor"], t, (ku, kp, kn), uniform_density, config)
         # The logged action rides along as one more sample: the critic is then read once.
         asked = jnp.concatenate([t.action[:, :, None], drawn], 2)
         pieces = ac.pieces_of(b)
 
-        def critic_loss(critic, x, asked, goal, densities) -> tuple[Array, Metrics]:
-            q = critic(x, asked)  # (N, 2, B, 1 + S)
-            logged = q[..., 0]
-            others = q[..., 1:] - jnp.moveaxis(densities, 0, 1)[:, None]
-            error = ((logged - goal.T[:, None]) ** 2).mean(2).sum()
-            conservative = (jax.nn.logsumexp(others, -1) - logged).mean(2).sum()
-            loss = error + config.cql_weight * conservative
-            return loss, {"loss/critic": error, "loss/conservative": conservative, "value": logged.mean()}
-
         def slope(*part: Array) -> tuple[PyTree, Metrics]:
-            return jax.grad(critic_loss, has_aux=True)(params["critic"], *part)
+            return critic_slope(params["critic"], *part)
 
         parts = ac.in_pieces(slope, pieces, t.x, asked, goal.T, densities)
         grads, metrics = jax.tree.map(lambda g: g.mean(0), parts)
@@ -185,23 +225,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
             searched = ac.in_pieces(search, pieces, t.x, own, noise).reshape(own.shape)
 
-        def actor_loss(actor) -> tuple[Array, Metrics]:
-            logits = actor(t.x)
-            own = jnp.tanh(logits)
-            loss = config.action_penalty * (own**2).mean((0, 2)).sum()
-            # A saturated actor learns nothing any more, and at the study's rate some agent of most runs saturates.
-            effort = config.logit_penalty * (logits**2).mean((0, 2))
-            if config.coefficient > 0:
-                gap = ((own - searched) ** 2).mean((0, 2))
-                loss = loss + config.coefficient * (gap + effort).sum()
-            if config.coefficient < 1:
-                q = critic.first(spec.n_agents)(t.x, own)[:, 0]
-                size = jax.lax.stop_gradient(jnp.abs(q).mean(1))
-                loss = loss + (1.0 - config.coefficient) * (size * effort - q.mean(1)).sum()
-            return loss, {"loss/actor": loss, "imitation_gap": ((own - t.action) ** 2).mean()}
-
-        slope, more = jax.grad(actor_loss, has_aux=True)(params["actor"])
-        actor, actor_moments, actor_norms = opt.update({"actor": slope}, state["opt"], {"actor": params["actor"]})
+        grads, more = actor_slope(params["actor"], critic, t, searched)
+        actor, actor_moments, actor_norms = opt.update({"actor": grads}, state["opt"], {"actor": params["actor"]})
         new = {**actor, **critics}
         state = {
             **state,

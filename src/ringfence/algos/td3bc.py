@@ -142,11 +142,52 @@ def threshold(config: Config, spec: Spec) -> float:
     return config.limit * (1 - g**t) / ((1 - g) * t)
 
 
+def smoothed(action: Array, key: Key, config: Config) -> Array:
+    """Target actions with TD3's bounded noise."""
+    if config.target_noise <= 0:
+        return action
+    bound = config.target_noise_clip
+    noise = jnp.clip(config.target_noise * jax.random.normal(key, action.shape), -bound, bound)
+    return jnp.clip(action + noise, -1.0, 1.0)
+
+
+def make_actor_slope(config: Config, spec: Spec, allowed: float):
+    """slope(actor, critics, t, batch, λ (N,)) -> the gradient of L_π, (metrics, by how much the cost passes
+    `allowed` (N,), as a share of it)."""
+
+    def actor_loss(
+        actor, critics: PyTree, t: ac.Transitions, batch: Batch, scale: Array
+    ) -> tuple[Array, tuple[Metrics, Array]]:
+        own = ac.act(actor, t.x)
+        x = t.x
+        if config.centralised_critic:
+            x = ac.joint(t.x)
+            acted = ac.joint_actions(t.action, own)
+        else:
+            acted = own
+        q = critics["critic"].first(spec.n_agents)(x, acted)[:, 0]  # (N, B)
+        size = lambda v: jax.lax.stop_gradient(jnp.abs(v).mean(1, keepdims=True))  # noqa: E731
+        merit = q / size(q)
+        excess = jnp.zeros(spec.n_agents)
+        if config.lagrange:
+            c = jax.nn.relu(critics["cost"](x, acted).max(1))  # (N, B)
+            merit = (merit - scale[:, None] * c / jnp.maximum(size(c), allowed)) / (1.0 + scale[:, None])
+            calm = batch.costs[:, 0] <= 0  # a first state was not arrived in, so nothing was charged there
+            excess = jnp.where(calm, c / allowed - 1.0, 0.0).sum(1) / jnp.maximum(calm.sum(), 1)
+        imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
+        penalty = (own**2).mean((0, 2)).sum()
+        loss = imitation - config.alpha * merit.mean(1).sum() + config.action_penalty * penalty
+        return loss, ({"loss/actor": loss, "loss/cloning": imitation, "value": q.mean()}, excess)
+
+    return jax.grad(actor_loss, has_aux=True)
+
+
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
     opt = optimiser(config)
     unit = cost_unit(config, spec)
     allowed = threshold(config, spec) / unit
+    actor_slope = make_actor_slope(config, spec, allowed)
 
     def critic_inputs(x: Array, action: Array) -> tuple[Array, Array]:
         return (ac.joint(x), ac.joint(action)) if config.centralised_critic else (x, action)
@@ -155,11 +196,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         t = ac.transitions(batch, state["frozen"]["normaliser"])
         params = state["params"]
         target = state["target"]
-        next_action = ac.act(target["actor"], t.ahead)
-        if config.target_noise > 0:
-            bound = config.target_noise_clip
-            noise = jnp.clip(config.target_noise * jax.random.normal(key, next_action.shape), -bound, bound)
-            next_action = jnp.clip(next_action + noise, -1.0, 1.0)
+        next_action = smoothed(ac.act(target["actor"], t.ahead), key, config)
         here = critic_inputs(t.x, t.action)
         there = critic_inputs(t.ahead, next_action)
         goal = t.reward.T + config.discount * t.bootstrap.T * target["critic"](*there).min(1)
@@ -177,30 +214,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         grads, metrics = jax.grad(critic_loss, has_aux=True)(critics)
         critics, moments, norms = opt.update(grads, state["opt"], critics)
         scale = state["multiplier"]
-
-        def actor_loss(actor) -> tuple[Array, tuple[Metrics, Array]]:
-            own = ac.act(actor, t.x)
-            x = t.x
-            if config.centralised_critic:
-                x = ac.joint(t.x)
-                acted = ac.joint_actions(t.action, own)
-            else:
-                acted = own
-            q = critics["critic"].first(spec.n_agents)(x, acted)[:, 0]  # (N, B)
-            size = lambda v: jax.lax.stop_gradient(jnp.abs(v).mean(1, keepdims=True))  # noqa: E731
-            merit = q / size(q)
-            excess = jnp.zeros(spec.n_agents)
-            if config.lagrange:
-                c = jax.nn.relu(critics["cost"](x, acted).max(1))  # (N, B)
-                merit = (merit - scale[:, None] * c / jnp.maximum(size(c), allowed)) / (1.0 + scale[:, None])
-                calm = batch.costs[:, 0] <= 0  # a first state was not arrived in, so nothing was charged there
-                excess = jnp.where(calm, c / allowed - 1.0, 0.0).sum(1) / jnp.maximum(calm.sum(), 1)
-            imitation = ((own - t.action) ** 2).mean((0, 2)).sum()
-            penalty = (own**2).mean((0, 2)).sum()
-            loss = imitation - config.alpha * merit.mean(1).sum() + config.action_penalty * penalty
-            return loss, ({"loss/actor": loss, "loss/cloning": imitation, "value": q.mean()}, excess)
-
-        slope, (more, excess) = jax.grad(actor_loss, has_aux=True)(params["actor"])
+        slope, (more, excess) = actor_slope(params["actor"], critics, t, batch, scale)
         actor, actor_moments, actor_norms = opt.update({"actor": slope}, state["opt"], {"actor": params["actor"]})
         new = {"actor": actor["actor"], **critics}
         moved = ac.soft_update(target, {k: new[k] for k in target}, config.target_rate)

@@ -70,14 +70,8 @@ def play(
     options = renamed(options, OLD_ARGUMENTS, "play")
     max_episode_steps = options.pop("max_episode_steps", max_episode_steps)
     num_envs = options.pop("num_envs", num_envs)
-    whole_number("episodes", episodes, 1)
-    whole_number("num_envs", num_envs, 1)
-    whole_number("seed", seed, 0, LAST_SEED)
-    known("early_ends", early_ends, EARLY_ENDS)
-    if max_episode_steps is not None:
-        whole_number("max_episode_steps", max_episode_steps, 1)
-    if split not in rollout.RESETS:
-        raise UserError(f"split='{split}' does not exist; use test or validation.")
+    _check_sizes(episodes, num_envs, seed, max_episode_steps)
+    _check_choices(early_ends, split)
     player = player_of(run, planner, split, options)
     if keep:
         _check_kept(player)
@@ -103,11 +97,29 @@ def play(
     summary = _summary(player, tables)
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
     if keep and isinstance(player, RunPlayer):
-        of_file = {"split": split, "protocol": protocol.PROTOCOL, "variant": player.variant}
-        of_file["simulator"] = name_of(make_env, envs[0])
-        player.run.add_result(player.variant, summary | about | of_file)
+        of_file = {"split": split, "simulator": name_of(make_env, envs[0])}
+        _add_to_run(player, summary | about | of_file)
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
+
+
+def _check_sizes(episodes: int, num_envs: int, seed: int, max_episode_steps: int | None) -> None:
+    whole_number("episodes", episodes, 1)
+    whole_number("num_envs", num_envs, 1)
+    whole_number("seed", seed, 0, LAST_SEED)
+    if max_episode_steps is not None:
+        whole_number("max_episode_steps", max_episode_steps, 1)
+
+
+def _check_choices(early_ends: str, split: str) -> None:
+    known("early_ends", early_ends, EARLY_ENDS)
+    if split not in rollout.RESETS:
+        raise UserError(f"split='{split}' does not exist; use test or validation.")
+
+
+def _add_to_run(player: RunPlayer, result: dict[str, Any]) -> None:
+    of_file = {"protocol": protocol.PROTOCOL, "variant": player.variant}
+    player.run.add_result(player.variant, result | of_file)
 
 
 class PlayInterrupted(UserError):

@@ -67,9 +67,7 @@ class PolicySpec:
         choices = _choices(barrier, execution, options)
         barrier = choices.get("barrier")
         execution = choices.get("execution")
-        if planner in stored.PLANNERS:
-            deprecated(f"planner '{planner}'", f"'{stored.PLANNERS[planner]}'")
-            planner = stored.PLANNERS[planner]
+        planner = _planner(planner)
         options = renamed(options, stored.GUARD_OPTIONS, "the guard")
         options = renamed(options, stored.PLANNER_OPTIONS, "the planner")
         guards = guard != "none" or any(f.name in options for f in dataclasses.fields(GuardOptions))
@@ -81,20 +79,16 @@ class PolicySpec:
         _known("execution", execution or "centralized", EXECUTIONS)
         if barrier is not None:
             _known("barrier", barrier, SOURCES)
-        guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
-        plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
-        for name in options:
-            if name not in guard_names + plan_names:
-                raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
+        of_plans, of_guard = _by_owner(options)
         if agents is not None:
             whole_number("agents", agents, 1, 100_000)
         spec = cls(
             run=None if run is None else Run.of(run),
             checkpoint=checkpoint,
             planner=planner,
-            plan_options=_options(PlanOptions, {k: v for k, v in options.items() if k not in guard_names}),
+            plan_options=_options(PlanOptions, of_plans),
             guard=guard,
-            guard_options=_options(GuardOptions, {k: v for k, v in options.items() if k in guard_names}),
+            guard_options=_options(GuardOptions, of_guard),
             barrier=barrier or "learned",
             execution=execution,
             world=world if world is None or isinstance(world, World) else Path(world),
@@ -102,10 +96,7 @@ class PolicySpec:
             anyway=anyway,
         )
         if not spec.guarded and not options.get("barrier_guidance"):
-            unread = {"barrier": barrier is not None, "world": world is not None}
-            for name, given in unread.items():
-                if given:
-                    raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
+            _refuse_unread(barrier=barrier, world=world)
         return spec
 
     @classmethod
@@ -155,6 +146,32 @@ def _choices(barrier: str | None, execution: str | None, options: dict[str, Any]
         renamed({name: value for name, value in given.items() if value is not None}, stored.GUARD, "the guard"),
         stored.VALUES,
     )
+
+
+def _planner(name: str) -> str:
+    """The planner's name of today."""
+    if name not in stored.PLANNERS:
+        return name
+    deprecated(f"planner '{name}'", f"'{stored.PLANNERS[name]}'")
+    return stored.PLANNERS[name]
+
+
+def _refuse_unread(**choices: Any) -> None:
+    """Of a guard, where there is none."""
+    for name, given in choices.items():
+        if given is not None:
+            raise UserError(f"{name} is read by nothing without a guard; name one with guard=, e.g. shield.")
+
+
+def _by_owner(options: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options of PlanOptions, and those of GuardOptions; others are refused."""
+    guard_names = [f.name for f in dataclasses.fields(GuardOptions)]
+    plan_names = [f.name for f in dataclasses.fields(PlanOptions)]
+    for name in options:
+        if name not in guard_names + plan_names:
+            raise unknown("option of planner or guard", name, {*guard_names, *plan_names})
+    of_plans = {name: value for name, value in options.items() if name not in guard_names}
+    return of_plans, {name: value for name, value in options.items() if name in guard_names}
 
 
 def _known(kind: str, name: Any, known: Any) -> None:

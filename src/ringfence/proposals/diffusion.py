@@ -151,21 +151,10 @@ def refine(
     remat: bool = False,
 ) -> Array:
     """Denoise x from levels[0] down the given decreasing diffusion steps and on to the clean plan."""
-    bar = np.concatenate([alpha_bar[levels], [1.0]])
-    signal = np.sqrt(bar)
-    noise = np.sqrt(1.0 - bar)
     if sampler not in SAMPLERS:
         raise unknown("sampler", sampler, SAMPLERS)
     eta = 1.0 if sampler == "ddpm" else eta
-    schedule = {
-        "k": jnp.asarray(levels, jnp.int32),
-        "signal": jnp.asarray(signal[:-1], jnp.float32),
-        "noise": jnp.asarray(noise[:-1], jnp.float32),
-        "next_signal": jnp.asarray(signal[1:], jnp.float32),
-        "next_noise": jnp.asarray(noise[1:], jnp.float32),
-        "key": jax.random.split(key, len(levels)),
-        "ratio": jnp.asarray(_multistep_ratio(bar), jnp.float32),
-    }
+    schedule = _schedule(levels, alpha_bar, key)
 
     def step(carry, s):
         x, previous = carry
@@ -192,6 +181,22 @@ def refine(
         step = jax.checkpoint(step)
     (x, _), _ = jax.lax.scan(step, (x, jnp.zeros_like(x)), schedule)
     return inpaint(x)
+
+
+def _schedule(levels: np.ndarray, alpha_bar: np.ndarray, key: Key) -> dict[str, Array]:
+    """What every step down the diffusion steps `levels` reads, the last one onto the clean plan."""
+    bar = np.concatenate([alpha_bar[levels], [1.0]])
+    signal = np.sqrt(bar)
+    noise = np.sqrt(1.0 - bar)
+    return {
+        "k": jnp.asarray(levels, jnp.int32),
+        "signal": jnp.asarray(signal[:-1], jnp.float32),
+        "noise": jnp.asarray(noise[:-1], jnp.float32),
+        "next_signal": jnp.asarray(signal[1:], jnp.float32),
+        "next_noise": jnp.asarray(noise[1:], jnp.float32),
+        "key": jax.random.split(key, len(levels)),
+        "ratio": jnp.asarray(_multistep_ratio(bar), jnp.float32),
+    }
 
 
 def _multistep_ratio(bar: np.ndarray) -> np.ndarray:

@@ -79,21 +79,14 @@ def train(
     vmap_seeds = older.pop("vmap_seeds", vmap_seeds)
     if older:
         raise unknown("argument of train()", next(iter(older)), inspect.signature(train).parameters)
-    if not isinstance(data, EpisodeStore):
-        raise UserError(
-            f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
-            "ringfence.datasets.make.make(ringfence.datasets.registry.get(NAME))[0]."
-        )
+    _check_store(data)
     seeds = _seeds(seeds)
-    for name, value in (("chunk", chunk), ("checkpoint_every", checkpoint_every)):
-        if value is not None and value < 1:
-            raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
+    _check_counts(chunk=chunk, checkpoint_every=checkpoint_every)
     if tensorboard:
         _summary_writer()
     require_resolved(data)
     task = registry.from_store(data)
     job = make_job(algorithm, task, preset, changes or {}, logs := task.logs(data), world)
-    lessons = _Lessons(job, logs, quiet)
     place = folder or (lambda seed: folder_of(out, job, seed))
     runs = [Run(place(seed)) for seed in seeds]
     fresh = [run for run in runs if not run.path.exists()]
@@ -103,20 +96,42 @@ def train(
     steps = job.config.num_updates
     for run in runs:
         run.drop_damaged()
-    left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [steps]]
     chunk = chunk or max(1, steps // 40)
-    options = _Options(chunk, checkpoint_every or max(chunk, steps // 4), tensorboard, quiet, on_chunk)
-    if vmap_seeds and left:
+    every = checkpoint_every or max(chunk, steps // 4)
+    options = _Options(chunk, every, tensorboard, quiet, on_chunk, on_finish, vmap_seeds)
+    _finish_all(job, _Lessons(job, logs, quiet), runs, seeds, fresh, options)
+    return runs
+
+
+def _finish_all(
+    job: Job, lessons: _Lessons, runs: list[Run], seeds: Sequence[int], fresh: list[Run], options: _Options
+) -> None:
+    """Train the runs that are not finished, together or one after the other."""
+    left = [run for run in runs if [step for step, _ in run.checkpoints()][-1:] != [job.config.num_updates]]
+    if options.vmap_seeds and left:
         with _undone(fresh):
             _loop(job, lessons, left, [seed for run, seed in zip(runs, seeds) if run in left], options)
     program = None
     for run, seed in zip(runs, seeds):
-        if run in left and not vmap_seeds:
+        if run in left and not options.vmap_seeds:
             with _undone(fresh):
                 program = _loop(job, lessons, [run], [seed], options, program)
-        if on_finish:
-            on_finish(run)
-    return runs
+        if options.on_finish:
+            options.on_finish(run)
+
+
+def _check_store(data: EpisodeStore) -> None:
+    if not isinstance(data, EpisodeStore):
+        raise UserError(
+            f"train() got data of type {type(data).__name__}; pass an EpisodeStore, e.g. "
+            "ringfence.datasets.make.make(ringfence.datasets.registry.get(NAME))[0]."
+        )
+
+
+def _check_counts(**counts: int | None) -> None:
+    for name, value in counts.items():
+        if value is not None and value < 1:
+            raise UserError(f"{name}={value} must be at least 1; it is a number of updates.")
 
 
 @contextmanager
@@ -187,6 +202,8 @@ class _Options:
     tensorboard: bool
     quiet: bool
     on_chunk: Callable[[int, dict], None] | None
+    on_finish: Callable[[Run], None] | None
+    vmap_seeds: bool
 
 
 class Program(NamedTuple):

@@ -132,15 +132,7 @@ def _fitted(
     world = blank_world(map, spec, settings)
     acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
-    searches = {name: _Search(logged.by(name), parts.seed) for name in labels}
-    fitted = {name: _label_of(search, moved, acts, parts, quiet) for name, search in searches.items()}
-    found_by = {name: found for name, (found, _) in fitted.items()}
-    each = [
-        _with_future(fitted[name][1], search, moved, found_by[name], parts, quiet) for name, search in searches.items()
-    ]
-    barrier = None
-    if each:
-        barrier = cbf.MinBarrier(tuple(each), tuple(labels)) if logged.several else each[0]
+    barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts, quiet)
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
     found = validate.validate(world, logged, settings.miscoverage, settings.loss)
@@ -267,6 +259,21 @@ def _bounds(store: EpisodeStore) -> list[str]:
 
 def _digest(array: np.ndarray) -> str:
     return hashlib.blake2b(array.tobytes(), digest_size=8).hexdigest()
+
+
+def _barrier(
+    logged: Logged, names: tuple[str, ...], moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool
+) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
+    """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
+    searches = {name: _Search(logged.by(name), parts.seed) for name in names}
+    labels = {name: _label_of(search, moved, acts, parts, quiet) for name, search in searches.items()}
+    causes = {name: found for name, (found, _) in labels.items()}
+    each = [
+        _with_future(labels[name][1], search, moved, causes[name], parts, quiet) for name, search in searches.items()
+    ]
+    if not each:
+        return None, causes
+    return cbf.MinBarrier(tuple(each), names) if logged.several else each[0], causes
 
 
 def _label_of(

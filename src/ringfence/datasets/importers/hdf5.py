@@ -210,44 +210,22 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
     layout = "DSRL" if "costs" in f else "D4RL"
     found = {name: arrays.array(path, f, name) for name in DSRL if name in f}
     rows = len(found["actions"])
-    for name, array in found.items():
-        if len(array) != rows:
-            raise StoreError(f"'{path}' has {len(array)} rows of '{name}' and {rows} of 'actions'; copy it again.")
-        if name in ("rewards", "costs", "terminals", "timeouts"):
-            common.vector(path, name, array.shape)
-    seen, acted = (common.entries(path, name, found[name].shape) for name in ("observations", "actions"))
     following = found.get("next_observations")
-    if following is not None and following.shape != found["observations"].shape:
-        raise StoreError(
-            f"'{path}' has next_observations {following.shape} and observations {found['observations'].shape}; they "
-            "must be of one shape."
-        )
-    common.continuous(path, "actions", found["actions"])
+    seen, acted = _flat_widths(path, found)
     if asked.agents is not None:
         columns.check(path, asked.agents, seen, acted)
     bounds = common.bounds_of(None, asked, acted)
     arrays.affordable(path, sum(array.nbytes for array in found.values()), common.PACKED)
 
     terminals, timeouts = (common.flags(path, name, found[name], rows) for name in ("terminals", "timeouts"))
-    ends = np.flatnonzero(terminals | timeouts) + 1
-    if not len(ends):
-        raise StoreError(
-            f"'{path}' marks no end of an episode in its {rows} rows; set terminals or timeouts at their last steps."
-        )
+    ends = _ends(path, terminals | timeouts)
     kept = int(ends[-1])
     notes = common.flattened(found["observations"].shape, found["actions"].shape)
     if kept < rows:
         notes.append(f"the last {rows - kept} rows are an unfinished episode and were dropped")
     if both := int((terminals & timeouts).sum()):
         notes.append(f"{both} steps are marked as terminals and as timeouts, too, and count as terminals")
-    others = sorted(set(f) - set(DSRL) - {"infos", "metadata"})
-    if others:
-        notes.append(f"not read: {', '.join(others[:10])}" + f" and {len(others) - 10} more" * (len(others) > 10))
-    infos = f["infos"] if isinstance(f.get("infos", getlink=True), h5py.HardLink) else None
-    if layout == "D4RL" and isinstance(infos, h5py.Group) and "cost" in infos:
-        notes.append(
-            "infos/cost is not read, since D4RL does not say which state it belongs to; as 'costs' it would be"
-        )
+    notes += _unread(f, layout)
 
     observations = common.numbers(path, "observations", found["observations"], kept)
     actions = common.numbers(path, "actions", found["actions"], kept)
@@ -275,6 +253,50 @@ def _flat(path: Path, f: h5py.File, asked: common.Asked) -> common.Logs:
         ends = np.cumsum(lengths[long] - 1)
         terminated = np.zeros(len(ends), bool)
     return common.Logs(layout, observations, actions, rewards, costs, ends, terminated, bounds, notes, path.stem)
+
+
+def _ends(path: Path, last: np.ndarray) -> np.ndarray:
+    """(E,) where episodes end, of rows (T,) that are marked as their last."""
+    ends = np.flatnonzero(last) + 1
+    if not len(ends):
+        raise StoreError(
+            f"'{path}' marks no end of an episode in its {len(last)} rows; set terminals or timeouts at their last "
+            "steps."
+        )
+    return ends
+
+
+def _flat_widths(path: Path, found: dict[str, h5py.Dataset]) -> tuple[int, int]:
+    """Entries of an observation and of an action, of arrays that fit each other."""
+    rows = len(found["actions"])
+    for name, array in found.items():
+        if len(array) != rows:
+            raise StoreError(f"'{path}' has {len(array)} rows of '{name}' and {rows} of 'actions'; copy it again.")
+        if name in ("rewards", "costs", "terminals", "timeouts"):
+            common.vector(path, name, array.shape)
+    seen, acted = (common.entries(path, name, found[name].shape) for name in ("observations", "actions"))
+    following = found.get("next_observations")
+    if following is not None and following.shape != found["observations"].shape:
+        raise StoreError(
+            f"'{path}' has next_observations {following.shape} and observations {found['observations'].shape}; they "
+            "must be of one shape."
+        )
+    common.continuous(path, "actions", found["actions"])
+    return seen, acted
+
+
+def _unread(f: h5py.File, layout: str) -> list[str]:
+    """What is said of what the file holds beside."""
+    notes = []
+    others = sorted(set(f) - set(DSRL) - {"infos", "metadata"})
+    if others:
+        notes.append(f"not read: {', '.join(others[:10])}" + f" and {len(others) - 10} more" * (len(others) > 10))
+    infos = f["infos"] if isinstance(f.get("infos", getlink=True), h5py.HardLink) else None
+    if layout == "D4RL" and isinstance(infos, h5py.Group) and "cost" in infos:
+        notes.append(
+            "infos/cost is not read, since D4RL does not say which state it belongs to; as 'costs' it would be"
+        )
+    return notes
 
 
 def _given_up(lengths: np.ndarray, terminated: np.ndarray) -> str:

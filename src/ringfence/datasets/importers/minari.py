@@ -50,28 +50,15 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
     space = _action_space(path, metadata, asked)
     found = {name: _shapes(path, f, name) for name in episodes}
     first = found[episodes[0]]
-    for name, shapes in found.items():
-        if replace(shapes, steps=0, size=0) != replace(first, steps=0, size=0):
-            kinds = ("observations", "actions", "cost")
-            kind = next(k for k in kinds if getattr(shapes, k) != getattr(first, k))
-            raise StoreError(
-                f"'{path}' has '{name}' with other {'infos/cost' if kind == 'cost' else kind} than '{episodes[0]}'; "
-                "all episodes must hold the same arrays."
-            )
-    seen, acted = (sum(math.prod(s) for s in x.values()) for x in (first.observations, first.actions))
-    if not seen or not acted:
-        raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
+    _check_alike(path, found, episodes[0])
+    seen, acted = _widths(path, first)
     if asked.agents is not None:
         columns.check(path, asked.agents, seen, acted)
     bounds = common.bounds_of(space, asked, acted)
     arrays.affordable(path, sum(shapes.size for shapes in found.values()), common.PACKED)
 
-    if empty := [name for name, shapes in found.items() if not shapes.steps]:
-        notes.append(f"{len(empty)} episodes without a step were dropped")
-        found = {name: shapes for name, shapes in found.items() if shapes.steps}
+    found = _with_steps(path, found, notes)
     ends = np.cumsum([shapes.steps for shapes in found.values()], dtype=np.int64)
-    if not len(ends):
-        raise StoreError(f"'{path}' holds no episode with a step; record some.")
     steps = int(ends[-1])
     observations = np.empty((steps + len(ends), seen), np.float32)
     actions, rewards, costs = (np.empty(s, np.float32) for s in ((steps, acted), (steps,), (steps,)))
@@ -88,15 +75,7 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
         if first.cost:
             cost = arrays.array(path, _group(path, here, "infos"), "cost")
             costs[now] = common.numbers(path, f"{name}/infos/cost", cost)[-shapes.steps :, 0]
-    if both := int((terminated & truncated).sum()):
-        notes.append(f"{both} episodes are marked as terminated and as truncated, too, and count as terminated")
-    if neither := int((~terminated & ~truncated).sum()):
-        notes.append(f"{neither} episodes end without a mark and count as truncated")
-    names = [
-        f"{key.partition('/')[2]}" + f".{j}" * (math.prod(shape) > 1)
-        for key, shape in first.observations.items()
-        for j in range(math.prod(shape))
-    ]
+    notes += _odd_ends(terminated, truncated)
     flat = tuple(first.observations) == ("observations",)
     if flat:
         notes += common.flattened((0, *first.observations["observations"]), (0,))
@@ -111,9 +90,59 @@ def read(path: Path, f: h5py.File, episodes: list[str], asked: common.Asked) -> 
         bounds,
         notes,
         metadata["dataset_id"] if isinstance(metadata.get("dataset_id"), str) else path.stem,
-        None if flat else names,
+        None if flat else _names(first.observations),
         _simulator(metadata),
     )
+
+
+def _check_alike(path: Path, found: dict[str, Shapes], of: str) -> None:
+    """Refuse episodes that hold other arrays than the first one, `of`."""
+    first = found[of]
+    for name, shapes in found.items():
+        if replace(shapes, steps=0, size=0) != replace(first, steps=0, size=0):
+            kinds = ("observations", "actions", "cost")
+            kind = next(k for k in kinds if getattr(shapes, k) != getattr(first, k))
+            raise StoreError(
+                f"'{path}' has '{name}' with other {'infos/cost' if kind == 'cost' else kind} than '{of}'; "
+                "all episodes must hold the same arrays."
+            )
+
+
+def _widths(path: Path, shapes: Shapes) -> tuple[int, int]:
+    """Entries of an observation and of an action."""
+    seen, acted = (sum(math.prod(s) for s in x.values()) for x in (shapes.observations, shapes.actions))
+    if not seen or not acted:
+        raise StoreError(f"'{path}' has {seen} observation and {acted} action entries; both must be 1 or more.")
+    return seen, acted
+
+
+def _with_steps(path: Path, found: dict[str, Shapes], notes: list[str]) -> dict[str, Shapes]:
+    """The episodes that have steps; that others were dropped is noted."""
+    if empty := [name for name, shapes in found.items() if not shapes.steps]:
+        notes.append(f"{len(empty)} episodes without a step were dropped")
+        found = {name: shapes for name, shapes in found.items() if shapes.steps}
+    if not found:
+        raise StoreError(f"'{path}' holds no episode with a step; record some.")
+    return found
+
+
+def _odd_ends(terminated: np.ndarray, truncated: np.ndarray) -> list[str]:
+    """What is said of episodes (E,) with two marks at their end, or none."""
+    notes = []
+    if both := int((terminated & truncated).sum()):
+        notes.append(f"{both} episodes are marked as terminated and as truncated, too, and count as terminated")
+    if neither := int((~terminated & ~truncated).sum()):
+        notes.append(f"{neither} episodes end without a mark and count as truncated")
+    return notes
+
+
+def _names(observations: dict[str, tuple[int, ...]]) -> list[str]:
+    """Names of the entries of arrays with rows of those shapes."""
+    return [
+        f"{key.partition('/')[2]}" + f".{j}" * (math.prod(shape) > 1)
+        for key, shape in observations.items()
+        for j in range(math.prod(shape))
+    ]
 
 
 def _shapes(path: Path, f: h5py.File, name: str) -> Shapes:

@@ -237,28 +237,14 @@ def _store(log: StateLog | ObservationLog, data_set: DataSet, provenance: str, n
     else:
         arrays = {"observations": log.observations} | arrays
     _check_finite(log.where, arrays)
-    if not log.last.any():
-        raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
-    ends = np.flatnonzero(log.last) + 1
-    total = int(ends[-1])
-    lengths = np.diff(ends, prepend=0)
-    if total < len(log.actions):
-        notes.append(f"the last {len(log.actions) - total} steps are an unfinished episode and were dropped")
-    if (lengths > env.episode_length).any():
-        raise StoreError(
-            f"{log.where} has an episode of {lengths.max()} steps, {env.name} ends after {env.episode_length}; "
-            "its ends are marked wrongly."
-        )
-    beyond = float((np.abs(log.actions[:total]) > 1 + 1e-3).mean())
-    if beyond:
-        notes.append(f"{100 * beyond:.2g} % of action entries are beyond ±1 and were clipped, as the robot does")
+    ends = _ends(log, env, notes)
     if isinstance(log, StateLog):
         steps = _from_states(log, env, ends, notes)
         task = data_set.name
     else:
         steps = _from_observations(log, env, ends, notes)
         task = f"{data_set.name}-observations"
-    short = int((lengths < env.episode_length).sum() - steps.terminated.sum())
+    short = int((np.diff(ends, prepend=0) < env.episode_length).sum() - steps.terminated.sum())
     if env.ant and short:
         notes.append(f"{short} episodes are shorter than {env.episode_length} steps without a fall that is known of")
     return EpisodeStore.from_steps(
@@ -285,6 +271,26 @@ def _store(log: StateLog | ObservationLog, data_set: DataSet, provenance: str, n
             **env.describe(steps.speed, ROBOT_COST_LIMIT),
         },
     )
+
+
+def _ends(log: StateLog | ObservationLog, env: SafeMuJoCo, notes: list[str]) -> np.ndarray:
+    """(E,) where the log's whole episodes end; what is odd about them is noted."""
+    if not log.last.any():
+        raise StoreError(f"{log.where} marks no end of an episode; cut it into episodes first.")
+    ends = np.flatnonzero(log.last) + 1
+    total = int(ends[-1])
+    lengths = np.diff(ends, prepend=0)
+    if total < len(log.actions):
+        notes.append(f"the last {len(log.actions) - total} steps are an unfinished episode and were dropped")
+    if (lengths > env.episode_length).any():
+        raise StoreError(
+            f"{log.where} has an episode of {lengths.max()} steps, {env.name} ends after {env.episode_length}; "
+            "its ends are marked wrongly."
+        )
+    beyond = float((np.abs(log.actions[:total]) > 1 + 1e-3).mean())
+    if beyond:
+        notes.append(f"{100 * beyond:.2g} % of action entries are beyond ±1 and were clipped, as the robot does")
+    return ends
 
 
 def _check_finite(where: str, arrays: dict[str, np.ndarray | None]) -> None:
