@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringfence.world.causes import Cause, told_of
+from ringfence.world.causes import Cause, narrowed
 from ringfence.world.cells import CELLS, Cells
 
 UNSAFE_STEPS = 30_000  # that causes are looked for in, at most
@@ -45,7 +45,7 @@ class Steps:
     def picked(self, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
         """((T, P) cells of the agents and things that a cause is about, (P,) whose they are); those of a cause of all
         are remembered."""
-        cell = self.cells(told_of(cause, ()))[-1]
+        cell = self.cells(narrowed(cause, ()))[-1]
         agents, things = np.nonzero(cause.holds(cell.shape[1]))
         return cell[:, agents, things], agents
 
@@ -126,7 +126,7 @@ def counted(steps: Steps, cause: Cause, explained: Explained) -> Counted:
     """The cause, by what others leave unexplained."""
     from scipy.ndimage import binary_dilation  # slow to import, and read by fits alone
 
-    low, high, bins, _ = steps.cells(told_of(cause, ()))
+    low, high, bins, _ = steps.cells(narrowed(cause, ()))
     cell, agents = steps.picked(cause)
     size = bins**cause.width
     left = explained.left(steps.unsafe)

@@ -19,7 +19,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
-from ringfence.world.causes import Cause, Edge, Found, candidates, only_of, told_of, wider
+from ringfence.world.causes import Cause, Edge, Found, candidates, narrowed, only_of, wider
 from ringfence.world.cells import CELLS, Cells
 
 VERSION = 10  # of the search: what was found by another is looked for again
@@ -127,7 +127,7 @@ def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Exp
         who = best.cause.who
         if other.who[0] in who:
             continue
-        more = counted(steps, told_of(best.cause, (*who, *other.who)), explained)
+        more = counted(steps, narrowed(best.cause, (*who, *other.who)), explained)
         if more.gain > (1 + SIMPLER) * best.gain:
             best = more
     return best

@@ -82,10 +82,10 @@ def only_of(cause: Cause, n_agents: int) -> Iterator[Cause]:
     """The cause as one that holds for a single agent, and a single thing of it."""
     for agent in range(n_agents):
         for thing in range(len(cause.things)):
-            yield told_of(cause, ((agent, thing),))
+            yield narrowed(cause, ((agent, thing),))
 
 
-def told_of(cause: Cause, who: tuple[tuple[int, int], ...]) -> Cause:
+def narrowed(cause: Cause, who: tuple[tuple[int, int], ...]) -> Cause:
     """The cause as one of these agents and things alone; as one of all where none is given."""
     base = cause.name.split(" of agent ")[0]
     if not who:
