@@ -359,7 +359,7 @@ CLAIMS = (
         contact("crossing", ("behaviour data", "reference"), 0.205, 0.215),
     ),
     Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
-    Claim("README.md", "Learned danger does what the formula does", "guards, guards-mujoco", same_safety),
+    Claim("README.md", "learned danger does what the formula does", "guards, guards-mujoco", same_safety),
     Claim(
         "README.md",
         "Climbing learned values from cloned actions earns as much as from its plans",
