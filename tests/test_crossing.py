@@ -157,7 +157,8 @@ def test_certificates_keep_apart_who_would_touch():
     first = env.reset(jax.random.key(5), 20)
 
     def contacts(name: str) -> float:
-        driver = jnp.broadcast_to(jnp.array(astuple(recipe.DRIVERS[name])), (20, 8, 5))
+        habits = jnp.array(astuple(recipe.DRIVERS[name]))
+        driver = jnp.broadcast_to(habits, (20, 8, len(habits)))
 
         def step(state, key):
             after, out = env.step(state, recipe.drive(env, state, driver, key))

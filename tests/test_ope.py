@@ -213,12 +213,12 @@ def renamed_agents(names, **card) -> EpisodeStore:
 
 def test_an_estimate_that_diverges_is_not_told():
     """A cost of −2971 was printed."""
-    from ringfence.evaluation.ope.fqe import _told
+    from ringfence.evaluation.ope.fqe import _bounded
 
     always = np.array([0.0, 20.0])
-    assert not _told(np.full(5, -2971.0), always).known and not _told(np.array([np.nan, 1.0]), always).known
-    assert _told(np.linspace(1, 5, 5), always).known
-    assert "not known" in str(_told(np.full(5, -2971.0), always))
+    assert not _bounded(np.full(5, -2971.0), always).known and not _bounded(np.array([np.nan, 1.0]), always).known
+    assert _bounded(np.linspace(1, 5, 5), always).known
+    assert "not known" in str(_bounded(np.full(5, -2971.0), always))
 
 
 def test_actions_are_compared_in_one_unit(uneven):
