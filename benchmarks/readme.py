@@ -43,7 +43,7 @@ ROWS = (
     ("madiff", "default", "MADIFF (no barrier)"),
     ("icbf", "paper", "ICBF-Diffuser `paper`"),
     ("icbf", "split", "ICBF-Diffuser `split`"),
-    ("icbf", "split+plans8", "`split`, best of 8 plans"),
+    ("icbf", "split+num_samples8", "`split`, best of 8 plans"),
     ("madiff", "default+guarded", "MADIFF, guarded planner"),
     ("icbf", "split+guarded", "**`split`, guarded planner**"),
     ("icbf", "long", "`long`: `split` for 6000 updates"),
