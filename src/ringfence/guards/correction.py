@@ -117,28 +117,29 @@ class Corrector:
 
         def again(carry: tuple[Array, Array]) -> tuple[Array, Array]:
             found, round = carry
-            start = self._start(present, asked, found, starts[round], margin)
+            missing = self.missing(present, found[:, None], margin)[:, 0]
+            start = self._start(present, asked, found, missing, starts[round], margin)
             other = self._by_slope(present, asked, start, margin)
-            before = self.shortfall(present, found, margin)
+            before = team_sum(missing, (1,), self.alone)
             better = (before < -TOLERANCE) & (self.shortfall(present, other, margin) > before)
             return jnp.where(better[:, None, :, None], other, found), round + 1
 
         return jax.lax.while_loop(goes_on, again, (found, jnp.asarray(0)))[0]
 
-    def _start(self, present: Array, asked: Array, found: Array, starts: Array, margin: Array) -> Array:
+    def _start(self, present: Array, asked: Array, found: Array, missing: Array, starts: Array, margin: Array) -> Array:
         """(B, K, N, A) the one of starts (S, K, N, A) that misses least, and among equals the one whose first action is
-        nearest to what was asked. Agents who miss nothing keep what was found for them."""
+        nearest to what was asked. Agents of whose plans found nothing is `missing` (B, K, N) keep these."""
         low, high = self.within(asked)
         starts = jnp.clip(starts, low[:, None], high[:, None])
-        unmet = self.missing(present, found[:, None], margin)[:, 0].sum(1) < -TOLERANCE
+        unmet = missing.sum(1) < -TOLERANCE
         starts = jnp.where(unmet[:, None, None, :, None], starts, found[:, None])
 
         def of_team(x: Array, axes: tuple[int, ...]) -> Array:  # (B, S, 1), or (B, S, N) of agents who are alone
             return jax.vmap(lambda x: team_sum(x, axes, self.alone), 1, 1)(x)
 
-        missing = of_team(self.missing(present, starts, margin), (1,))
+        short = of_team(self.missing(present, starts, margin), (1,))
         far = of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
-        fine = missing >= missing.max(1, keepdims=True) - TOLERANCE
+        fine = short >= short.max(1, keepdims=True) - TOLERANCE
         index = jnp.where(fine, -far, -jnp.inf).argmax(1)
         return jnp.take_along_axis(starts, index[:, None, None, :, None], 1)[:, 0]
 

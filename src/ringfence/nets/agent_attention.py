@@ -10,9 +10,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ringfence.nets.embedding import Condition
+from ringfence.nets.flat import entries, flattened, restored
 from ringfence.types import Array, Key
 
 HEADS = 4
@@ -45,7 +45,7 @@ class AgentAttention(eqx.Module):
         """`agents`: their number if they are to be distinguished, as limbs of one body are; 0: they are homogeneous.
         `drivers`: how many it may be told to plan as."""
         keys = jax.random.split(key, depth + 3)
-        self.carried = tuple(range(rows * features)) if carried is None else carried
+        self.carried = entries(rows, features, carried)
         flat = len(self.carried)
         self.condition = Condition(keys[0], width, drivers)
         self.inlet = _normal(keys[1], flat, width)
@@ -56,18 +56,16 @@ class AgentAttention(eqx.Module):
     def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
         those it may be told -> (B, H, N, D)."""
-        b, h, n, d = x.shape
+        b, _, n, _ = x.shape
         c = self.condition(k, y, keep, driver)
-        carried = np.array(self.carried)
-        token = jnp.moveaxis(x, 1, 2).reshape(b * n, h * d)[:, carried] @ self.inlet
+        token = flattened(x, self.carried) @ self.inlet
         if self.which is not None:
             token = token + jnp.tile(self.which, (b, 1))
         for p in self.blocks:
             token = token + _attend(_norm(token), p, n)
             condition = jnp.repeat(c @ p["tell"] + p["bias"], n, axis=0)
             token = token + jax.nn.silu(_norm(token) @ p["up"] + condition) @ p["down"]
-        out = jnp.zeros((b * n, h * d)).at[:, carried].set(_norm(token) @ self.outlet)
-        return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
+        return restored(_norm(token) @ self.outlet, x.shape, self.carried)
 
 
 def _attend(z: Array, p: dict[str, Array], n: int) -> Array:

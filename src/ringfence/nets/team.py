@@ -9,9 +9,9 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from ringfence.nets.embedding import Condition
+from ringfence.nets.flat import entries, flattened, restored
 from ringfence.nets.residual import ResidualMLP
 from ringfence.types import Array, Key
 
@@ -38,7 +38,7 @@ class TeamDenoiser(eqx.Module):
     ):
         """For teams of `agents`; `drivers`: how many it may be told to plan as."""
         k1, k2 = jax.random.split(key)
-        self.carried = tuple(range(rows * features)) if carried is None else carried
+        self.carried = entries(rows, features, carried)
         flat = agents * len(self.carried)
         self.condition = Condition(k1, CONDITION, drivers)
         self.net = ResidualMLP(k2, flat + CONDITION, flat, width, depth, 0.1)
@@ -46,13 +46,10 @@ class TeamDenoiser(eqx.Module):
     def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
         those it may be told -> (B, H, N, D)."""
-        b, h, n, d = x.shape
-        carried = np.array(self.carried)
-        windows = jnp.moveaxis(x, 1, 2).reshape(b, n, h * d)
-        seen = windows[..., carried].reshape(b, -1)
+        b, _, n, _ = x.shape
+        seen = flattened(x, self.carried).reshape(b, -1)
         clean = self.net(jnp.concatenate([seen, self.condition(k, y, keep, driver)], -1))
-        out = jnp.zeros_like(windows).at[..., carried].set(clean.reshape(b, n, -1))
-        return jnp.moveaxis(out.reshape(b, n, h, d), 2, 1)
+        return restored(clean.reshape(b * n, -1), x.shape, self.carried)
 
 
 def planning_as(denoiser, driver: Array | None):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,6 +19,17 @@ def driver_scores(net: Any, seen: Array, score: Array, keep: Array) -> Array:
 def asked(seen: Array, score: Array, keep: Array) -> Array:
     """(B, 2): y and whether it is told."""
     return jnp.stack([jnp.where(keep, score, 0.0), keep.astype(seen.dtype)], -1)
+
+
+def classifier_free(answer: Callable[[Array, Array], Array], score: Array, scale: float) -> Array:
+    """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y (B,), whether it is told (B,));
+    ω = 1 asks once."""
+    everyone = jnp.ones(score.shape, bool)
+    conditional = answer(score, everyone)
+    if scale == 1.0:
+        return conditional
+    free = answer(score, ~everyone)
+    return free + scale * (conditional - free)
 
 
 def drawn(logits: Array, normal: Array) -> Array:

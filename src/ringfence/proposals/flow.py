@@ -23,7 +23,7 @@ from ringfence.problem.constraints import lowest
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import from_unit, in_bounds_of, rolled
-from ringfence.proposals.drivers import asked, drawn, driver_scores
+from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_scores
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
@@ -153,16 +153,11 @@ class FlowPolicy(eqx.Module):
         return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
-        """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y, whether it is told)."""
-        o = self.options
-        score, everyone = jnp.full(batch, o.target_return), jnp.ones(batch, bool)
+        """What answers to (y, whether it is told), guided by the return that is asked for, if training knew any."""
+        score = jnp.full(batch, self.options.target_return)
         if not self.conditioned:
-            return answer(score, ~everyone)
-        asked = answer(score, everyone)
-        if o.cfg_scale == 1.0:
-            return asked
-        free = answer(score, ~everyone)
-        return free + o.cfg_scale * (asked - free)
+            return answer(score, jnp.zeros(batch, bool))
+        return classifier_free(answer, score, self.options.cfg_scale)
 
     def _with_driver(self, carry: PyTree, x: Array, key: Key) -> tuple[PyTree, Key]:
         """What is carried, with the driver that this episode's first features x (B, N, D) draw, and a key."""

@@ -11,6 +11,7 @@ What becomes of several plans, and of what they would do, is a guard's (guard/).
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -25,7 +26,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
-from ringfence.proposals.drivers import drawn, driver_scores
+from ringfence.proposals.drivers import classifier_free, drawn, driver_scores
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
@@ -152,13 +153,10 @@ class Planner(HadStart, eqx.Module):
 
     def _drawn(self, present: Array, key: Key) -> Array:
         """(B,) who drives at states (B, N, D), drawn, for the return that is asked for."""
-        o, batch = self.options, present.shape[0]
+        batch = present.shape[0]
         seen = self.normaliser.state(present).reshape(batch, -1)
-        score, everyone = jnp.full(batch, o.target_return), jnp.ones(batch, bool)
-        logits = driver_scores(self.networks["prior"], seen, score, everyone)
-        if o.cfg_scale != 1.0:
-            free = driver_scores(self.networks["prior"], seen, score, ~everyone)
-            logits = free + o.cfg_scale * (logits - free)
+        answer = partial(driver_scores, self.networks["prior"], seen)
+        logits = classifier_free(answer, jnp.full(batch, self.options.target_return), self.options.cfg_scale)
         return drawn(logits, jax.random.normal(key, logits.shape))
 
     def plans(self, past: Array, present: Array, key: Key, count: int, driver: Array | None = None) -> Array:

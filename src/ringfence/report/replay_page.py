@@ -41,7 +41,8 @@ def _drawn(film: Film, radius: float, number: int) -> str:
         for other in np.moveaxis(film.others, 1, 0):
             there = ((other > low) & (other < high)).all(-1)
             shown = np.where(there[:, None], other, np.nan)
-            ax.plot(*shown.T, color=INK, linewidth=0.8, alpha=0.35, marker=".", markersize=3)
+            # Dots and no line: where others are listed by distance, a place in the list may change its owner.
+            ax.plot(*shown.T, color=INK, linestyle="none", alpha=0.45, marker=".", markersize=4)
         lines = {
             "as logged": (film.logged, (0, (1, 2))),
             "without guard": (film.alone, (0, (4, 2))),

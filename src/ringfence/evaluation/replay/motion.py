@@ -32,7 +32,7 @@ class Kinematics:
     low: np.ndarray  # (A,) bounds of actions
     high: np.ndarray
     max_speed: float  # m/s: the fastest of the logs
-    late: float = 0.5  # share of a step that is gone with the next velocity
+    late: float  # share of a step that is gone with the next velocity
     gain: float = 1.0
     drag: float = 0.0
     explained: float = float("nan")  # share of the logged changes of velocity

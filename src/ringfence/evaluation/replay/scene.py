@@ -85,7 +85,7 @@ class Motion:
     velocity: np.ndarray | None  # (M, N, 2) m/s; None: by differences
     offset: np.ndarray  # (M, N, K, 2) m to others, NOBODY where nobody is seen
     seen: np.ndarray  # (M, N, K) bool
-    late: float = 1.0  # share of a step that a body goes with its next velocity; the rest with this one
+    late: float  # share of a step that a body goes with its next velocity; the rest with this one
 
 
 def motion_of(store: EpisodeStore, names: Names) -> Motion:
