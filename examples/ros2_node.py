@@ -4,13 +4,19 @@
 
 Needs rclpy, onnxruntime and NumPy. Everything is read in one frame, and an action is taken for a velocity (m/s) in it:
 change `command` where yours is something else. Nothing is sent before every robot was heard and has a goal.
+
+What was done is kept in evidence.log and published on /evidence, a record a step, each with a digest of the one before:
+`ringfence log verify evidence.log` tells whether it is what was written.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
@@ -49,6 +55,23 @@ class Pilot:
         return out["action"]
 
 
+class Evidence:
+    """Records that show whether they were changed (docs/stress.md): a line of "DIGEST JSON" each."""
+
+    def __init__(self, file: str, policy: str):
+        self.file, self.last, self.n = open(file, "xb", buffering=0), "ringfence log 1", 0  # never over an older one
+        digest = hashlib.blake2b(Path(policy).read_bytes(), digest_size=8).hexdigest()
+        self.add({"kind": "begin", "t": time.time(), "policy": digest})
+
+    def add(self, record: dict) -> str:
+        """The line that was written."""
+        body = json.dumps({"n": self.n, **record}, separators=(",", ":"))
+        self.last = hashlib.blake2b(f"{self.last} {body}".encode(), digest_size=16).hexdigest()
+        self.file.write(f"{self.last} {body}\n".encode())
+        self.n += 1
+        return f"{self.last} {body}"
+
+
 def observed(names: list[str], place: np.ndarray, speed: np.ndarray, goal: np.ndarray) -> np.ndarray:
     """(N, O) what every robot sees, by the logs' names (own.vx, goal.dx, other0.dy, other1.dvx); arrays are (N, 2)."""
     n, rows = len(place), []
@@ -72,6 +95,7 @@ def main(file: str, robots: list[str]) -> None:
     from geometry_msgs.msg import PointStamped, Twist
     from nav_msgs.msg import Odometry
     from rclpy.node import Node
+    from std_msgs.msg import String
 
     class Team(Node):
         def __init__(self):
@@ -82,6 +106,8 @@ def main(file: str, robots: list[str]) -> None:
             for i, name in enumerate(robots):
                 self.create_subscription(Odometry, f"/{name}/odom", lambda m, i=i: self.heard(m, i), 1)
                 self.create_subscription(PointStamped, f"/{name}/goal", lambda m, i=i: self.sent(m, i), 1)
+            self.evidence = Evidence("evidence.log", file)
+            self.recorder = self.create_publisher(String, "/evidence", 10)
             self.create_timer(PERIOD, self.step)
 
         def heard(self, m: Odometry, i: int) -> None:
@@ -94,7 +120,12 @@ def main(file: str, robots: list[str]) -> None:
         def step(self) -> None:
             if np.isfinite([self.place, self.speed, self.goal]).all():
                 seen = observed(self.pilot.told["names"]["observations"], self.place, self.speed, self.goal)
-                for sender, action in zip(self.senders, self.pilot.act(seen)):
+                begun, actions = time.perf_counter(), self.pilot.act(seen)
+                ms = 1e3 * (time.perf_counter() - begun)
+                known = {"observed": seen.tolist(), "executed": actions.tolist(), "info": self.pilot.info}
+                record = self.evidence.add({"kind": "step", "t": time.time(), "ms": ms} | known)
+                self.recorder.publish(String(data=record))
+                for sender, action in zip(self.senders, actions):
                     sender.publish(self.command(action))
 
         def command(self, action: np.ndarray) -> Twist:

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
+from ringfence.cli import log as log_commands
 from ringfence.cli.console import Refusals, complain
 from ringfence.cli.doctor import doctor
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
@@ -613,6 +614,13 @@ def main(arguments: list[str] | None = None) -> None:
                 description="Episode stores: make, import, inspect.",
                 args=arguments[1:],
             )
+        elif arguments[:1] == ["log"]:
+            tyro.extras.subcommand_cli_from_dict(
+                log_commands.COMMANDS,
+                prog="ringfence log",
+                description="Look into a log that Controller(log=) wrote.",
+                args=arguments[1:],
+            )
         elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in bench_commands.COMMANDS:
             tyro.extras.subcommand_cli_from_dict(
                 bench_commands.COMMANDS,
@@ -622,7 +630,7 @@ def main(arguments: list[str] | None = None) -> None:
             )
         else:
             tyro.extras.subcommand_cli_from_dict(
-                COMMANDS | {"data": lambda: main(["data", "--help"])},
+                COMMANDS | {"data": lambda: main(["data", "--help"]), "log": lambda: main(["log", "--help"])},
                 prog="ringfence",
                 description="Safe offline multi-agent reinforcement learning.",
                 args=arguments,

@@ -13,6 +13,7 @@ from ringfence.world import World
 from ringfence.world.barrier import Barrier, MinBarrier
 
 BARRIERS = ("learned", "analytic", "both")
+AHEAD = "what will be dangerous after the last row"
 __getattr__ = renamed.names_of(__name__)
 
 
@@ -71,6 +72,34 @@ class BarrierSource(eqx.Module):
         if self.source == "analytic":
             return self._analytic(present)
         return self._with_analytic(self._barrier.apart(before, present), present)
+
+    def parts(self, rows: Array) -> Array:
+        """(..., K, N, M) what the scores of predicted rows (..., K+1, N, D) are the least of, without what is taken off
+        out of distribution."""
+        after = rows[..., 1:, :, :]
+        found: list[Array] = []
+        if self.source != "analytic":
+            found.append(self._barrier.parts(rows[..., :-1, :, :], after))
+        if self.terminal_value:
+            ahead = self._barrier.ahead_apart(after).min(-1)
+            last = jnp.arange(after.shape[-3])[:, None] == after.shape[-3] - 1
+            found.append(jnp.where(last, ahead, jnp.inf)[..., None])
+        if self.source != "learned":
+            found.append(self._analytic(after))
+        return jnp.concatenate(found, -1)
+
+    @property
+    def part_names(self) -> tuple[tuple[str, str], ...]:
+        """(what is dangerous, of which thing) of each of `parts`."""
+        found: list[tuple[str, str]] = []
+        if self.source != "analytic":
+            found += self._barrier.part_names
+        if self.terminal_value:
+            found.append((AHEAD, ""))
+        if self.source != "learned":
+            assert self.hazard is not None, "checked when it was made"
+            found.append((f"{type(self.hazard.hazard).__name__} by formula", ""))
+        return tuple(found)
 
     @property
     def limits(self) -> dict[str, float]:

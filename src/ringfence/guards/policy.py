@@ -17,6 +17,7 @@ from ringfence.errors import NoSafeAction, UserError, unknown
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
+from ringfence.guards.reasons import reasons
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
 from ringfence.proposals.base import held, in_bounds_of
@@ -47,6 +48,7 @@ class Guarded(HadStart, eqx.Module):
 
     proposal: Any
     guard: Guard
+    explains: bool = eqx.field(static=True, default=False)  # say of every step what was requested, and what was amiss
 
     def initial_state(self, batch: int) -> PyTree:
         options = self.guard.options
@@ -135,6 +137,8 @@ class Guarded(HadStart, eqx.Module):
         }
         spec = guard.world.spec
         action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
+        if self.explains:
+            info |= reasons(guard, acting, actions[:, 0])
         if "sent" in carry:
             carry = {**carry, "sent": jnp.concatenate([carry["sent"][:, 1:], found.plan[:, :1]], 1)}
         unknown_costs = {name: jnp.full_like(carry[name], jnp.nan) for name in ("cost", "costs") if name in carry}

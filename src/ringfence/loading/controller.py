@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -15,6 +17,7 @@ from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
 from ringfence.guards.wrap import Callback, under_guard
+from ringfence.loading.evidence import Evidence, explaining, guarded_of
 from ringfence.loading.resolve import load
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, agent_policy, team_policy
@@ -51,6 +54,10 @@ class Controller:
     certificate: a file of `ringfence certify`, which must be of this run, World, guard and team. The margin is taken
     from it. `info["covered"]` then says whether the guard kept its condition where its World knows its way: of other
     steps the certificate counts how they end, and says no more.
+
+    log: a file, to which a record of every step is added before its action is returned: what was requested and what
+    is executed, why, how old the observations were, whether it was covered (docs/stress.md). Each record holds a digest
+    of the one before; `evidence.last` is that of the last one. `close()` ends the log.
     """
 
     def __init__(
@@ -59,6 +66,7 @@ class Controller:
         planner: str = DEFAULT,
         seed: int = 0,
         certificate: str | Path | None = None,
+        log: str | Path | None = None,
         **options: Any,
     ):
         keep_programs()
@@ -73,6 +81,10 @@ class Controller:
         self.certificate = promised
         if promised is not None:
             _require(promised, self._source)
+        self.evidence: Evidence | None = None
+        if log is not None:
+            self._source.policy = self.policy = explaining(self.policy)
+            self.evidence = Evidence(log, self.policy, self._source.agents, promised)
         self.info: dict[str, np.ndarray] = Info()
         self.last_action: np.ndarray | None = None
         self.reset()
@@ -88,6 +100,13 @@ class Controller:
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._carry = self.policy.initial_state(1)
+        if self.evidence is not None:
+            self.evidence.reset()
+
+    def close(self) -> None:
+        """End the log, if there is one."""
+        if self.evidence is not None:
+            self.evidence.close()
 
     def act(
         self,
@@ -104,7 +123,8 @@ class Controller:
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
         source = self._source
-        with no_safe_action(self.last_action):
+        begun = time.perf_counter()
+        with no_safe_action(self.last_action), self._recorded():
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
             before = self._carry if age is None else self._aged(age)
@@ -113,8 +133,20 @@ class Controller:
             action, info = acted(step, source.name)
             if self.certificate is not None:
                 info["covered"] = ~(info["infeasible"] | info["ood"])
+        if self.evidence is not None:
+            self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
         return action
+
+    @contextmanager
+    def _recorded(self) -> Iterator[None]:
+        """A refusal is recorded, too."""
+        try:
+            yield
+        except UserError as error:
+            if self.evidence is not None:
+                self.evidence.refused(str(error))
+            raise
 
     @in_float32
     def _aged(self, age: Any) -> PyTree:
@@ -123,8 +155,8 @@ class Controller:
         steps = np.asarray(age)
         if steps.dtype.kind not in "iu" or steps.shape not in ((), (agents,)) or steps.min() < 0:
             raise UserError(f"age={str(age)[:60]} must be a whole number of steps, 0 or more, or one of each agent.")
-        guarded = self.policy.guarded if isinstance(self.policy, Callback) else agent_policy(self.policy)
-        if not isinstance(guarded, Guarded) or not guarded.guard.options.max_age:
+        guarded = guarded_of(self.policy)
+        if guarded is None or not guarded.guard.options.max_age:
             raise UserError(
                 "age is read by nothing here; give a guard with max_age=, up to which it makes good for it."
             )

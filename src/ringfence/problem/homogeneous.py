@@ -70,7 +70,8 @@ def merge_agents(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     for name in ("clearance", "next_clearance"):
         if name in step.info:
             info[name] = step.info[name].reshape(shape).min(1)
-    info |= {name: value.reshape(shape) for name, value in step.info.items() if name.startswith("agent_")}
+    of_agents = {name: value for name, value in step.info.items() if name.startswith("agent_")}
+    info |= {name: value.reshape(*shape, *value.shape[2:]) for name, value in of_agents.items()}
     return PolicyStep(step.action.reshape(*shape, -1), info)
 
 

@@ -32,7 +32,7 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import least, lowest
 from ringfence.problem.features import FeatureMap, numbered
 from ringfence.types import Array, Key
-from ringfence.world.cause_nets import Score, blank, worst
+from ringfence.world.cause_nets import Score, blank, scores, worst
 from ringfence.world.causes import Found
 
 Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
@@ -78,6 +78,32 @@ class Barrier(eqx.Module):
         value = soft(_score(self.future, _still(self.shape), (x - self.mean) / self.scale, x.shape[:-1]))
         return jnp.minimum(value, soft(worst(self.causes, x))) if self.causes else value
 
+    def parts(self, before: Array, after: Array) -> Array:
+        """(..., N, M) the scores that ℓ is the least of, in units of the margin; `part_names` says of what."""
+        if self.causes:
+            each = jnp.concatenate([scores(net, after) for net in self.causes], -1)
+        else:
+            z = self.standardised(before, after)
+            each = jnp.stack(_scores(self.label, self.shape, z, after.shape[:-1]), -1)
+        return soft(each) / self.unit
+
+    @property
+    def part_names(self) -> tuple[tuple[str, str], ...]:
+        """(what is dangerous, of which thing) of each of `parts`; "" where it is about the agent itself."""
+        found: list[tuple[str, str]] = []
+        for net in self.causes:
+            cause = net.cause
+            kind = re.sub(r"^length of ", "", cause.name).split(".")[0]
+            several = len(cause.things) > 1
+            found += [(cause.name, f"{kind}{j}" if several else "") for j in range(len(cause.things))]
+        if self.causes:
+            return tuple(found)
+        if "own" in self.label:
+            found.append(("own entries", ""))
+        for kind, entries in self.shape.pairs:
+            found += [(f"entries of {kind}", f"{kind}{j}") for j in range(len(entries))]
+        return tuple(found)
+
     def apart(self, before: Array, after: Array) -> Array:
         """ℓ (..., N, 1) in units of the margin, with an axis of constraints."""
         return (self.of_steps(before, after) / self.unit)[..., None]
@@ -113,6 +139,16 @@ class MinBarrier(eqx.Module):
 
     def ahead(self, x: Array) -> Array:
         return lowest(self.ahead_apart(x))
+
+    def parts(self, before: Array, after: Array) -> Array:
+        """(..., N, M) of all constraints' barriers."""
+        return jnp.concatenate([b.parts(before, after) for b in self.each], -1)
+
+    @property
+    def part_names(self) -> tuple[tuple[str, str], ...]:
+        """The same as a barrier's, each with the constraint's name in the logs."""
+        named = zip(self.names, self.each)
+        return tuple((f"{name}: {what}", thing) for name, b in named for what, thing in b.part_names)
 
     def apart(self, before: Array, after: Array) -> Array:
         """ℓ (..., N, C) of each constraint."""
@@ -223,6 +259,11 @@ def _still(shape: Shape) -> Shape:
 
 def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
     """Scores (..., N) of standardised entries (..., N, D or 2D); `agents` is that shape."""
+    return least(_scores(nets, shape, z, agents))
+
+
+def _scores(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> list[Array]:
+    """What `_score` is the least of: own entries, and each thing."""
     half = z.shape[-1] // (2 if shape.use_transition else 1)
     if shape.joint:
         z = z[..., :1, :]
@@ -239,7 +280,7 @@ def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]
         each = nets[kind](pair.reshape(*z.shape[:-2], -1, pair.shape[-1]))[..., 0]
         each = each.reshape(*z.shape[:-1], len(entries))
         parts += [each[..., j] for j in range(len(entries))]
-    return least(parts)
+    return parts
 
 
 def _with_distance(pair: Array, place: tuple[int, ...], speed: tuple[int, ...]) -> Array:

@@ -1,0 +1,162 @@
+"""What a controller did and why, step by step, in a log that shows whether it was changed (`utils/chained.py`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ringfence
+from ringfence.faults.certificate import Certificate, digest
+from ringfence.guards.policy import Guarded
+from ringfence.guards.wrap import Callback
+from ringfence.problem.homogeneous import PerAgent, agent_policy
+from ringfence.utils.chained import ChainedLog
+
+FEW = 1e-6  # an executed action that differs by less from the requested one is that
+
+
+class Evidence:
+    """Records of one controller: `begin` says of which policy, World, guard and certificate; then `reset` where an
+    episode begins, `step`, and `refused` where nothing was done; `end` when it is closed."""
+
+    def __init__(self, path: str | Path, policy: Any, agents: int, certificate: Certificate | None):
+        guarded = guarded_of(policy)
+        self._parts = () if guarded is None else guarded.guard.barrier.part_names
+        self._log = ChainedLog(path)
+        self._log.add(_begun(policy, guarded, agents, certificate))
+
+    @property
+    def last(self) -> str:
+        """Digest of the last record; keep it elsewhere, and `ringfence log verify --last` tells a log that was cut."""
+        return self._log.last
+
+    def reset(self) -> None:
+        """An episode begins."""
+        self._log.add({"kind": "reset", "t": _now()})
+
+    def step(
+        self,
+        seen: tuple[np.ndarray, np.ndarray | None],
+        age: Any,
+        action: np.ndarray,
+        info: Mapping[str, np.ndarray],
+        ms: float,
+    ) -> None:
+        """An action (N, A) that is about to be executed, and what is known of it."""
+        record: dict[str, Any] = {
+            "kind": "step",
+            "t": _now(),
+            "ms": round(ms, 3),
+            "observed": _digest_of(*seen),
+            "age": None if age is None else np.asarray(age).tolist(),
+            "executed": _numbers(action),
+        }
+        if "agent_requested" in info:
+            record["corrected"] = self._corrected(action, info)
+        if "agent_clearance" in info:
+            record["clearance"] = _numbers(info["agent_clearance"])
+            record["infeasible"] = np.flatnonzero(info["agent_infeasible"]).tolist()
+            record["ood"] = np.flatnonzero(info["agent_ood"]).tolist()
+        for name in ("covered", "proved"):
+            if name in info:
+                record[name] = bool(np.all(info[name]))
+        self._log.add(record)
+
+    def refused(self, why: str) -> None:
+        """Nothing was done."""
+        self._log.add({"kind": "refused", "t": _now(), "why": why})
+
+    def close(self) -> None:
+        """End the log; what stopped without it was killed."""
+        self._log.add({"kind": "end", "t": _now()})
+        self._log.close()
+
+    def _corrected(self, action: np.ndarray, info: Mapping[str, np.ndarray]) -> list[dict[str, Any]]:
+        """Of each agent whose action is another than it requested: that one, and the worst along its plan."""
+        requested = info["agent_requested"]
+        found = []
+        for agent in np.flatnonzero((np.abs(requested - action) > FEW).any(-1)).tolist():
+            constraint, thing = self._parts[int(info["agent_reason"][agent])]
+            found.append(
+                {
+                    "agent": agent,
+                    "requested": _numbers(requested[agent]),
+                    "constraint": constraint,
+                    "thing": thing,
+                    "row": int(info["agent_reason_row"][agent]),
+                    "score": _numbers(info["agent_reason_score"][agent]),
+                }
+            )
+        return found
+
+
+def guarded_of(policy: Any) -> Guarded | None:
+    """The guard of a policy, a team's or of each agent."""
+    one = policy.guarded if isinstance(policy, Callback) else agent_policy(policy)
+    return one if isinstance(one, Guarded) else None
+
+
+def explaining(policy: Any) -> Any:
+    """The policy, whose guard says what was requested and what was amiss with it."""
+    guarded = guarded_of(policy)
+    if guarded is None:
+        return policy
+    guarded = dataclasses.replace(guarded, explains=True)
+    if isinstance(policy, Callback):
+        return Callback(policy.function, guarded, policy.agents)
+    return PerAgent(guarded, policy.agents) if isinstance(policy, PerAgent) else guarded
+
+
+def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certificate | None) -> dict[str, Any]:
+    proposal = agent_policy(policy) if guarded is None else guarded.proposal
+    found: dict[str, Any] = {
+        "kind": "begin",
+        "t": _now(),
+        "ringfence": ringfence.__version__,
+        "agents": agents,
+        "policy": None if isinstance(policy, Callback) else digest(proposal),
+        "world": None,
+        "guard": None,
+        "certificate": None if certificate is None else _digest_of_certificate(certificate),
+    }
+    if guarded is not None:
+        guard = guarded.guard
+        found |= {
+            "world": digest(guard.world),
+            "barrier": guard.barrier.source,
+            "guard": dataclasses.asdict(guard.options),
+        }
+    return found
+
+
+def _digest_of_certificate(certificate: Certificate) -> str:
+    content = json.dumps(dataclasses.asdict(certificate), sort_keys=True)
+    return hashlib.blake2b(content.encode(), digest_size=8).hexdigest()
+
+
+def _digest_of(*arrays: np.ndarray | None) -> str:
+    found = hashlib.blake2b(digest_size=8)
+    for array in arrays:
+        if array is not None:
+            found.update(np.ascontiguousarray(array, np.float32).data)
+    return found.hexdigest()
+
+
+def _numbers(x: np.ndarray) -> Any:
+    """Single-precision numbers as the shortest decimals that give them back; what is no number is None."""
+    array = np.asarray(x, np.float32)
+    if array.ndim:
+        return [_numbers(one) for one in array]
+    return float(str(array)) if np.isfinite(array) else None
+
+
+def _now() -> float:
+    """s since 1970, to the microsecond."""
+    return round(time.time(), 6)
