@@ -34,6 +34,8 @@ class Data(Part, frozen=True):
     observation_width: int | None = None  # entries of what an agent sees
     state_width: int | None = None  # of the global state
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
+    observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
+    state_origins: list[float] | None = None
 
 
 class HeldOut(Part, frozen=True):
