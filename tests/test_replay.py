@@ -15,6 +15,7 @@ from ringfence.evaluation.replay.judge import Played, check_view, radius_of, row
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
+from ringfence.faults import Faults
 from ringfence.logs.store import EpisodeStore
 from ringfence.world import save
 from ringfence.world.card import Verdict
@@ -204,3 +205,15 @@ def test_a_run_is_replayed_under_every_filter(close, tmp_path):
     assert names == [(policy, filter) for policy in ("bc", "seek") for filter in filters]
     for row in result.rows:
         assert row.contacts == row.alone - row.prevented + row.caused
+
+
+def test_the_driven_agent_has_faults_and_the_others_none():
+    """Three late steps: it goes on as it began for three, and then does what it did at first without them."""
+    stage = stage_of(walkers())
+    plain = stage.play("seek").place
+    late = dataclasses.replace(stage, faults=Faults(delay=3)).play("seek").place
+    steps = np.diff(late[:, :5], axis=1)
+    np.testing.assert_allclose(steps[:, 1:3], steps[:, :2], atol=1e-6)
+    assert np.abs(np.diff(plain[:, :3], 2, axis=1)).max() > 1e-3
+    gained = [np.linalg.norm(np.diff(place, axis=1), axis=-1) for place in (late[:, 3:5], plain[:, :2])]
+    np.testing.assert_allclose(*gained, atol=1e-5)

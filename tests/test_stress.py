@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -15,19 +16,24 @@ from ringfence.cli.app import main
 from ringfence.deploy import zoo
 from ringfence.envs import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
+from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import UserError
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
+from ringfence.evaluation.stress import compensated, own_acceleration
 from ringfence.faults import Faults, Faulty, under_faults
 from ringfence.faults.certificate import Certificate
 from ringfence.faults.monitor import Monitor
 from ringfence.guards.policy import build
+from ringfence.guards.wrap import Nothing
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.types import PolicyStep
+
+LIGHT = {"correction_steps": 1, "correction_restarts": 0, "horizon": 1, "terminal_value": False}  # compiles soon
 
 
 class Counts(eqx.Module):
@@ -104,11 +110,14 @@ def test_noise_gain_and_turns():
         ({"gain": 0.0}, "gain=0.0 of the faults must be positive"),
         ({"asynchrony": float("inf")}, "asynchrony=inf"),
         ({"delay": 1.5}, "must be a whole number"),
+        ({"spread": 1.0}, "an action could have no effect"),
+        ({"jitter": -1}, "jitter=-1"),
+        ({"stop": 1.0}, "lie in [0, 1)"),
         ({"latency": 1}, "Unknown config field of the faults 'latency'"),
     ],
 )
 def test_what_is_no_fault_is_refused(given, words):
-    with pytest.raises(UserError, match=words.replace("(", r"\(")):
+    with pytest.raises(UserError, match=re.escape(words)):
         Faults.of(given)
 
 
@@ -203,6 +212,104 @@ def test_what_proposes_is_shown_that_state_and_what_was_sent_is_remembered(run):
     assert usual.observe_sent({}, other) == usual.observe_age({}, jnp.zeros((8, 1))) == {}
 
 
+def test_actions_of_varying_lateness_are_done_as_they_arrive():
+    """Each within its bounds, none after a newer one, and none before it was sent."""
+    done, _, _, sent = walk({"delay": 1, "jitter": 3}, 60)
+    number = np.rint(done / 0.01).astype(int)  # of the step that what is done was sent in, from 1; 0: nothing
+    late = np.arange(60)[:, None] + 1 - number
+    assert (np.diff(number, axis=0) >= 0).all() and (late[number > 0] >= 1).all()
+    assert late[8:].max() <= 4 and set(late[8:].ravel()) >= {1, 2, 3, 4} and (late[:, 0] != late[:, 1]).any()
+
+
+def test_what_is_drawn_for_an_episode_stays():
+    """An entry is off by as much throughout, flags are not; agents differ in gain; who has stopped does nothing."""
+    _, seen, _, _ = walk({"bias": 0.1}, 20)
+    off = seen - np.arange(20)[:, None, None]
+    np.testing.assert_allclose(off, np.broadcast_to(off[:1], off.shape), atol=1e-5)
+    flags = np.array([name.endswith(".seen") for name in task().simulator.observation_names])
+    assert 0.05 < off[0][:, ~flags].std() < 0.15 and not off[..., flags].any()
+    done, _, _, sent = walk({"spread": 0.5})
+    gain = done / sent
+    np.testing.assert_allclose(gain, np.broadcast_to(gain[:1], gain.shape), rtol=1e-4)
+    assert gain[0, 0] != gain[0, 1] and (np.abs(gain - 1) <= 0.5).all()
+    done, _, _, sent = walk({"stop": 0.05}, 60)
+    stopped = done == 0
+    assert stopped[-1].any() and (np.diff(stopped.astype(int), axis=0) >= 0).all()
+    np.testing.assert_allclose(done[~stopped], sent[~stopped])
+
+
+def test_simulators_of_anybody_have_the_same_faults(run):
+    """Two late steps: nothing is done in the first two, and a result behind faults is not kept among others."""
+
+    class Recorded(CrossingParallel):
+        def step(self, actions):
+            acted.append(np.stack(list(actions.values())))
+            return super().step(actions)
+
+    played = {}
+    for name, faults in (("plain", None), ("late", {"delay": 2})):
+        acted = []
+        played[name] = ringfence.play(run, Recorded, episodes=1, num_envs=1, faults=faults), np.stack(acted)
+    plain, late = played["plain"][1], played["late"][1]
+    np.testing.assert_array_equal(late[:2], 0.0)
+    np.testing.assert_allclose(late[2], plain[0], atol=1e-5)
+    assert played["late"][0]["faults"]["delay"] == 2 and "faults" not in played["plain"][0]
+    with pytest.raises(UserError, match="no result has faults"):
+        ringfence.play(run, Recorded, episodes=1, faults={"delay": 2}, keep=True)
+
+
+# --- guards that know ---
+
+
+def test_an_action_that_is_held_is_planned_as_held(run):
+    policy = load(run, guard="shield", hold=2, **{**LIGHT, "horizon": 3})[1].one
+    env = Crossing()
+    present = env.observe(env.reset(jax.random.key(0), 1))[0][:, None]
+    plans = jax.random.uniform(jax.random.key(1), (8, 1, 3, 1, 2), minval=-1.0, maxval=1.0)
+    margin = jnp.full((8, 1, 1), 3.0)
+    plan = policy.guard.decide(present, plans, plans[:, 0], margin, jax.random.key(2)).plan
+    np.testing.assert_array_equal(plan[:, 0], plan[:, 1])
+    assert np.abs(plan[:, 2] - plan[:, 1]).max() > 1e-3
+
+
+def test_others_who_were_not_seen_are_taken_to_be_nearer(run):
+    """By ½ a (τ² + 2 k τ) in the direction of each; whoever was seen now is where it is."""
+    policy = load(run, guard="shield", max_age=4, others_acceleration=2.0, **LIGHT)[1].one
+    guard = policy.guard
+    names = guard.world.map.names
+    env = Crossing()
+    present = env.observe(env.reset(jax.random.key(0), 1))[0][:, None]
+    rows, _ = guard.predict(present, jnp.zeros((8, 1, 3, 1, 2)))
+    age = jnp.array([[0], [1], [2], [3], [4], [4], [4], [4]])
+    near = guard.nearer(rows, age)
+    dx, dy = (np.array([names.index(f"other{j}.{d}") for j in range(6)]) for d in ("dx", "dy"))
+    before, after = (np.hypot(x[..., dx], x[..., dy])[:, 0, :, 0] for x in (rows, near))
+    k = np.arange(4)[:, None]
+    tau = np.asarray(age)[:, :, None]
+    np.testing.assert_allclose(before - after, np.broadcast_to(0.01 * (tau**2 + 2 * k * tau), before.shape), atol=1e-4)
+    np.testing.assert_array_equal(guard.nearer(rows, age * 0), rows)
+    rest = [d for d in range(len(names)) if d not in {*dx, *dy}]
+    np.testing.assert_array_equal(near[..., rest], rows[..., rest])
+    assert (after > 0).all()
+    assert own_acceleration(guard.world) == pytest.approx(1.0, abs=0.1)  # a disc's, by what was learned
+    with pytest.raises(UserError, match="others_acceleration needs a World"):
+        build(
+            Nothing(),
+            dataclasses.replace(guard.world, map=dataclasses.replace(guard.world.map, dt=None)),
+            None,
+            "shield",
+            "learned",
+            others_acceleration=1.0,
+        )
+
+
+def test_a_guard_is_told_of_all_that_it_can_be_told(run):
+    told = compensated(run, Faults(delay=1, jitter=2, drop=0.3, asynchrony=0.667), {"guard": "shield"})
+    assert (told["delay"], told["max_age"], told["hold"]) == (2, 6, 3)
+    assert told["others_acceleration"] == pytest.approx(1.0, abs=0.1)
+    assert compensated(run, Faults(noise=0.1, gain=0.5), {"guard": "shield"}) == {"guard": "shield"}
+
+
 def test_more_lateness_than_the_world_can_foresee_is_refused(run):
     with pytest.raises(UserError, match="delay=6 and max_age=3 ask the World for 9 steps .* known for 8"):
         load(run, guard="shield", delay=6, max_age=3)
@@ -230,8 +337,6 @@ def test_compensating_and_saying_so_oneself_are_one_too_many(run):
 
 
 # --- certificates ---
-
-LIGHT = {"correction_steps": 1, "horizon": 1, "terminal_value": False}  # a guard that compiles soon
 
 
 @pytest.fixture

@@ -18,6 +18,7 @@ from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
 from ringfence.cli.console import Refusals, complain
 from ringfence.cli.doctor import doctor
+from ringfence.cli.faults import NO_FAULTS, Wrong
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import Interrupted, UserError, whole_number
@@ -236,9 +237,11 @@ def play(
     split: Literal["test", "validation"] = "test",
     num_envs: int = 16,
     early_ends: Literal["refuse", "cut", "skip"] = "refuse",
+    wrong: Wrong = NO_FAULTS,
     playing: How = AS_IT_IS,
 ) -> None:
-    """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports.
+    """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports, but
+    behind faults.
 
     Args:
         runs: run folders, or folders that hold some.
@@ -252,6 +255,7 @@ def play(
     from ringfence.evaluation.simulators import simulator
 
     given = playing.arguments()
+    faults = wrong.faults()
     found = _some_runs(runs)
     make = simulator(env)
     given |= {
@@ -259,7 +263,8 @@ def play(
         "split": split,
         "num_envs": num_envs,
         "early_ends": early_ends,
-        "keep": True,
+        "faults": faults,
+        "keep": not faults.given,
         "quiet": False,
     }
     table = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
@@ -299,11 +304,7 @@ def stress(
     episodes: int = 100,
     split: Literal["test", "validation"] = "test",
     checkpoint: int | None = None,
-    delay: int = 0,
-    drop: float = 0.0,
-    noise: float = 0.0,
-    gain: float = 1.0,
-    asynchrony: Annotated[float, tyro.conf.arg(name="async")] = 0.0,
+    wrong: Wrong = NO_FAULTS,
     compensate: bool = False,
     playing: How = AS_IT_IS,
 ) -> None:
@@ -314,17 +315,12 @@ def stress(
         episodes: a bound of 1 % takes 300 without an accident.
         split: test resets, or validation resets for choosing settings.
         checkpoint: step of the one that is played; the last one by default.
-        delay: steps after which an action takes effect.
-        drop: probability that an agent's observation of a step is lost; what it got last is held.
-        noise: standard deviation of what is observed, in the entries' own units.
-        gain: what becomes of an action, which is clipped to its bounds.
-        asynchrony: share of steps that an agent lets pass, each in its own rhythm.
-        compensate: tell the guard of delay and drop, which it then makes good for.
+        compensate: tell the guard of late actions, old observations and actions that are held, which it then makes
+            good for.
     """
     from ringfence.evaluation.stress import stress as run_stress
-    from ringfence.faults import Faults
 
-    faults = Faults.of({"delay": delay, "drop": drop, "noise": noise, "gain": gain, "asynchrony": asynchrony})
+    faults = wrong.faults()
     given = playing.arguments()
     found = _some_runs(runs)
     given |= {
@@ -350,11 +346,7 @@ def stress(
 def certify(
     run: Positional[Path],
     out_file: Annotated[Path, tyro.conf.arg(name="out")],
-    delay: int = 0,
-    drop: float = 0.0,
-    noise: float = 0.0,
-    gain: float = 1.0,
-    asynchrony: Annotated[float, tyro.conf.arg(name="async")] = 0.0,
+    wrong: Wrong = NO_FAULTS,
     confidence: float = 0.95,
     quantile: float = 0.95,
     calibration: int = 100,
@@ -362,25 +354,19 @@ def certify(
     playing: How = AS_IT_IS,
 ) -> None:
     """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
-    it. The guard is told of delay and drop. docs/stress.md says what is promised.
+    it. The guard is told of late actions, old observations and held actions. docs/stress.md says what is promised.
 
     Args:
         run: a run folder.
         out_file: the certificate, JSON.
-        delay: steps after which an action takes effect.
-        drop: probability that an agent's observation of a step is lost; what it got last is held.
-        noise: standard deviation of what is observed, in the entries' own units.
-        gain: what becomes of an action, which is clipped to its bounds.
-        asynchrony: share of steps that an agent lets pass, each in its own rhythm.
         confidence: of the bound.
         quantile: of episodes, whose shortfall the margin is to cover.
         calibration: episodes of each batch that the margin is calibrated on.
         episodes: fresh ones, for the bound.
     """
     from ringfence.evaluation.certify import certify as run_certify
-    from ringfence.faults import Faults
 
-    faults = Faults.of({"delay": delay, "drop": drop, "noise": noise, "gain": gain, "asynchrony": asynchrony})
+    faults = wrong.faults()
     given = playing.arguments()
     if given.get("guard", "none") == "none":
         given |= {"guard": "shield"}
@@ -502,6 +488,7 @@ def replay(
     seed: int = 0,
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
+    wrong: Wrong = NO_FAULTS,
     playing: How = Playing(guard="shield"),  # noqa: B008
 ) -> None:
     """Judge a policy and its guard by logs alone: one agent is driven, the others do what they did. Contacts without
@@ -525,7 +512,7 @@ def replay(
     from ringfence.report.replay_page import build_replay
     from ringfence.training.runs import write_json
 
-    given = playing.arguments()
+    given = playing.arguments() | {"faults": wrong.faults()}
     out_file = None if out_file is None else writable(out_file)
     report = None if report is None else writable(report)
     policy = None if run.is_file() else _runs([run])[0]

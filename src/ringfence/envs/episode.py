@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.problem.origins import NOWHERE, Origins
 from ringfence.utils.given import NUMBERS, given_as
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
@@ -36,7 +35,6 @@ class Shape:
     observation: int | None = None
     state: int | None = 0  # entries of the global state, 0: it is not asked for
     homogeneous: bool = False  # any number of agents could play
-    origins: Origins = NOWHERE  # of what is shown, which is taken from it
 
 
 def check(env: Any, *names: str) -> None:
@@ -233,12 +231,10 @@ class Episode:
     def _observe(self, observations: ByAgent) -> None:
         self._check_all_in("observations", observations, len(self.rewards))
         rows = [observations[a] for a in self.agents]
-        origins = self.shape.origins
-        shape = (len(self.agents), self.shape.observation)
-        self.seen = given_as("observations", rows, shape, origins=origins.observations)
+        self.seen = given_as("observations", rows, (len(self.agents), self.shape.observation))
         self.state = None
         if self._read_state is not None:
-            self.state = given_as("state", self._read_state(), (self.shape.state,), origins=origins.state)
+            self.state = given_as("state", self._read_state(), (self.shape.state,))
 
 
 class Step(NamedTuple):

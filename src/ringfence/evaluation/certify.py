@@ -23,7 +23,7 @@ from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import compensation
+from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards import Guard
@@ -62,9 +62,9 @@ def certify(
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     _check(confidence, quantile, calibration, episodes)
     options = {**options, "guard": guard}
-    if compensate:
-        options |= compensation(faults, options)
     keep_programs()
+    if compensate:
+        options = compensated(run, faults, options)
     resolved = _resolved(run, options)
     rounds: list[dict[str, float]] = []
     agreed = False

@@ -15,6 +15,7 @@ from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_num
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
+from ringfence.faults import Faults
 from ringfence.loading.controller import Controller
 from ringfence.problem.bounds import Bounds
 from ringfence.proposals.base import with_cost
@@ -42,6 +43,7 @@ def play(
     num_envs: int = 16,
     max_episode_steps: int | None = None,
     early_ends: Literal["refuse", "cut", "skip"] = "refuse",
+    faults: Faults | Mapping[str, Any] | None = None,
     keep: bool = False,
     quiet: bool = True,
     **options: Any,
@@ -56,8 +58,8 @@ def play(
     noise. `early_ends` says what becomes of an episode that an agent leaves before its team: it is refused, cut there
     (`cut_episodes` counts them), or skipped (`skipped_episodes`). A refusal's `finished` is the summary of the episodes
     that were finished before, and so is that of a Ctrl-C (`errors.Interrupted`). `planner` and `options` (guard,
-    barrier, execution, world, ...) are as in `ringfence.load`. `keep` adds the result to the run's results.json, as
-    `ringfence eval` does, for reports.
+    barrier, execution, world, ...) are as in `ringfence.load`. `faults` lie between policy and simulator
+    (`ringfence.stress`). `keep` adds the result to the run's results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -72,7 +74,10 @@ def play(
     num_envs = options.pop("num_envs", num_envs)
     _check_sizes(episodes, num_envs, seed, max_episode_steps)
     _check_choices(early_ends, split)
-    player = player_of(run, planner, split, options)
+    faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
+    if keep and faults.given:
+        raise UserError("keep=True adds to results.json, where no result has faults; leave keep or faults out.")
+    player = player_of(run, planner, split, options, faults)
     if keep:
         _check_kept(player)
     max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,7 @@ from ringfence.datasets.task import Task
 from ringfence.envs.episode import Shape
 from ringfence.errors import UserError
 from ringfence.evaluation import evaluate
+from ringfence.faults import Faults, behind
 from ringfence.guards.wrap import Callback
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import Resolved, resolve
@@ -27,6 +29,7 @@ from ringfence.types import Key, Policy, PolicyStep, PyTree
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
+NO_FAULTS = Faults()
 Unsafe = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
 
 
@@ -40,6 +43,8 @@ class Player:
     task: Task
     shape: Shape
     episode_length: int  # of the longest logged one
+    action_dim: int
+    observation_names: tuple[str, ...]  # empty where nobody names them
     unsafe: Unsafe | None  # (B,) of observations and states, where a formula says what is unsafe
     about: dict[str, Any]  # what a result says of it
     limits: Mapping[str, float]  # per episode, of constraints that the data names
@@ -53,11 +58,30 @@ class RunPlayer(Player):
     variant: str
 
 
-def player_of(policy: Run | str | Controller, planner: str, split: str, options: dict[str, Any]) -> Player:
-    """A run as planner and options say, or a function under guard, which takes neither."""
+def player_of(
+    policy: Run | str | Controller, planner: str, split: str, options: dict[str, Any], faults: Faults = NO_FAULTS
+) -> Player:
+    """A run as planner and options say, or a function under guard, which takes neither; behind faults, if any."""
     if isinstance(policy, Controller):
-        return _of_function(policy.policy, planner, options)
-    return _of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split)
+        return _behind(_of_function(policy.policy, planner, options), faults)
+    return _behind(_of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split), faults)
+
+
+def _behind(player: Player, faults: Faults) -> Player:
+    """The same behind faults; entries without names are all taken for measured."""
+    if not faults.given:
+        return player
+    shape = player.shape
+    if shape.agents is None or shape.observation is None or shape.state is None:
+        raise UserError(
+            "Faults need to know how wide observations and state are, and nothing tells; play a run of named logs."
+        )
+    names = player.observation_names or ("",) * shape.observation
+    states = ("",) * shape.state
+    bounds = (player.task.action_low, player.task.action_high)
+    steps = player.episode_length
+    policy = behind(player.policy, faults, shape.agents, player.action_dim, names, states, bounds, steps)
+    return dataclasses.replace(player, policy=policy, about=player.about | {"faults": dataclasses.asdict(faults)})
 
 
 def _of_run(resolved: Resolved, split: str) -> RunPlayer:
@@ -68,14 +92,22 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         policy=resolved.team,
         act=in_float32(jax.jit(act_with)),
         task=job.task,
-        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins),
+        shape=Shape(job.team, observation, state or 0, job.task.homogeneous),
         episode_length=job.spec.episode_length,
+        action_dim=job.spec.action_dim,
+        observation_names=_names_of(resolved),
         unsafe=_unsafe_by_formula(job) if job.hazard.has_formula else None,
         about={"step": resolved.step} | evaluate.about(resolved),
         limits=resolved.run.config["data"].get("constraints") or {},
         run=resolved.run,
         variant=resolved.variant(split),
     )
+
+
+def _names_of(resolved: Resolved) -> tuple[str, ...]:
+    env = resolved.job.task.env
+    names = resolved.run.config["data"].get("observation_names") or getattr(env, "observation_names", ())
+    return tuple(names) if len(names) == resolved.job.widths[0] else ()
 
 
 def _unsafe_by_formula(job: Job) -> Unsafe:
@@ -101,6 +133,8 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
         task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
         shape=_shape_of(world, callback.agents),
         episode_length=spec.episode_length,
+        action_dim=spec.action_dim,
+        observation_names=(),
         unsafe=None,
         about={"guard": "own"},
         limits=world.limits,
@@ -111,8 +145,8 @@ def _shape_of(world: World, agents: int) -> Shape:
     """What a simulator must show to a World."""
     width, state_width = world.widths
     if world.map.reads_state:
-        return Shape(agents, None, state_width, world.spec.homogeneous, world.origins)
-    return Shape(agents, width, 0, world.spec.homogeneous, world.origins)
+        return Shape(agents, None, state_width, world.spec.homogeneous)
+    return Shape(agents, width, 0, world.spec.homogeneous)
 
 
 class _OneByOne:
@@ -126,6 +160,5 @@ class _OneByOne:
     def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         function = self.policy.function
         # Copies: a function that writes into what it sees must not blind its guard.
-        copies = ((x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations))
-        wanted = [function(*self.policy.origins.measured(*seen)) for seen in copies]
+        wanted = [function(x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations)]
         return self.policy.decided(carry, observations, state, wanted, key)

@@ -7,6 +7,9 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
+
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.evaluate import Split, about
 from ringfence.evaluation.protocol import evaluate_policy
@@ -17,6 +20,7 @@ from ringfence.training.runs import Run, write_json
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
+from ringfence.world import World
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
 MAX_AGE = 8  # steps up to which a compensating guard makes good for observations that were lost
@@ -37,16 +41,17 @@ def stress(
 ) -> dict[str, Any]:
     """Evaluate a run behind faults, on the same resets as `evaluate`, and add the result to its stress.json.
 
-    faults: a `Faults`, or its fields by name. `compensate` tells the guard of the delay, and that observations may be
-    old where they are dropped; a guard that is not told does not know. Other options are as in `load`. Without faults
-    the numbers are those of `evaluate`.
+    faults: a `Faults`, or its fields by name. `compensate` tells the guard of the delay, that observations may be old
+    where they are dropped, that actions are held where agents act in turn, and what others can do meanwhile; a guard
+    that is not told does not know. Other options are as in `load`. Without faults the numbers are those of `evaluate`.
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
-    if compensate:
-        options |= compensation(faults, options)
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
-    resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
+    options |= {"checkpoint": checkpoint, "planner": planner}
+    if compensate:
+        options = compensated(run, faults, options)
+    resolved = resolve(PolicySpec.of(run, **options))
     file = writable(resolved.run.path / FILE)
     kept = json.loads(file.read_text()) if file.exists() else {}
     name = f"{resolved.variant(split)} behind {faults.name}"
@@ -60,13 +65,47 @@ def stress(
     return result
 
 
+def compensated(run: Run | str, faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a guard that is told of faults."""
+    options = {**options, **compensation(faults, options)}
+    late = {"delay", "max_age"} & options.keys()
+    if not late or "others_acceleration" in options:
+        return options
+    guard = resolve(PolicySpec.of(run, **options)).guard
+    assert guard is not None, "checked before"
+    return options | {"others_acceleration": own_acceleration(guard.world)}
+
+
 def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What a guard is told of faults, as its options."""
+    """What faults alone say to a guard, as its options."""
     guarded = options.get("guard", "none") != "none"
     if not guarded:
         raise UserError("compensate is read by nothing without a guard; name one with guard=, e.g. shield.")
-    found = {"delay": faults.delay, "max_age": MAX_AGE if faults.drop else 0}
+    delay = faults.delay + (faults.jitter + 1) // 2
+    found = {
+        "delay": delay,
+        "max_age": max(MAX_AGE - delay, 0) if faults.drop else 0,
+        "hold": round(1 / (1 - faults.asynchrony)),
+    }
     twice = sorted(found.keys() & options.keys())
     if twice:
         raise UserError(f"compensate and {twice[0]} both tell the guard of it; give one of them.")
-    return {name: value for name, value in found.items() if value}
+    usual = {"delay": 0, "max_age": 0, "hold": 1}
+    return {name: value for name, value in found.items() if value != usual[name]}
+
+
+def own_acceleration(world: World) -> float:
+    """m/s² that an agent can change its velocity by, as the World predicts it of one in the mean of the logs; 0 where
+    it does not know how long a step takes. Others of its kind can do as much."""
+    names = world.map.names
+    speeds = [names.index(f"own.v{axis}") for axis in "xyz" if f"own.v{axis}" in names]
+    if world.map.dt is None or not speeds:
+        return 0.0
+    spec = world.spec
+    pushes = np.concatenate([np.eye(spec.action_dim), -np.eye(spec.action_dim)]).astype(np.float32)
+    before = jnp.broadcast_to(world.dynamics.mean, (len(pushes), spec.n_agents, len(names)))
+    before = before.at[..., np.array(speeds)].set(0.0)
+    action = jnp.broadcast_to(jnp.asarray(pushes)[:, None], (len(pushes), spec.n_agents, spec.action_dim))
+    after, _ = world.dynamics.step(before, action)
+    change = np.asarray((after - before)[..., np.array(speeds)])
+    return round(float(np.linalg.norm(change, axis=-1).max()) / world.map.dt, 2)

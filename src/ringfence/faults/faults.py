@@ -13,6 +13,7 @@ from ringfence.utils.config import NonNegative, Positive, build_config, check_bo
 
 Delay = Annotated[int, Meta(ge=0, le=1000)]
 Chance = Annotated[float, Meta(ge=0, lt=1, description="lie in [0, 1): at 1 nothing would ever arrive")]
+Share = Annotated[float, Meta(ge=0, lt=1, description="lie in [0, 1): at 1 an action could have no effect")]
 
 
 @dataclass(frozen=True)
@@ -24,6 +25,10 @@ class Faults:
     noise: NonNegative = 0.0  # standard deviation of what is observed, in the entries' own units
     gain: Positive = 1.0  # what becomes of an action, which is clipped to its bounds
     asynchrony: Chance = 0.0  # share of steps that an agent lets pass, each in its own rhythm: 0.5 every second one
+    jitter: Delay = 0  # steps by which an action may be later still, drawn for each; an overtaken one is not done
+    bias: NonNegative = 0.0  # standard deviation of what an entry is off by throughout an episode, in its own units
+    spread: Share = 0.0  # by how much of `gain` agents differ, e.g. in mass: drawn in gain (1 ± spread) for an episode
+    stop: Chance = 0.0  # probability that an agent stops acting, at each step, for the rest of an episode
 
     def __post_init__(self):
         check_bounds(self)

@@ -18,7 +18,7 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.faults.faults import Faults
 from ringfence.proposals.base import with_cost
-from ringfence.types import Array, Key, ObservesDelay, Policy, PolicyStep, PyTree
+from ringfence.types import Array, Bound, Key, ObservesDelay, Policy, PolicyStep, PyTree
 
 EXACT = ("seen", "draw")  # entries that are no measurements, by the ends of their names
 OWN_KEY = 39  # folded into the policy's key, whose own draws stay what they are without faults
@@ -37,9 +37,21 @@ class Faulty(eqx.Module):
     def initial_state(self, batch: int) -> PyTree:
         n, o, s, a = self.shape
         nothing = jnp.broadcast_to(jnp.clip(0.0, self.low, self.high), (batch, n, a))
-        return {
+        late = self.faults.delay + self.faults.jitter
+        found = {}
+        if self.faults.jitter:
+            found["due"] = jnp.full((batch, late, n), -1, jnp.int32)  # steps until these arrive
+            found["done"] = nothing
+        if self.faults.bias:
+            found["bias"] = jnp.zeros((batch, n, o))
+            found["state_bias"] = jnp.zeros((batch, s))
+        if self.faults.spread:
+            found["gain"] = jnp.ones((batch, n, 1))
+        if self.faults.stop:
+            found["stopped"] = jnp.zeros((batch, n), bool)
+        return found | {
             "inner": self.policy.initial_state(batch),
-            "queue": jnp.repeat(nothing[:, None], self.faults.delay, 1),  # the oldest first
+            "queue": jnp.repeat(nothing[:, None], late, 1),  # the oldest first
             "sent": nothing,
             "observations": jnp.zeros((batch, n, o)),
             "state": jnp.zeros((batch, s)),
@@ -50,6 +62,7 @@ class Faulty(eqx.Module):
 
     def act(self, carry: PyTree, observations: Any, state: Any, key: Key) -> tuple[PyTree, PolicyStep]:
         outside = isinstance(observations, np.ndarray)  # of JAX: so is what a foreign policy is given
+        carry = self._drawn(carry, jax.random.fold_in(key, OWN_KEY + 1))
         carry = self._arrived(carry, observations, state, jax.random.fold_in(key, OWN_KEY))
         seen: Any = np.asarray(carry["observations"]) if outside else carry["observations"]
         if state is not None:
@@ -62,10 +75,50 @@ class Faulty(eqx.Module):
         sent = jnp.where(self._decides(carry["step"]), jnp.asarray(step.action), carry["sent"])
         if isinstance(self.policy, ObservesDelay):
             inner = self.policy.observe_sent(inner, sent)
-        queue = jnp.concatenate([carry["queue"], sent[:, None]], 1)
-        done = jnp.clip(self.faults.gain * queue[:, 0], self.low, self.high)
-        carry = {**carry, "inner": inner, "queue": queue[:, 1:], "sent": sent, "step": carry["step"] + 1}
-        return carry, step._replace(action=done)
+        carry, done = self._executed({**carry, "inner": inner, "sent": sent}, jax.random.fold_in(key, OWN_KEY + 2))
+        return {**carry, "step": carry["step"] + 1}, step._replace(action=done)
+
+    def _drawn(self, carry: PyTree, key: Key) -> PyTree:
+        """The carry with what is drawn once for an episode, at its first step."""
+        key_bias, key_state, key_gain = jax.random.split(key, 3)
+        first = carry["step"] == 0
+        noisy, noisy_state = (np.array(entries) for entries in self.noisy)
+        found = {}
+        if self.faults.bias:
+            bias = self.faults.bias * noisy * jax.random.normal(key_bias, carry["bias"].shape)
+            found["bias"] = jnp.where(first, bias, carry["bias"])
+            bias = self.faults.bias * noisy_state * jax.random.normal(key_state, carry["state_bias"].shape)
+            found["state_bias"] = jnp.where(first, bias, carry["state_bias"])
+        if self.faults.spread:
+            spread = self.faults.spread
+            gain = jax.random.uniform(key_gain, carry["gain"].shape, minval=1 - spread, maxval=1 + spread)
+            found["gain"] = jnp.where(first, gain, carry["gain"])
+        return {**carry, **found}
+
+    def _executed(self, carry: PyTree, key: Key) -> tuple[PyTree, Array]:
+        """(carry, what is done now (B, N, A)) of what was sent now and before."""
+        key_due, key_stop = jax.random.split(key)
+        queue = jnp.concatenate([carry["queue"], carry["sent"][:, None]], 1)
+        found = {"queue": queue[:, 1:]}
+        done = queue[:, 0]
+        if self.faults.jitter:
+            late = self.faults.delay + jax.random.randint(
+                key_due, carry["due"].shape[::2], 0, self.faults.jitter + 1
+            )  # (B, N)
+            due = jnp.concatenate([carry["due"], late[:, None]], 1)
+            # the newest that has arrived; what was sent before it is overtaken
+            newest = jnp.where(due == 0, jnp.arange(due.shape[1])[:, None], -1).max(1)
+            arrived = jnp.take_along_axis(queue, jnp.maximum(newest, 0)[:, None, :, None], 1)[:, 0]
+            done = jnp.where((newest >= 0)[..., None], arrived, carry["done"])
+            overtaken = jnp.arange(due.shape[1])[:, None] <= newest[:, None]
+            due = jnp.where(overtaken, -1, jnp.maximum(due - 1, -1))
+            found |= {"due": due[:, 1:], "done": done}
+        if self.faults.stop:
+            now = jax.random.uniform(key_stop, carry["stopped"].shape) < self.faults.stop
+            found["stopped"] = carry["stopped"] | now
+            done = jnp.where(found["stopped"][..., None], jnp.clip(0.0, self.low, self.high), done)
+        gain = self.faults.gain * (carry["gain"] if self.faults.spread else 1.0)
+        return {**carry, **found}, jnp.clip(gain * done, self.low, self.high)
 
     def observe_cost(self, carry: PyTree, cost: Any) -> PyTree:
         """What a step cost arrives."""
@@ -78,6 +131,8 @@ class Faulty(eqx.Module):
         noisy, noisy_state = self.noisy
         lost = ~first & (jax.random.uniform(key_lost, carry["age"].shape) < self.faults.drop)
         fresh = self._measured(observations, noisy, key_noise)
+        if self.faults.bias:
+            fresh = fresh + carry["bias"]
         found = {
             "observations": jnp.where(lost[..., None], carry["observations"], fresh),
             "age": jnp.where(lost, carry["age"] + 1, 0),
@@ -85,6 +140,8 @@ class Faulty(eqx.Module):
         if state is not None:
             lost = ~first & (jax.random.uniform(key_state_lost, carry["state_age"].shape) < self.faults.drop)
             fresh = self._measured(state, noisy_state, key_state)
+            if self.faults.bias:
+                fresh = fresh + carry["state_bias"]
             found["state"] = jnp.where(lost[:, None], carry["state"], fresh)
             found["state_age"] = jnp.where(lost, carry["state_age"] + 1, 0)
         return {**carry, **found}
@@ -107,17 +164,34 @@ class Faulty(eqx.Module):
 
 def under_faults(policy: Policy, faults: Faults, task: Any) -> Policy:
     """The policy of a task's whole team behind faults; itself where there are none."""
+    env = task.simulator
+    names = tuple(getattr(env, "observation_names", ())) or ("",) * env.observation_dim
+    bounds = (task.action_low, task.action_high)
+    return behind(
+        policy, faults, env.n_agents, env.action_dim, names, tuple(env.state_names), bounds, env.episode_length
+    )
+
+
+def behind(
+    policy: Policy,
+    faults: Faults,
+    agents: int,
+    actions: int,
+    observation_names: tuple[str, ...],
+    state_names: tuple[str, ...],
+    bounds: tuple[Bound | np.ndarray, Bound | np.ndarray],
+    steps: int,
+) -> Policy:
+    """The policy of a team behind faults, by what it observes (names may be empty) and does; `steps` of an episode.
+    Itself where there are no faults."""
     if not faults.given:
         return policy
-    env = task.simulator
-    if faults.delay >= env.episode_length:
+    if faults.delay + faults.jitter >= steps:
+        name = f"delay={faults.delay}" + (f" and jitter={faults.jitter}" if faults.jitter else "")
         raise UserError(
-            f"delay={faults.delay} steps is no less than an episode of {env.episode_length}, in which nothing would be "
-            "done; give a shorter one."
+            f"{name} steps is no less than an episode of {steps}, in which nothing would be done; give a shorter one."
         )
-    states = tuple(env.state_names)
-    seen = tuple(getattr(env, "observation_names", ())) or ("",) * env.observation_dim
-    shape = (env.n_agents, env.observation_dim, len(states), env.action_dim)
-    measured = tuple(tuple(not name.endswith(EXACT) for name in names) for names in (seen, states))
-    low, high = (jnp.asarray(bound, jnp.float32) for bound in (task.action_low, task.action_high))
-    return Faulty(policy, low, high, faults, shape, (measured[0], measured[1]))
+    shape = (agents, len(observation_names), len(state_names), actions)
+    seen, whole = (tuple(not name.endswith(EXACT) for name in names) for names in (observation_names, state_names))
+    low, high = (jnp.asarray(bound, jnp.float32) for bound in bounds)
+    return Faulty(policy, low, high, faults, shape, (seen, whole))

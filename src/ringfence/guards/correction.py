@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.problem.homogeneous import team_sum
-from ringfence.types import Array
+from ringfence.types import Array, PyTree
 
 TOGETHER = 32  # teams whose plans are corrected at once
 AGAIN = 8  # teams for which a correction is begun again at once
@@ -32,15 +32,16 @@ class Correction(NamedTuple):
 
 @dataclass(frozen=True)
 class Corrector:
-    """Plans (B, K, N, A) into plans that miss less of a condition, in the present (B, N, D) by margins (B, ...)."""
+    """Plans (B, K, N, A) into plans that miss less of a condition, in the present (arrays) by margins (B, ...)."""
 
-    missing: Callable[[Array, Array, Array], Array]  # present, plans (B, S, K, N, A), margin -> (B, S, K, N), 0 or less
+    # present, plans (B, S, K, N, A), margin -> (B, S, K, N), 0 or less
+    missing: Callable[[PyTree, Array, Array], Array]
     within: Callable[[Array], tuple[Array, Array]]  # bounds of what may become of plans
     alone: bool  # agents answer for themselves
     steps: int
     restarts: int
 
-    def __call__(self, present: Array, plan: Array, margin: Array) -> Array:
+    def __call__(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """Where nothing is missing a plan is kept as it is."""
         found = self._where_short(self._by_slope, TOGETHER, 0.0, (present, plan, plan, margin))
         if not self.restarts:
@@ -48,7 +49,7 @@ class Corrector:
         return self._where_short(self._again, AGAIN, TOLERANCE, (present, plan, found, margin))
 
     def _where_short(
-        self, improve: Callable[..., Array], together: int, bearable: float, given: tuple[Array, Array, Array, Array]
+        self, improve: Callable[..., Array], together: int, bearable: float, given: tuple[PyTree, Array, Array, Array]
     ) -> Array:
         """`improve` of (present, plans asked, plans found, margin), a few teams at a time. Most plans miss nothing, so
         they are sorted, and it ends with the last that does."""
@@ -59,23 +60,23 @@ class Corrector:
         short = self._is_short(given, bearable)
         order = jnp.argsort(short, descending=True)
         order = jnp.concatenate([order, jnp.repeat(order[-1:], -batch % together)])
-        parts = tuple(x[order].reshape(-1, together, *x.shape[1:]) for x in given)
+        parts = jax.tree.map(lambda x: x[order].reshape(-1, together, *x.shape[1:]), given)
 
-        def few(part: tuple[Array, Array, Array, Array]) -> Array:
+        def few(part: tuple[PyTree, Array, Array, Array]) -> Array:
             return jax.lax.cond(self._is_short(part, bearable).any(), lambda: improve(*part), lambda: part[2])
 
         return found.at[order].set(jax.lax.map(few, parts).reshape(-1, *found.shape[1:]))
 
-    def _is_short(self, given: tuple[Array, Array, Array, Array], bearable: float) -> Array:
+    def _is_short(self, given: tuple[PyTree, Array, Array, Array], bearable: float) -> Array:
         """(B,) bool: more than is bearable is missing of the plans found."""
         present, _, found, margin = given
         return (self.shortfall(present, found, margin) < -bearable).any(1)
 
-    def shortfall(self, present: Array, plan: Array, margin: Array) -> Array:
+    def shortfall(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
         return team_sum(self.missing(present, plan[:, None], margin)[:, 0], (1,), self.alone)
 
-    def _by_slope(self, present: Array, asked: Array, plan: Array, margin: Array) -> Array:
+    def _by_slope(self, present: PyTree, asked: Array, plan: Array, margin: Array) -> Array:
         """Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖². The best
         plan on the way, within bounds around the one that was asked for. Where the condition cannot be met, larger
         actions throw robots over."""
@@ -106,7 +107,7 @@ class Corrector:
         found = jax.lax.while_loop(goes_on, correct, begun)
         return jnp.where((shortfall(found.plan) >= found.least)[:, None, :, None], found.plan, found.best)
 
-    def _again(self, present: Array, asked: Array, found: Array, margin: Array) -> Array:
+    def _again(self, present: PyTree, asked: Array, found: Array, margin: Array) -> Array:
         """Plans found, or better ones by corrections that begin elsewhere, in as many rounds as are allowed."""
         _, rows, agents, dim = found.shape
         starts = jnp.asarray(fixed_plans(rows, agents, dim, self.restarts), found.dtype)
@@ -126,7 +127,9 @@ class Corrector:
 
         return jax.lax.while_loop(goes_on, again, (found, jnp.asarray(0)))[0]
 
-    def _start(self, present: Array, asked: Array, found: Array, missing: Array, starts: Array, margin: Array) -> Array:
+    def _start(
+        self, present: PyTree, asked: Array, found: Array, missing: Array, starts: Array, margin: Array
+    ) -> Array:
         """(B, K, N, A) the one of starts (S, K, N, A) that misses least, and among equals the one whose first action is
         nearest to what was asked. Agents of whose plans found nothing is `missing` (B, K, N) keep these."""
         low, high = self.within(asked)

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from ringfence.guards.barrier import BarrierSource
@@ -24,10 +25,12 @@ from ringfence.guards.correction import TOLERANCE, Corrector
 from ringfence.guards.options import GuardOptions
 from ringfence.nets.mlp import MLP
 from ringfence.problem.constraints import lowest
+from ringfence.problem.features import others_offsets
 from ringfence.types import Array, Key
 from ringfence.world import World
 from ringfence.world.dynamics import Dynamics
 
+NEAREST = 0.02  # share of a distance that is left of it, whatever others may have done
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
 
@@ -55,21 +58,24 @@ class Guard(eqx.Module):
     def world(self) -> World:
         return self.barrier.world
 
-    def decide(self, present: Array, proposals: Array, last: Array, margin: Array, key: Key) -> Decision:
+    def decide(
+        self, present: Array, proposals: Array, last: Array, margin: Array, key: Key, unseen: Array | None = None
+    ) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
-        (B, C), of each constraint, or (B, N, C) of agents who are alone."""
-        proposals = self.world.spec.own(proposals)
+        (B, C), of each constraint, or (B, N, C) of agents who are alone. `unseen` (B, N) are the steps for which an
+        agent has not seen others, or (B, N, J) each of them."""
+        proposals = self.held(self.world.spec.own(proposals))
         if self.options.optimizer_steps:
             proposals = self.refined(present, *self.started(proposals, last, key), margin)
         rows, spread = self.predict(present, proposals)
-        chosen = self.selected(rows, proposals, self.clear(rows, spread, margin))
+        chosen = self.selected(rows, proposals, self.clear(rows, spread, margin, unseen))
         index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
         plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
         if self.options.correction_steps:
-            plan = self.shielded(present, plan, margin)
+            plan = self.shielded(present, plan, margin, unseen)
         ahead, spread = self.predict(present, plan[:, None])
-        scores = self.barrier.along(ahead, spread)[:, 0]
-        missing = self.missing(present, self.clear(ahead, spread, margin)[:, 0], margin)
+        scores = self.barrier.along(self.nearer(ahead, unseen), spread)[:, 0]
+        missing = self.missing(present, self.clear(ahead, spread, margin, unseen)[:, 0], margin)
         return Decision(
             plan=plan,
             chosen=chosen,
@@ -105,9 +111,33 @@ class Guard(eqx.Module):
 
         return jax.vmap(of_start, (0, 1), 1)(nets, actions)
 
-    def clear(self, rows: Array, spread: Array, margin: Array) -> Array:
+    def held(self, plans: Array) -> Array:
+        """Plans (..., K, N, A) as they are done where every action is held for `hold` steps."""
+        if self.options.hold == 1:
+            return plans
+        index = np.arange(plans.shape[-3])
+        return plans[..., index - index % self.options.hold, :, :]
+
+    def nearer(self, rows: Array, unseen: Array | None) -> Array:
+        """Predicted rows (B, P, K+1, N, D) with others moved towards each agent, by what they may have come nearer
+        since they were seen: in τ steps and k further ones by ½ a (τ² + 2 k τ). What they do in these k steps after
+        they were seen is a matter of the margin, late or not."""
+        if unseen is None or not self.options.others_acceleration:
+            return rows
+        assert self.world.map.dt is not None, "refused before"
+        entries = others_offsets(self.world.map.names)  # (J, 2 or 3)
+        since = unseen if unseen.ndim == 3 else unseen[..., None]
+        ahead = jnp.arange(rows.shape[2])[:, None, None]
+        since = since[:, None, None].astype(rows.dtype)
+        near = 0.5 * self.options.others_acceleration * self.world.map.dt**2 * (since**2 + 2 * ahead * since)
+        offset = rows[..., entries]
+        distance = jnp.sqrt((offset**2).sum(-1) + 1e-9)
+        share = jnp.maximum(1.0 - near / distance, NEAREST)
+        return rows.at[..., entries].set(offset * share[..., None])
+
+    def clear(self, rows: Array, spread: Array, margin: Array, unseen: Array | None = None) -> Array:
         """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst."""
-        return lowest(self.barrier.along(rows, spread) - _over(margin, 2))
+        return lowest(self.barrier.along(self.nearer(rows, unseen), spread) - _over(margin, 2))
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
         """(B, K, N) how much predicted rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
@@ -170,20 +200,21 @@ class Guard(eqx.Module):
         clear = clear.min(2)
         return pick(clear if self.world.alone else clear.min(-1), value, 0.0)
 
-    def shielded(self, present: Array, plan: Array, margin: Array) -> Array:
+    def shielded(self, present: Array, plan: Array, margin: Array, unseen: Array | None = None) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
         otherwise, within `max_correction` of what they were."""
         options = self.options
 
-        def missing(present: Array, plans: Array, margin: Array) -> Array:
-            clear = self.clear(*self.predict(present, plans), margin)
+        def missing(given: tuple[Array, Array | None], plans: Array, margin: Array) -> Array:
+            present, unseen = given
+            clear = self.clear(*self.predict(present, self.held(plans)), margin, unseen)
             return jax.vmap(lambda clear: self.missing(present, clear, margin), 1, 1)(clear)
 
         def within(plan: Array) -> tuple[Array, Array]:
             return self._within(plan, options.max_correction)
 
         correct = Corrector(missing, within, self.world.alone, options.correction_steps, options.correction_restarts)
-        return correct(present, plan, margin)
+        return self.held(correct((present, unseen), plan, margin))
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has

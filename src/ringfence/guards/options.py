@@ -14,6 +14,7 @@ Samples = Annotated[int, Meta(ge=1, le=10_000)]
 Rounds = Annotated[int, Meta(ge=0, le=10**6)]
 Fall = Annotated[float, Meta(gt=0, le=1, description="lie in (0, 1]: at 0 a barrier could never fall")]
 Late = Annotated[int, Meta(ge=0, le=100)]
+Held = Annotated[int, Meta(ge=1, le=100)]
 Few = Annotated[int, Meta(ge=0, le=100)]
 CostRate = Annotated[float, Meta(gt=0, lt=1, description="be a share of steps between 0 and 1")]
 Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions lie in [-1, 1]")]
@@ -42,6 +43,9 @@ class GuardOptions:
     rate: CostRate = 0.0125  # share of steps with a cost at which an adapting margin settles
     delay: Late = 0  # steps after which an action takes effect; the guard decides for that time
     max_age: Late = 0  # steps that observations may be old and still be moved to the present; 0: they are taken as new
+    hold: Held = 1  # steps for which an action is held: agents that act every so many steps
+    # m/s² that others may accelerate by while nobody sees them: late and old observations have them nearer by so much
+    others_acceleration: NonNegative = 0.0
 
     def __post_init__(self):
         check_bounds(self)

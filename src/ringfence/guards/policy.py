@@ -122,8 +122,11 @@ class Guarded(HadStart, eqx.Module):
         if guard.options.adapt:
             adapted = guard.adapted(carry["margin"], self._was_unsafe(carry, present))
             margin = jnp.where(carry["age"] == 0, margin, adapted)
-        acting = self.when_it_acts(carry, present) if "sent" in carry else present
-        found = guard.decide(acting, actions, carry["last"], margin, key)
+        acting, unseen = present, None
+        if "sent" in carry:
+            acting = self.when_it_acts(carry, present)
+            unseen = guard.options.delay + carry["observed_age"]
+        found = guard.decide(acting, actions, carry["last"], margin, key, unseen)
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -319,6 +322,11 @@ def build(
 def _refuse_far(options: GuardOptions, world: World) -> None:
     """Refuse to roll actions forward for longer than anybody knows how well the World does."""
     error = world.card.prediction_error
+    if options.others_acceleration and world.map.dt is None:
+        raise UserError(
+            "others_acceleration needs a World of agents that see for themselves and know how long a step takes; leave "
+            "it out."
+        )
     known = FARTHEST if error is None else len(error.error_of_change)
     late = options.delay + options.max_age
     if late > known:

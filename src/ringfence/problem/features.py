@@ -153,6 +153,13 @@ def numbered(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
     return {kind: [fields for _, fields in sorted(things.items())] for kind, things in found.items()}
 
 
+def others_offsets(names: Sequence[str]) -> np.ndarray:
+    """(J, 2 or 3) entries that say where each of the others is (dx, dy, dz); (0, 2) where names tell no such thing."""
+    things = numbered(names).get("other", [])
+    axes = [f"d{axis}" for axis in "xyz" if things and all(f"d{axis}" in thing for thing in things)]
+    return np.array([[thing[axis] for axis in axes] for thing in things], int).reshape(len(things), len(axes) or 2)
+
+
 def headed(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """The velocity of an agent that tells its speed and heading: two products of entries, along x and y; none where
     it tells no such thing."""
@@ -201,7 +208,7 @@ def constant_velocity(map: FeatureMap, dt: float, late: float = 1.0) -> FeatureM
     by `own.vx` in a step of `dt` seconds, for the share `late` of it by the next row's. `other0.dx`, `other0.dvx` move
     as if that other kept its velocity. So what is predicted of an agent is its own velocity, whoever the others are and
     however many; what else is known of things (`obstacle0.radius`) stays."""
-    rules = _moves(map.names)
+    rules = motion_rules(map.names)
     if not rules:
         return map
     names = {name: d for d, name in enumerate(map.names)}
@@ -220,7 +227,7 @@ def constant_velocity(map: FeatureMap, dt: float, late: float = 1.0) -> FeatureM
     )
 
 
-def _moves(names: Sequence[str]) -> tuple[tuple[int, int, int], ...]:
+def motion_rules(names: Sequence[str]) -> tuple[tuple[int, int, int], ...]:
     """(entry of a place, entry of its relative velocity or −1, entry of the own velocity) of what is named so."""
     entries = {name: d for d, name in enumerate(names)}
     rules = []
@@ -472,7 +479,7 @@ def _step_of(map: FeatureMap, steps: _Steps | None) -> float | None:
 
 def _late(map: FeatureMap, steps: _Steps | None, dt: float) -> float:
     """The share of a step that is gone with the next velocity; all of it where the logged steps do not say."""
-    rules = _moves(map.names)
+    rules = motion_rules(map.names)
     if steps is None or not rules:
         return 1.0
     place, speed, mine = np.array(rules).T

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film, ReplayResult, Row
 from ringfence.evaluation.replay.scene import NOBODY, Motion, Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Driven, Stage
+from ringfence.faults import Faults
 from ringfence.guards import GUARDS
 from ringfence.guards.policy import Guarded, build
 from ringfence.guards.wrap import Nothing
@@ -56,6 +58,7 @@ def replay(
     baselines: bool = True,
     anyway: bool = False,
     seed: int = 0,
+    faults: Faults | Mapping[str, Any] | None = None,
     **options: Any,
 ) -> ReplayResult:
     """Contacts that a guard prevents and causes where one agent is driven and all others do what they did.
@@ -67,6 +70,8 @@ def replay(
     closer than `radius` m to another: by default the task's formula, else the distance that best tells the logged
     unsafe steps. `kinematics` is a name of KINEMATICS. `baselines` adds a brake that takes everybody's velocity for
     constant, and a guard that knows the formula, along 2 s.
+
+    `faults` (`ringfence.stress`) lie between the driven agent's policy or guard and its body; a brake has none.
 
     Others do not react: what drives into a driven agent from behind counts as its contact, too.
     """
@@ -88,11 +93,13 @@ def replay(
         check_view(known_world, store)
     motion = motion_of(store, names)
     radius, source = radius_of(store, motion, radius)
+    faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     stage, left_out = _stage(
         store, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
     )
+    stage = dataclasses.replace(stage, faults=faults)
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
-    notes: list[str] = []
+    notes: list[str] = [f"Behind faults: {faults.name}; a brake is not behind them."] if faults.given else []
     if baselines and known_world is not None:
         formula = _formula(known_world, radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}
@@ -170,8 +177,6 @@ def check_view(world: World, store: EpisodeStore) -> None:
             f"The World reads {wanted[0]} agents of {wanted[1]} entries and {wanted[2]} actions, the logs hold "
             f"{shape[0]} of {shape[1]} and {shape[2]}; fit a World to these logs."
         )
-    if world.origins != store.card.origins:
-        raise UserError("The logs were moved by other origins than those of the World; fit a World to these logs.")
     names = store.card.observation_names
     if names and not world.map.reads_state:
         for name, entry in zip(world.map.names, world.map.plus[0]):

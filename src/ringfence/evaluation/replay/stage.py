@@ -13,19 +13,49 @@ from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
 from ringfence.evaluation.replay.scene import Windows
+from ringfence.faults import Faults, Faulty, behind
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import act_with, held, with_cost
-from ringfence.types import Array, Policy
+from ringfence.types import Array, Policy, PolicyStep, PyTree
 from ringfence.world import World
 
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (W, N, O) and state (W, S)
 TOLD = ("infeasible", "ood", "clearance")  # of a guard's info
+NO_FAULTS = Faults()
 _act = jax.jit(act_with)
 
 
 @jax.jit
 def _decided(guarded: Guarded, memory: Any, present: Array, actions: Array, key: Array) -> Any:
     return guarded.decided(memory, present, actions, key)
+
+
+class _Bad:
+    """A bad driver as a policy, under guard or not: what it and the others do is set before every step."""
+
+    def __init__(self, guard: Guarded | None):
+        self.guard = guard
+        self.team = np.zeros(0)  # (W, N, A)
+
+    def initial_state(self, batch: int) -> PyTree:
+        return {} if self.guard is None else self.guard.initial_state(batch)
+
+    def observe_cost(self, carry: PyTree, cost: Any) -> PyTree:
+        return carry if self.guard is None else self.guard.observe_cost(carry, cost)
+
+    def observe_age(self, carry: PyTree, age: Array) -> PyTree:
+        return carry if self.guard is None else self.guard.observe_age(carry, age)
+
+    def observe_sent(self, carry: PyTree, action: Array) -> PyTree:
+        return carry if self.guard is None else self.guard.observe_sent(carry, action)
+
+    def act(self, carry: PyTree, observations: Any, state: Any, key: Array) -> tuple[PyTree, PolicyStep]:
+        team: Any = self.team
+        if self.guard is None:
+            return carry, PolicyStep(team, {})
+        world = self.guard.guard.world
+        present = world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
+        return _decided(self.guard, carry, present, held(in_unit(team, world), self.guard.guard.options.horizon), key)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +75,7 @@ class Stage:
     kinematics: Kinematics
     radius: float
     seed: int
+    faults: Faults = NO_FAULTS
 
     def play(self, driver: str | Policy, guard: Guarded | None = None, brake: bool = False) -> Driven:
         """`driver`: a name of DRIVERS, or a policy; `guard` filters what it does, and so does the `brake`."""
@@ -57,8 +88,9 @@ class Stage:
             heading = np.arctan2(first[:, w.names.observation["own.sin"]], first[:, w.names.observation["own.cos"]])
         if guard is not None and not isinstance(driver, str):
             driver = Guarded(driver, guard.guard)
-        actor = guard if isinstance(driver, str) else driver
-        memory = None if actor is None else actor.initial_state(w.count)
+        bad = _Bad(guard) if isinstance(driver, str) else None
+        actor: Any = self._behind(bad or driver)
+        memory = actor.initial_state(w.count)
         world = self.kinematics.world if self.kinematics.name == "world" else None
         foresee = None if world is None else foreseen_velocity(world)
         key = jax.random.key(self.seed)
@@ -69,7 +101,11 @@ class Stage:
             seen = w.observed(t, place, velocity, heading)
             now = self._now(t, place, velocity, heading)
             key, step_key = jax.random.split(key)
-            memory, action, step_info = self._action(driver, guard, memory, t, seen, now, step_key)
+            if bad is not None:
+                bad.team = w.actions[:, t].copy()
+                wanted = DRIVERS[str(driver)](now)
+                bad.team[np.arange(w.count), w.driven] = self.kinematics.toward(wanted, velocity, heading)
+            memory, action, step_info = self._action(actor, memory, seen, step_key)
             if brake:
                 action, step_info["braked"] = braked(now, action, self.kinematics, self.radius)
             for name, value in step_info.items():
@@ -81,8 +117,7 @@ class Stage:
             touches = w.distances(t + 1, place).min(-1) < self.radius
             contact |= touches
             places.append(place)
-            if actor is not None:
-                memory = with_cost(actor, memory, jnp.asarray(touches, jnp.float32))
+            memory = with_cost(actor, memory, jnp.asarray(touches, jnp.float32))
         return Driven(np.stack(places, 1), contact, {k: np.stack(v, 1) for k, v in info.items()})
 
     def _now(self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> Now:
@@ -92,26 +127,28 @@ class Stage:
             velocity, heading, w.velocity[:, 0], w.goal - place, away, w.others_move[:, t], self.kinematics.max_speed
         )
 
-    def _action(
-        self, driver: str | Policy, guard: Guarded | None, memory: Any, t: int, seen: Seen, now: Now, key: Any
-    ) -> tuple[Any, np.ndarray, dict[str, Any]]:
+    def _behind(self, policy: Any) -> Any:
+        """The driven agent's policy behind faults; a brake is never behind them."""
+        w = self.windows
+        entries = w.names.observation
+        observations, state = w.observed(0, w.place[:, 0], w.velocity[:, 0], np.zeros(w.count))
+        width = observations.shape[-1]
+        named = {index: name for name, index in entries.items()}
+        names = tuple(named.get(d, "") for d in range(width))
+        states = ("",) * (0 if state is None else state.shape[-1])
+        actions = w.actions.shape[-1]
+        bounds = (self.kinematics.low, self.kinematics.high)
+        return behind(policy, self.faults, observations.shape[1], actions, names, states, bounds, w.steps)
+
+    def _action(self, actor: Any, memory: Any, seen: Seen, key: Any) -> tuple[Any, np.ndarray, dict[str, Any]]:
         """(memory, actions (W, A) of the driven agents, what the guard says)."""
         w = self.windows
-        rows = np.arange(w.count)
-        if isinstance(driver, str):
-            action = self.kinematics.toward(DRIVERS[driver](now), now.velocity, now.heading)
-            if guard is None:
-                return memory, action, {}
-            present, team = self._in_world(guard.guard.world, t, seen, action)
-            plan = held(team, guard.guard.options.horizon)
-            memory, step = _decided(guard, memory, present, plan, key)
-        else:
-            memory, step = _act(driver, memory, *seen, key)
-        acted = np.asarray(step.action, np.float64)[rows, w.driven]
+        foreign = isinstance(actor, _Bad) or (isinstance(actor, Faulty) and isinstance(actor.policy, _Bad))
+        memory, step = (act_with if foreign else _act)(actor, memory, *seen, key)
+        acted = np.asarray(step.action, np.float64)[np.arange(w.count), w.driven]
         if not np.isfinite(acted).all():
             raise UserError("The policy gave actions that are not finite; it has diverged: train or fit it again.")
-        names = [n for n in TOLD if n in step.info]
-        return memory, acted, {n: np.asarray(step.info[n]) for n in names}
+        return memory, acted, {n: np.asarray(step.info[n]) for n in TOLD if n in step.info}
 
     def _in_world(self, world: World, t: int, seen: Seen, action: np.ndarray) -> tuple[Array, Array]:
         """What a World sees (W, N, D), and everybody's actions (W, N, A) in its units: others do as they did."""
