@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -9,11 +10,14 @@ import numpy as np
 import pytest
 
 from ringfence import EpisodeStore, fit, guard
+from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.problem import features
-from ringfence.world import cause_search, causes, verdict
+from ringfence.report.ope_page import build_ope
+from ringfence.world import cause_search, causes, probes, verdict
 from ringfence.world.card import BarrierScores, Card, Data, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
 from ringfence.world.logged import held_out
 from tests.quick import QUICK_WORLD
@@ -200,9 +204,49 @@ def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
     np.testing.assert_array_equal(again.barrier.of_steps(x, x), fitted.barrier.of_steps(x, x))
 
 
-def test_networks_on_all_entries_are_a_setting():
+def test_answers_are_drawn_on_the_page_of_a_fit(fitted, tmp_path):
+    answers = {probe.name: probe for probe in fitted.card.barrier.probes}
+    near = answers["length of other.dx, other.dy, put into held-out states"]
+    assert near.unsafe[:3] == (1.0, 1.0, 1.0) and near.unsafe[-1] == 0.0
+    assert near.unsafe_closing == (), "nothing tells how fast others move"
+    assert abs(answers["own.v"].edge - FAST) < 0.02
+    page = build_ope(tmp_path / "card.html", fitted.card, audit(store_of())).read_text()
+    assert "Called unsafe by length of other.dx, other.dy" in page and "Score along own.v" in page
+    assert "http" not in page
+
+
+def test_networks_on_all_entries_are_a_setting(tmp_path):
     plain = fit(store_of(60), **QUICK_WORLD, causes=False)
     assert plain.card.causes == {"": causes.Found()} and not plain.barrier.causes and plain.barrier.label
+    (place,) = plain.card.barrier.maps
+    assert place.name.startswith("own.x, own.y") and np.shape(place.scores) == (len(place.y), len(place.x))
+    assert any(probe.name.startswith("own speed (own.v)") for probe in plain.card.barrier.probes)
+    page = build_ope(tmp_path / "card.html", plain.card, audit(store_of(60))).read_text()
+    assert "Score over own.x, own.y" in page and "Score along own speed" in page
+
+
+def test_somebody_is_put_at_rest_and_closing():
+    """Somebody 1 m away in front, who is put at half a metre: at rest, and as fast as anybody was."""
+    names = ("other0.dx", "other0.dy", "other0.dvx", "other0.dvy")
+    states = jnp.tile(jnp.array([1.0, 0.0, -2.0, 0.0]), (5, 1, 1))
+    (cause,) = causes.offsets(names)
+
+    class Closing(eqx.Module):
+        """Danger is how fast it closes."""
+
+        def of_steps(self, before, after):
+            return after[..., 2]
+
+    scores = probes._put(Closing(), states, names, cause, 0.5)
+    np.testing.assert_allclose(scores, [[0.0] * 5, [-2.0] * 5], atol=1e-6)
+    assert probes._put(Closing(), states, ("other0.dx", "other0.dy", "a", "b"), cause, 0.5).shape == (1, 5)
+
+
+def test_a_cause_of_a_place_has_a_map():
+    cause = Cause("own.x, own.y", ((0, 1),))
+    found = Found((cause,), edges=(Edge((-1.0, -2.0), (1.0, 2.0)),))
+    plane = probes._map(blank(found, 8, jax.random.key(0))[0], 1.0)
+    assert plane.x[0] == -1.2 and plane.y[-1] == 2.4 and np.shape(plane.scores) == (len(plane.y), len(plane.x))
 
 
 @pytest.mark.verdicts

@@ -448,7 +448,7 @@ def test_places_far_from_the_origin_are_warned_of(small_store):
     from ringfence.datasets.audit import audit
 
     def coarse(store):
-        return [w for w in audit(store).warnings if "subtract an origin" in w]
+        return [w for w in audit(store).warnings if "so far from 0" in w]
 
     assert not coarse(small_store)
     far = small_store.observations + np.float32(5.4e6) * np.eye(1, 18, 4, dtype=np.float32)[0]  # a northing in metres

@@ -8,6 +8,9 @@ Whatever nothing reads is left out: cloning under a shield takes observations (a
 and remembers nothing. `next.NAME` is `memory.NAME` of the step after; `cost` is what the last step cost, NaN where
 nobody gave; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random numbers
 differ between runtimes. What is carried begins with, names, shapes and the facts of the run are metadata of the file.
+
+Observations and states of logs that were moved towards 0 (`origins` of the metadata) come in float64, as they were
+measured, and the file takes the origins from them.
 """
 
 from __future__ import annotations
@@ -43,7 +46,7 @@ from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key, Policy
 from ringfence.utils.files import whole, writable
-from ringfence.utils.precision import in_float32
+from ringfence.utils.precision import float64, in_float32
 from ringfence.utils.pytrees import digest_of, named_arrays, named_leaves
 from ringfence.utils.renamed import renamed
 
@@ -58,7 +61,7 @@ class Entry:
 
     name: str
     shape: tuple[int, ...]
-    dtype: str  # float32, int32 or bool
+    dtype: str  # float32, int32 or bool; float64 of what is moved
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,10 +73,16 @@ class Step:
     outputs: tuple[Entry, ...]
     initial: dict[str, np.ndarray]  # by the inputs' names
     draw: Callable[[Key], list[Array]]  # the noise that `Controller` would draw by a key
+    origins: dict[str, np.ndarray]  # what a file takes from inputs, by their names, before it calls the function
 
     @property
     def avals(self) -> list[jax.ShapeDtypeStruct]:
         return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.inputs]
+
+    @property
+    def measured(self) -> tuple[Entry, ...]:
+        """The inputs of a file."""
+        return tuple(dataclasses.replace(x, dtype="float64") if x.name in self.origins else x for x in self.inputs)
 
 
 @in_float32
@@ -165,6 +174,7 @@ def step_of(job: Job, policy: Policy) -> Step:
         tuple(_entry(traced.outputs[k], avals[k]) for k in outputs),
         {name: np.asarray(array) for name, array in traced.carry.items() if name in used},
         jax.jit(partial(_drawn, traced)),
+        {name: np.array(x) for name, x in dataclasses.asdict(job.origins).items() if x is not None and name in used},
     )
 
 
@@ -290,9 +300,10 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "constraints": _constraints(resolved.team),
         "action_low": stored(job.spec.action_low),
         "action_high": stored(job.spec.action_high),
-        "inputs": [dataclasses.asdict(x) for x in step.inputs],
+        "inputs": [dataclasses.asdict(x) for x in step.measured],
         "outputs": [dataclasses.asdict(x) for x in step.outputs],
         "initial": {name: _short(x) for name, x in step.initial.items()},
+        **({"origins": {name: x.tolist() for name, x in step.origins.items()}} if step.origins else {}),
     }
 
 
@@ -329,8 +340,11 @@ def _write_stablehlo(step: Step, metadata: dict[str, Any], file: Path) -> None:
     and `policy.jax` (the same for `jax.export.deserialize`). Nothing in it depends on a platform."""
     jax_export = _packer()
     checks = [jax_export.DisabledSafetyCheck.platform()]
+    pack = partial(jax_export.export, platforms=["cpu"], disabled_checks=checks)
     with _without_locations():
-        program = jax_export.export(jax.jit(step.call), platforms=["cpu"], disabled_checks=checks)(*step.avals)
+        program = pack(jax.jit(step.call))(*step.avals)
+        if step.origins:
+            program = _of_measured(step, program, pack)
     contents = {
         "metadata.json": _json(metadata, indent=1).encode(),
         "policy.mlirbc": program.mlir_module_serialized,
@@ -339,6 +353,18 @@ def _write_stablehlo(step: Step, metadata: dict[str, Any], file: Path) -> None:
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         for name, content in contents.items():
             packed.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content, zipfile.ZIP_DEFLATED)
+
+
+def _of_measured(step: Step, program: Any, pack: Callable[..., Any]) -> Any:
+    """The program with what it takes from its inputs first, in double precision."""
+    origins = [step.origins.get(x.name) for x in step.inputs]
+
+    def call(*arrays: Array) -> list[Array]:
+        near = [x if o is None else (x - jnp.asarray(o)).astype(jnp.float32) for x, o in zip(arrays, origins)]
+        return program.call(*near)
+
+    with float64():
+        return pack(jax.jit(call))(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in step.measured))
 
 
 @contextmanager
@@ -355,9 +381,29 @@ def _without_locations() -> Iterator[None]:
 
 def _write_onnx(step: Step, metadata: dict[str, Any], file: Path) -> None:
     model = as_onnx(step)
+    _take_origins(model.graph, step.origins)
     for name, text in {"ringfence": _json(metadata), **_flat(step.initial)}.items():
         model.metadata_props.add(key=name, value=text)
     file.write_bytes(model.SerializeToString())
+
+
+def _take_origins(graph: Any, origins: dict[str, np.ndarray]) -> None:
+    """Let an ONNX graph take origins from its inputs first, in double precision."""
+    import onnx
+
+    first = []
+    for name, taken in origins.items():
+        constant = onnx.numpy_helper.from_array(taken.astype(np.float64), f"{name}.origins")
+        graph.initializer.append(constant)
+        for node in graph.node:
+            node.input[:] = [f"{name}.near" if read == name else read for read in node.input]
+        first.append(onnx.helper.make_node("Sub", [name, constant.name], [f"{name}.far"]))
+        first.append(onnx.helper.make_node("Cast", [f"{name}.far"], [f"{name}.near"], to=onnx.TensorProto.FLOAT))
+        given = next(x for x in graph.input if x.name == name)
+        given.type.tensor_type.elem_type = onnx.TensorProto.DOUBLE
+    nodes = [*first, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
 
 
 def _flat(initial: dict[str, np.ndarray]) -> dict[str, str]:

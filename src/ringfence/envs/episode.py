@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.problem.origins import NOWHERE, Origins
 from ringfence.utils.given import NUMBERS, given_as
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
@@ -35,6 +36,7 @@ class Shape:
     observation: int | None = None
     state: int | None = 0  # entries of the global state, 0: it is not asked for
     homogeneous: bool = False  # any number of agents could play
+    origins: Origins = NOWHERE  # of what is shown, which is taken from it
 
 
 def check(env: Any, *names: str) -> None:
@@ -231,10 +233,12 @@ class Episode:
     def _observe(self, observations: ByAgent) -> None:
         self._check_all_in("observations", observations, len(self.rewards))
         rows = [observations[a] for a in self.agents]
-        self.seen = given_as("observations", rows, (len(self.agents), self.shape.observation))
+        origins = self.shape.origins
+        shape = (len(self.agents), self.shape.observation)
+        self.seen = given_as("observations", rows, shape, origins=origins.observations)
         self.state = None
         if self._read_state is not None:
-            self.state = given_as("state", self._read_state(), (self.shape.state,))
+            self.state = given_as("state", self._read_state(), (self.shape.state,), origins=origins.state)
 
 
 class Step(NamedTuple):

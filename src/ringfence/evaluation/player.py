@@ -92,7 +92,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         policy=resolved.team,
         act=in_float32(jax.jit(act_with)),
         task=job.task,
-        shape=Shape(job.team, observation, state or 0, job.task.homogeneous),
+        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins),
         episode_length=job.spec.episode_length,
         action_dim=job.spec.action_dim,
         observation_names=_names_of(resolved),
@@ -145,8 +145,8 @@ def _shape_of(world: World, agents: int) -> Shape:
     """What a simulator must show to a World."""
     width, state_width = world.widths
     if world.map.reads_state:
-        return Shape(agents, None, state_width, world.spec.homogeneous)
-    return Shape(agents, width, 0, world.spec.homogeneous)
+        return Shape(agents, None, state_width, world.spec.homogeneous, world.origins)
+    return Shape(agents, width, 0, world.spec.homogeneous, world.origins)
 
 
 class _OneByOne:
@@ -160,5 +160,6 @@ class _OneByOne:
     def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
         function = self.policy.function
         # Copies: a function that writes into what it sees must not blind its guard.
-        wanted = [function(x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations)]
+        copies = ((x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations))
+        wanted = [function(*self.policy.origins.measured(*seen)) for seen in copies]
         return self.policy.decided(carry, observations, state, wanted, key)

@@ -14,6 +14,7 @@ from ringfence.errors import UserError
 from ringfence.guards.policy import Guarded, build
 from ringfence.problem import constraints, normalise
 from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
+from ringfence.problem.origins import Origins
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
@@ -41,6 +42,11 @@ class Callback:
         """Who observes costs: one guard, or that of each agent."""
         return team_policy(self.guarded, self.agents, self.guarded.guard.world.spec.homogeneous)
 
+    @property
+    def origins(self) -> Origins:
+        """What is taken from what is given; the function is asked with what was measured."""
+        return self.guarded.guard.world.origins
+
     @in_float32
     def initial_state(self, batch: int) -> PyTree:
         return self._team.initial_state(batch)
@@ -50,7 +56,8 @@ class Callback:
         return self._team.observe_cost(carry, jax.tree.map(lambda c: jnp.asarray(c, jnp.float32), cost))
 
     def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
-        wanted = self.function(np.asarray(observations), None if state is None else np.asarray(state))
+        given = np.asarray(observations), None if state is None else np.asarray(state)
+        wanted = self.function(*self.origins.measured(*given))
         return self.decided(carry, observations, state, wanted, key)
 
     def seen(self, observations: Any, state: Any) -> tuple[np.ndarray, np.ndarray | None]:
@@ -61,12 +68,14 @@ class Callback:
         reads_state = world.map.reads_state
         remedy = "pass what its logs hold"
         shape = (self.agents, None if reads_state else width)
-        shown = given_as("observations", observations, shape, "this World", remedy)
+        origins = world.origins
+        shown = given_as("observations", observations, shape, "this World", remedy, origins.observations)
         if reads_state and state is None:
             raise UserError(f"This World reads the global state ({state_width or 'S'} entries), and there is none.")
         whole = None
         if state is not None:
-            whole = given_as("state", state, (state_width if reads_state else None,), "this World", remedy)
+            shape = (state_width if reads_state else None,)
+            whole = given_as("state", state, shape, "this World", remedy, origins.state)
         there = len(whole) if reads_state and whole is not None else shown.shape[-1]
         if there < needed:
             name = "state" if reads_state else "observations"

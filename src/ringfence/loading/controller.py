@@ -209,7 +209,8 @@ class _TrainedRun:
     def seen(self, observations: Any, state: Any) -> Seen:
         """Copies of what one environment shows, of the widths of the run's data."""
         width, state_width = self.job.widths
-        seen = given_as("observations", observations, (self.job.team, width))
+        origins = self.job.origins
+        seen = given_as("observations", observations, (self.job.team, width), origins=origins.observations)
         if state is not None and state_width == 0:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."
@@ -220,7 +221,7 @@ class _TrainedRun:
                 f"act() got no state, but this run's view '{view.view}' reads it; pass the global state"
                 + (f" ({state_width} entries)." if state_width else ".")
             )
-        whole = None if state is None else given_as("state", state, (state_width,))
+        whole = None if state is None else given_as("state", state, (state_width,), origins=origins.state)
         if None in self.job.widths:
             self._reaches(seen, whole)
         return seen, whole
@@ -260,7 +261,8 @@ class _Function:
     def act(self, carry: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:
         observations, state = seen
         # Copies: a function that writes into what it sees must not blind its guard.
-        wanted = self.policy.function(observations.copy(), None if state is None else state.copy())
+        copies = observations.copy(), None if state is None else state.copy()
+        wanted = self.policy.function(*self.policy.origins.measured(*copies))
         if cost is not None:
             carry = self.policy.observe_cost(carry, cost)
         return self.policy.decided(carry, *_batch(seen), [wanted], key)

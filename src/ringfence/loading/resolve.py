@@ -18,6 +18,7 @@ from ringfence.loading import oracle, run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
+from ringfence.problem.origins import Origins
 from ringfence.proposals.flow import FlowPolicy
 from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
@@ -172,7 +173,8 @@ def load_job(run: Run, agents: int | None = None) -> Job:
         task = registry.of_team(task, agents)
         team = agents
     bound = constraints.bind(hazard, spec.feature_names, spec.n_agents)
-    found = Job(algorithm, stored["preset"], config, task, spec, feature_map, bound, widths, team=team)
+    origins = Origins.of(stored["data"])
+    found = Job(algorithm, stored["preset"], config, task, spec, feature_map, bound, widths, None, team, origins)
     _check_width(found, feature_map, f"'{run.path}'")
     return found
 

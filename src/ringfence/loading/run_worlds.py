@@ -7,6 +7,7 @@ from pathlib import Path
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.logs.provenance import regenerated
+from ringfence.problem.origins import Origins
 from ringfence.training.runs import Run
 from ringfence.training.worlds import GUARD, WORLD, fit, load, usual
 from ringfence.world import Settings, World
@@ -27,6 +28,7 @@ def _kept(run: Run, file: Path) -> World:
             f"'{file}' is a World of '{found.card.data.task}', the run is of '{task}'; put the run's own World there, "
             "or delete that file."
         )
+    _of_same_origins(run, found)
     return found
 
 
@@ -81,6 +83,15 @@ def _of_data(run: Run, execution: str | None, quiet: bool) -> World:
     return fit(store, seed=config["seed"], execution=execution, quiet=quiet)
 
 
+def _of_same_origins(run: Run, world: World) -> None:
+    """Refuse a World of logs that were moved otherwise: it would take other numbers for the same place."""
+    if world.origins != Origins.of(run.config["data"]):
+        raise UserError(
+            f"The logs of the World were moved by other origins than those of the run '{run.path}'; fit one to the "
+            "data that the run was trained on."
+        )
+
+
 def _of_same(run: Run, world: World, execution: str) -> None:
     """Refuse a World of other data, or of another execution."""
     config = run.config
@@ -92,6 +103,7 @@ def _of_same(run: Run, world: World, execution: str) -> None:
             f"The World is of '{there.task}', the run '{run.path}' of other data ('{config['task']}'); fit one to the "
             "data that the run was trained on."
         )
+    _of_same_origins(run, world)
     if world.alone != (execution == "decentralized"):
         raise UserError(
             f"The World was fitted with execution={world.card.settings.execution}, the guard is to have "

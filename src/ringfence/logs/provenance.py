@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from ringfence.problem.origins import FIELDS as ORIGINS
+
 # What a card says of where its steps come from; the rest describes them, and later versions describe more.
 ORIGIN = ("task", "provenance", "simulator", "integrator", "reward", "seed", "transitions", "hazard", "content")
+ORIGIN += ORIGINS
 
 
 def regenerated(card: dict) -> bool:

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ringfence.errors import StoreError
+from ringfence.logs.moving import gap_at
 from ringfence.logs.store import EpisodeStore
 
 COARSE = 0.01  # of an entry's deviation: the distance of neighbouring numbers above which it is coarse
@@ -24,7 +25,7 @@ def coarse(store: EpisodeStore) -> list[str]:
         if len(found):
             warnings.append(
                 f"{what} entries {', '.join(map(str, found))} are so far from 0 that single precision tells their "
-                "values apart poorly; subtract an origin before making the store."
+                "values apart poorly; make the store of numbers in double precision, which are moved towards 0."
             )
     return warnings
 
@@ -45,7 +46,7 @@ def require_resolved(store: EpisodeStore) -> None:
                 raise StoreError(
                     f"{what} entry {entry}{name} of '{store.card.task}' reaches {np.abs(flat[..., entry]).max():.4g} "
                     f"and changes by {usual:.2g} a step, which single precision tells apart by {gap[entry]:.2g}: "
-                    "subtract an origin from it, the same from all entries that share it, or leave it out."
+                    "make the store of numbers in double precision, which are moved towards 0, or leave the entry out."
                 )
 
 
@@ -58,4 +59,4 @@ def _sources(store: EpisodeStore) -> Iterator[tuple[str, np.ndarray, list[str] |
 
 def _gap(flat: np.ndarray) -> np.ndarray:
     """(D,) the distance of neighbouring numbers of single precision, at the largest of rows (M, D)."""
-    return np.spacing(np.abs(flat).max(0).astype(np.float32)).astype(np.float64)
+    return gap_at(np.abs(flat).max(0))

@@ -15,6 +15,8 @@ from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.bounds import stored as stored_bound
+from ringfence.problem.origins import FIELDS as ORIGINS
+from ringfence.problem.origins import Origins
 from ringfence.types import as_tuples
 from ringfence.utils import schemas, stored
 from ringfence.utils.renamed import deprecated
@@ -49,6 +51,8 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     action_high: float | list = 1.0
     observation_names: list[str] | None = None
     state_names: list[str] | None = None
+    observation_origins: list[float] | None = None  # what was taken from each entry, e.g. of coordinates of a map
+    state_origins: list[float] | None = None
     hazard: dict[str, Any] = msgspec.field(default_factory=lambda: {"kind": "CostColumn"})
     dt: float | None = None  # s, of a step
     cost_limit: float | None = None  # of the team, per episode
@@ -71,6 +75,11 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         values = {**self.extra, **own}
         names = dict.fromkeys([*self.written, *differ, *self.extra])
         return {name: copy.deepcopy(values[name]) for name in names}
+
+    @property
+    def origins(self) -> Origins:
+        """What was taken from entries that are far from 0."""
+        return Origins.of({name: getattr(self, name) for name in ORIGINS})
 
     @property
     def bounds(self) -> Bounds:
@@ -226,6 +235,19 @@ def _lists_of_words(card: dict) -> None:
             _names_differ(name, list(words))
 
 
+def _origins(card: dict) -> None:
+    for name in ORIGINS:
+        origins = card.get(name)
+        origins = origins.tolist() if isinstance(origins, np.ndarray) else origins
+        if origins is not None and not (isinstance(origins, list | tuple) and all(_is_number(x) for x in origins)):
+            raise StoreError(
+                f"The card has {name}={repr(origins)[:200]}; it must be a list of numbers, what was subtracted from "
+                "each entry, or be left out."
+            )
+        if name in card:
+            card[name] = origins if origins is None else [float(x) for x in origins]
+
+
 def _names_differ(field: str, names: list[str]) -> None:
     wrong = [name for k, name in enumerate(names) if name in names[:k] or not name.isprintable()]
     if wrong:
@@ -274,6 +296,7 @@ CARD_RULES: tuple[Callable[[dict], None], ...] = (
     _cost_limit,
     _constraint_limits,
     _lists_of_words,
+    _origins,
     _seconds_of_a_step,
     _team,
     _homogeneous,
@@ -510,6 +533,14 @@ def _names_of_entries(store: Arrays) -> None:
         _demand(len(names) == size, f"The card names {len(names)} state entries, not {size}.")
 
 
+def _origins_of_entries(store: Arrays) -> None:
+    for field, array in zip(ORIGINS, (store.observations, store.state)):
+        origins = getattr(store.card, field)
+        if origins is not None and array is not None:
+            size = array.shape[-1]
+            _demand(len(origins) == size, f"The card has {len(origins)} {field}, the data has {size} such entries.")
+
+
 STORE_RULES: tuple[Callable[[Arrays], None], ...] = (
     _kinds,
     _actions,
@@ -524,4 +555,5 @@ STORE_RULES: tuple[Callable[[Arrays], None], ...] = (
     _episodes_end_in_one_way,
     _action_sizes,
     _names_of_entries,
+    _origins_of_entries,
 )

@@ -32,6 +32,7 @@ from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Table
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
+from ringfence.logs.moving import moved
 from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
@@ -184,6 +185,8 @@ class EpisodeStore:
             raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
         if self._shape_of_agents() != other._shape_of_agents():
             raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
+        if self.card.origins != other.card.origins:
+            raise StoreError("The stores were moved by other origins; make them of one table.")
         each = self.costs.ndim != other.costs.ndim  # the team's are everybody's, then
 
         def joined(name: str) -> np.ndarray:
@@ -235,7 +238,9 @@ class EpisodeStore:
             np.tile(self.terminated, n),
             np.tile(self.truncated, n),
             np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),
-            card=self.card.updated(state_names=None, agents=None, action_sizes=None, team=n, content=self.content),
+            card=self.card.updated(
+                state_names=None, state_origins=None, agents=None, action_sizes=None, team=n, content=self.content
+            ),
             constraints=None
             if self.constraints is None
             else np.moveaxis(self.constraints, 1, 0).reshape(-1, len(self.limits)),
@@ -278,16 +283,19 @@ class EpisodeStore:
         last[:, -1] = True
         ended = np.zeros(e, bool) if terminated is None else _truths("terminated", terminated)
         steps = e * length
+        ends = np.arange(1, e + 1) * length
+        states = None if state is None else _rows(state, e * (length + 1))
+        seen, states, card = moved(_rows(observations, e * (length + 1)), states, ends, complete_card(card or {}))
         return cls(
-            _flat(observations, e * (length + 1)),
+            seen,
             _flat(actions, steps),
             _flat(rewards, steps),
             _flat(costs, steps),
             (last & ended[:, None]).ravel(),
             (last & ~ended[:, None]).ravel(),
-            np.arange(1, e + 1) * length,
-            None if state is None else _flat(state, e * (length + 1)),
-            complete_card(card or {}),
+            ends,
+            states,
+            card,
             constraints=None if several is None else _flat(several, steps),
         )
 
@@ -313,9 +321,9 @@ class EpisodeStore:
         (E, S): the state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit);
         speed (T,)."""
         ends = _whole_ends(episode_ends)
-        observations = _floats("observations", observations, 3)
+        observations = _numbers("observations", observations, 3)
         actions = _floats("actions", actions, 3)
-        final_observations = _floats("final_observations", final_observations, 3)
+        final_observations = _numbers("final_observations", final_observations, 3)
         rewards = _floats("rewards", rewards)
         n_steps, n_agents = actions.shape[:2]
         costs, several, card = _several(costs, (n_steps,), n_agents, card)
@@ -327,8 +335,10 @@ class EpisodeStore:
         if rewards.ndim == 1:
             rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
+        seen = np.insert(observations, ends, final_observations, axis=0)
+        seen, states, card = moved(seen, states, ends, complete_card(card or {}))
         return cls(
-            np.insert(observations, ends, final_observations, axis=0),
+            seen,
             actions,
             rewards,
             np.zeros(n_steps, np.float32) if costs is None else _numbers("costs", costs).astype(np.float32),
@@ -336,7 +346,7 @@ class EpisodeStore:
             _flags(ends[~ended], n_steps),
             ends,
             states,
-            complete_card(card or {}),
+            card,
             None if speed is None else _numbers("speed", speed),
             several,
         )
@@ -552,8 +562,12 @@ def _floats(name: str, value, axes: int | None = None) -> np.ndarray:
 
 
 def _flat(x: np.ndarray, rows: int) -> np.ndarray:
-    """(E, L, ...) as (rows, ...), episodes one after another."""
-    return np.ascontiguousarray(x.reshape(rows, *x.shape[2:])).astype(np.float32, copy=False)
+    """(E, L, ...) as (rows, ...) in single precision, episodes one after another."""
+    return _rows(x, rows).astype(np.float32, copy=False)
+
+
+def _rows(x: np.ndarray, rows: int) -> np.ndarray:
+    return np.ascontiguousarray(x.reshape(rows, *x.shape[2:]))
 
 
 def _flags(ends: np.ndarray, steps: int) -> np.ndarray:
@@ -607,8 +621,8 @@ def _check_episodes(sizes: tuple[int, int, int], **arrays: np.ndarray | None) ->
 
 def _whole_states(state: Any, final_state: Any, ends: np.ndarray, n_steps: int) -> np.ndarray | None:
     """(T + E, S) the states of all steps and of the ends, in order; None where there are none."""
-    state = None if state is None else _floats("state", state, 2)
-    final_state = None if final_state is None else _floats("final_state", final_state, 2)
+    state = None if state is None else _numbers("state", state, 2)
+    final_state = None if final_state is None else _numbers("final_state", final_state, 2)
     if state is None:
         return None
     _check_rows("state", state, n_steps)

@@ -109,6 +109,15 @@ class Panel:
 
 
 @dataclass(frozen=True)
+class Drawn:
+    """A figure with a title, and what is said below it."""
+
+    title: str
+    svg: Markup
+    said: str
+
+
+@dataclass(frozen=True)
 class BarrierField:
     """A picture of a barrier around an agent, and what is said of it."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,8 @@ from markupsafe import Markup
 
 from ringfence.datasets.audit import Audit
 from ringfence.evaluation.ope.result import Behaviour, OPEResult, Safety
-from ringfence.report import html
-from ringfence.report.figures import INK, figure, style, to_svg
+from ringfence.report import html, probes
+from ringfence.report.figures import INK, Drawn, figure, style, to_svg
 from ringfence.world import Card
 from ringfence.world.card import BarrierScores
 
@@ -22,15 +21,6 @@ BEHAVIOUR = {
     "guard_ood_rate": "states that are out of distribution for the guard's World",
     "ood_rate": "states in which the action leads out of the distribution of these logs",
 }
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A figure of the page."""
-
-    title: str
-    svg: Markup
-    said: str
 
 
 def build_ope(out: str | Path, card: Card, audit: Audit, result: OPEResult | None = None) -> Path:
@@ -46,6 +36,7 @@ def build_ope(out: str | Path, card: Card, audit: Audit, result: OPEResult | Non
             "warnings": [*audit.warnings, *audit.notes],
             "words": str(card).splitlines(),
             "figures": _figures(card, result),
+            "probes": probes.panels(card),
             "ope": result,
             "behaviour": [] if result is None else _rates(result.behaviour),
         },

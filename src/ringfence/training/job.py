@@ -12,6 +12,7 @@ from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
+from ringfence.problem.origins import NOWHERE, Origins
 from ringfence.training import worlds
 from ringfence.types import Algorithm, Spec
 
@@ -30,6 +31,7 @@ class Job:
     widths: tuple[int | None, int | None] = (None, None)  # entries of an observation and of the state, where known
     world: dict | None = None  # settings of the World that training reads, if it reads one
     team: int = 1  # agents who play; more than the spec's one where they are homogeneous
+    origins: Origins = NOWHERE  # of the data, which are taken from what is given at run time
 
     @property
     def reads_world(self) -> bool:
@@ -89,7 +91,8 @@ def make_job(
         raise UserError(f"{a.name} reads no World in training; leave world= out.")
     team = spec.n_agents if store is None else store.card.team or store.n_agents
     team = team if task.env is None else task.env.n_agents
-    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), settings, team)
+    origins = NOWHERE if store is None else store.card.origins
+    return Job(a, preset, config, task, spec, feature_map, hazard, widths_of(task, store), settings, team, origins)
 
 
 def widths_of(task: Task, store: EpisodeStore | None = None) -> tuple[int | None, int | None]:

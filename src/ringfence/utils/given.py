@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,10 +19,12 @@ def given_as(
     expected: tuple[int | None, ...],
     who: str = "this run",
     remedy: str = "pass what its data holds",
+    origins: Sequence[float] | None = None,
 ) -> np.ndarray:
     """A new float32 array of the expected shape, with finite numbers alone; None stands for a width that nobody knows.
 
-    It is a copy: whoever gave it may go on writing into theirs.
+    It is a copy: whoever gave it may go on writing into theirs. `origins` of its last axis are taken from it, in double
+    precision.
     """
     letters = LETTERS[len(expected)]
     wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
@@ -34,6 +36,8 @@ def given_as(
             array = array.astype(np.float32)
         if array.dtype.kind not in NUMBERS:
             raise TypeError
+        if origins is not None and array.shape[-1:] == (len(origins),):
+            array = array.astype(np.float64) - np.asarray(origins)
         with np.errstate(over="ignore"):
             array = np.array(array, np.float32)
     except (TypeError, ValueError):

@@ -27,6 +27,13 @@ def float32() -> AbstractContextManager[object]:
     return getattr(experimental, "disable_x64")()  # noqa: B009 (what versions before call it)
 
 
+def float64() -> AbstractContextManager[object]:
+    """While it is open, JAX makes numbers of 64 bits."""
+    if hasattr(jax, "enable_x64"):
+        return jax.enable_x64(True)
+    return getattr(experimental, "enable_x64")()  # noqa: B009 (what versions before call it)
+
+
 def in_float32(function: Callable[P, T]) -> Callable[P, T]:
     """The function, in 32 bits."""
 

@@ -73,6 +73,8 @@ class Data(TypedDict, total=False):
     agents: list[str] | None
     observation_names: list[str] | None
     state_names: list[str] | None
+    observation_origins: list[float] | None
+    state_origins: list[float] | None
 
 
 class Config(TypedDict):

@@ -34,6 +34,8 @@ class Data(Part, frozen=True):
     observation_width: int | None = None  # entries of what an agent sees
     state_width: int | None = None  # of the global state
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
+    observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
+    state_origins: list[float] | None = None
 
 
 class HeldOut(Part, frozen=True):
@@ -90,6 +92,17 @@ class Probe(Part, frozen=True):
     at: tuple[float, ...]  # values, from low to high; of a cause of several entries along the first
     scores: tuple[float, ...]  # median score there, in margins
     edge: float = UNKNOWN  # where danger begins, in the entry's unit
+    unsafe: tuple[float, ...] = ()  # share of held-out states called unsafe with it put there, of a neighbour at rest
+    unsafe_closing: tuple[float, ...] = ()  # the same of a neighbour that closes in, where names tell its velocity
+
+
+class ProbeMap(Part, frozen=True):
+    """What a barrier answers over a plane of two entries, such as one's own place."""
+
+    name: str
+    x: tuple[float, ...]  # values of the first entry, from low to high
+    y: tuple[float, ...]  # of the second
+    scores: tuple[tuple[float, ...], ...]  # in margins, a row for each y
 
 
 class Verdict(Part, frozen=True):
@@ -120,6 +133,7 @@ class BarrierScores(Part, frozen=True):
     margin_kept: float = UNKNOWN  # share of the safe steps that have the default margin
     probed: float = UNKNOWN  # share of held-out states that are called unsafe with somebody put inside the radius
     probes: tuple[Probe, ...] = ()
+    maps: tuple[ProbeMap, ...] = ()
 
 
 class Card(msgspec.Struct, frozen=True, kw_only=True):

@@ -102,6 +102,7 @@ def fit_view(
     ]
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
+    content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
@@ -168,6 +169,8 @@ def _data(store: EpisodeStore, several: bool) -> Data:
         observation_width=store.observations.shape[2],
         state_width=None if store.state is None else store.state.shape[1],
         unsafe_costs={name: _unsafe_cost(store, name) for name in store.limits} if several else None,
+        observation_origins=store.card.observation_origins,
+        state_origins=store.card.state_origins,
     )
 
 

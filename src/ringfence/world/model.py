@@ -5,6 +5,8 @@ from __future__ import annotations
 import equinox as eqx
 
 from ringfence.problem.features import FeatureMap
+from ringfence.problem.origins import FIELDS as ORIGINS
+from ringfence.problem.origins import Origins
 from ringfence.types import Array, Spec
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import Card
@@ -34,6 +36,12 @@ class World(eqx.Module):
     def widths(self) -> tuple[int | None, int | None]:
         """Entries of an observation and of the global state in the logs; None where an older World does not say."""
         return self.card.data.observation_width, self.card.data.state_width
+
+    @property
+    def origins(self) -> Origins:
+        """What was taken from entries of the logs, and is taken from what is given at run time."""
+        data = self.card.data
+        return Origins.of({name: getattr(data, name) for name in ORIGINS})
 
     @property
     def unsafe_steps(self) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +12,7 @@ import numpy as np
 from ringfence.types import Array
 from ringfence.world import cause_search, causes
 from ringfence.world.barrier import Barrier, MinBarrier
-from ringfence.world.card import UNKNOWN, Probe
+from ringfence.world.card import UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
 from ringfence.world.causes import Cause, Edge
 from ringfence.world.logged import Logged
@@ -21,39 +22,126 @@ INSIDE = 0.9  # of the radius: what is nearer has to be called unsafe
 STATES = 500  # held-out states that are asked about
 CLOSING = (0.0, 1.0)  # of the fastest closing that was seen
 POINTS = 25  # of a curve
+FARTHEST = 4.0  # radii, up to which the curve of a distance reaches
+SIDE = 32  # values along each axis of a map
+ASKED = 50  # held-out states in which every place of a map is asked about
+OWN_PLACE = ("own.x", "own.y")
+OWN_SPEED = (("own.vx", "own.vy"), ("own.v",), ("own.speed",))
 
 
-def probe(
-    barrier: Barrier | MinBarrier, logged: Logged, unit: float, rng: np.random.Generator
-) -> tuple[tuple[Probe, ...], float]:
-    """(answers in margins of `unit`, share of states with somebody inside the radius that are called unsafe)."""
+class Probed(NamedTuple):
+    """What was asked, and how it was answered."""
+
+    answers: tuple[Probe, ...]
+    maps: tuple[ProbeMap, ...]
+    inside: float  # share of states with somebody inside the radius that are called unsafe
+
+
+def probe(barrier: Barrier | MinBarrier, logged: Logged, unit: float, rng: np.random.Generator) -> Probed:
+    """A barrier's answers, in margins of `unit`."""
     each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
-    curves = [_curve(net, unit) for one in each for net in one.causes if net.cause.width == 1]
+    nets = [net for one in each for net in one.causes]
+    curves = [_curve(net, unit) for net in nets if net.cause.width == 1]
+    maps = [_map(net, unit) for net in nets if net.cause.width == 2]
     states = _states(logged, rng)
+    names = logged.map.names
+    if not nets:
+        curves += _own_speed(barrier, states, names, unit)
+        maps += _own_place(barrier, states, names, unit)
     answers = []
     inside = []
     for cause, edge in _near(barrier, logged):
         if edge.at is None or not edge.below:
             continue
-        scores = {ratio: _put(barrier, states, logged.map.names, cause, ratio * edge.at) / unit for ratio in RADII}
-        at = tuple(round(ratio * edge.at, 4) for ratio in RADII)
-        medians = tuple(round(float(np.median(scores[ratio])), 3) for ratio in RADII)
-        answers.append(Probe(f"{cause.name}, put into held-out states", at, medians, edge.at))
+        scores = {ratio: _put(barrier, states, names, cause, ratio * edge.at) / unit for ratio in RADII}
+        answers.append(_neighbour(cause, edge.at, [scores[ratio] for ratio in RADII]))
         inside += [(scores[ratio] < 0).mean() for ratio in RADII if ratio <= INSIDE]
-    return (*curves, *answers), float(np.mean(inside)) if inside else UNKNOWN
+    return Probed((*curves, *answers), tuple(maps), float(np.mean(inside)) if inside else UNKNOWN)
+
+
+def _neighbour(cause: Cause, radius: float, scores: list[np.ndarray]) -> Probe:
+    """What is answered about something at each of RADII, by scores (speeds, W) of states."""
+    at_rest, *closing = ([round(float((one[k] < 0).mean()), 3) for one in scores] for k in range(len(scores[0])))
+    return Probe(
+        name=f"{cause.name}, put into held-out states",
+        at=tuple(round(ratio * radius, 4) for ratio in RADII),
+        scores=tuple(round(float(np.median(one)), 3) for one in scores),
+        edge=radius,
+        unsafe=tuple(at_rest),
+        unsafe_closing=tuple(closing[0]) if closing else (),
+    )
 
 
 def _curve(net: Score, unit: float) -> Probe:
-    """Scores of a cause that reads one number, along it."""
+    """Scores of a cause that reads one number, along it; of a distance from 0 to well beyond where danger begins."""
     edge = net.edge
     reach = 0.25 * (edge.high[0] - edge.low[0])
     low = max(0.0, edge.low[0] - reach) if net.cause.length else edge.low[0] - reach
-    at = np.linspace(low, edge.high[0] + reach, POINTS)
+    high = edge.high[0] + reach
+    if net.cause.length and edge.at:
+        low, high = 0.0, min(high, FARTHEST * edge.at)
+    at = np.linspace(low, high, POINTS)
     scores = np.asarray(net.of_values(jnp.asarray(at[:, None], jnp.float32))) / unit
-    crossing = np.flatnonzero((scores[:-1] < 0) != (scores[1:] < 0))
-    begins = round(float(at[crossing[0]]), 4) if len(crossing) else UNKNOWN
+    return _along(net.cause.name, at, scores, edge.at)
+
+
+def _along(name: str, at: np.ndarray, scores: np.ndarray, edge: float | None = None) -> Probe:
+    """A curve of scores in margins; danger begins at `edge`, or where the score first passes 0."""
+    if edge is None:
+        k = next(iter(np.flatnonzero((scores[:-1] < 0) != (scores[1:] < 0))), None)
+        edge = UNKNOWN if k is None else float(at[k] - scores[k] * (at[k + 1] - at[k]) / (scores[k + 1] - scores[k]))
     shown = tuple(round(float(score), 3) for score in scores)
-    return Probe(net.cause.name, tuple(round(float(value), 4) for value in at), shown, begins)
+    return Probe(name, tuple(round(float(value), 4) for value in at), shown, round(edge, 4))
+
+
+def _map(net: Score, unit: float) -> ProbeMap:
+    """Scores of a cause that reads two numbers, over their plane."""
+    axes = [_axis(low, high) for low, high in zip(net.edge.low, net.edge.high)]
+    places = np.stack(np.meshgrid(*axes), -1)
+    return _over(net.cause.name, axes, np.asarray(net.of_values(jnp.asarray(places, jnp.float32))) / unit)
+
+
+def _over(name: str, axes: Sequence[np.ndarray], scores: np.ndarray) -> ProbeMap:
+    x, y = (tuple(round(float(value), 4) for value in axis) for axis in axes)
+    return ProbeMap(name, x, y, tuple(tuple(round(float(score), 2) for score in row) for row in scores))
+
+
+def _axis(low: float, high: float) -> np.ndarray:
+    """Values over what was seen, and a little beyond."""
+    reach = 0.1 * (high - low)
+    return np.linspace(low - reach, high + reach, SIDE)
+
+
+def _own_speed(barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], unit: float) -> list[Probe]:
+    """Median scores of the first agent along its own speed, where names tell it; all else stays as it was."""
+    entries = next((found for found in OWN_SPEED if set(found) <= set(names)), None)
+    if entries is None:
+        return []
+    index = np.array([list(names).index(name) for name in entries])
+    velocity = np.asarray(states[:, 0, index])
+    speed = np.maximum(np.sqrt((velocity**2).sum(-1, keepdims=True)), 1e-6)
+    at = np.linspace(0.0, 1.25 * np.quantile(speed, 0.999), POINTS)
+    put = [states.at[:, 0, index].set(value * velocity / speed) for value in at]
+    scores = [np.median(np.asarray(_scores_of_all(barrier, states, x))[:, 0]) for x in put]
+    name = f"own speed ({', '.join(entries)}), put into held-out states"
+    return [_along(name, at, np.array(scores) / unit)]
+
+
+def _own_place(barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], unit: float) -> list[ProbeMap]:
+    """Median scores of the first agent over its own place, where names tell it; all else stays as it was."""
+    if not set(OWN_PLACE) <= set(names):
+        return []
+    index = np.array([list(names).index(name) for name in OWN_PLACE])
+    some = states[:ASKED]
+    axes = [_axis(*np.quantile(states[:, 0, d], (0.0, 1.0))) for d in index]
+    rows = []
+    for y in axes[1]:
+        places = jnp.asarray([(x, y) for x in axes[0]], jnp.float32)  # (SIDE, 2)
+        there = jnp.broadcast_to(places[:, None], (SIDE, len(some), 2)).reshape(-1, 2)
+        before = jnp.tile(some, (SIDE, 1, 1))
+        scores = _scores_of_all(barrier, before, before.at[:, 0, index].set(there))
+        rows.append(np.median(np.asarray(scores)[:, 0].reshape(SIDE, -1), 1))
+    return [_over(f"{', '.join(OWN_PLACE)}, put into held-out states", axes, np.array(rows) / unit)]
 
 
 def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Edge]]:
@@ -82,8 +170,8 @@ def _states(logged: Logged, rng: np.random.Generator) -> Array:
 def _put(
     barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], cause: Cause, distance: float
 ) -> np.ndarray:
-    """(W * closing,) scores of the first agent that the cause is about, with its thing at that distance, at rest and
-    closing."""
+    """(1 or 2, W) scores of the first agent that the cause is about, with its thing at that distance: at rest, and
+    closing where names tell its velocity."""
     agent, thing = cause.who[0] if cause.who else (0, 0)
     place = np.array(cause.things[thing])
     offset = states[:, agent, place]
@@ -92,13 +180,13 @@ def _put(
     put = states.at[:, agent, place].set(direction * distance)
     speed = _speed_entries(names, place)
     found = []
-    for share in CLOSING:
+    for share in CLOSING if speed is not None else CLOSING[:1]:
         moved = put
         if speed is not None:
             fastest = jnp.quantile(jnp.sqrt((states[..., speed] ** 2).sum(-1)), 0.99)
             moved = put.at[:, agent, speed].set(-share * fastest * direction)
         found.append(np.asarray(_scores_of_all(barrier, states, moved))[:, agent])
-    return np.concatenate(found)
+    return np.stack(found)
 
 
 def _speed_entries(names: Sequence[str], place: np.ndarray) -> np.ndarray | None:

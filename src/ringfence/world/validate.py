@@ -11,6 +11,7 @@ import numpy as np
 
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
+from ringfence.world import probes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (
     UNKNOWN,
@@ -35,10 +36,9 @@ from ringfence.world.margins import (
     rolled,
 )
 from ringfence.world.model import World
-from ringfence.world.probes import probe
 from ringfence.world.values import Values
 
-VERSION = 13  # of the validation: cached cards of another are made again
+VERSION = 14  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 STEPS = 60_000  # held-out steps that are scored
 SCORED = 20_000  # of them at once
@@ -230,7 +230,7 @@ def _barrier_scores(
         unit = max(least, calibrated(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))
     share = float(unsafe[held].mean())
     alarm = np.quantile(now[~truth], FALSE_ALARMS)
-    answers, probed = probe(barrier, logged, unit, rng)
+    asked = probes.probe(barrier, logged, unit, rng)
     scores = BarrierScores(
         unsafe_share=share,
         auroc=_auroc(now, truth),
@@ -246,8 +246,9 @@ def _barrier_scores(
         avoidable=_avoidable(dynamics, barrier, logged.arrays, ends[:ENTERED]),
         entries=float(count_entries(logged, bad)),
         margin_kept=float((now[~truth] >= unit).mean()),
-        probed=probed,
-        probes=answers,
+        probed=asked.inside,
+        probes=asked.answers,
+        maps=asked.maps,
     )
     return scores, unit
 

@@ -23,6 +23,7 @@ from ringfence.evaluation.ope.safety import safety
 from ringfence.loading.resolve import resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.origins import Origins
 from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.utils.precision import in_float32
@@ -161,6 +162,10 @@ def check(run: Run, store: EpisodeStore) -> None:
         if here is not None and here != there:
             raise UserError(f"The run is of {here} {what}, the logs of {there}; evaluate it by logs of its own task.")
     _check_names(config["data"], store)
+    if Origins.of(config["data"]) != store.card.origins:
+        raise UserError(
+            "The logs were moved by other origins than the run's data; make both of one table, e.g. with --split."
+        )
     here, there = config["data"].get("dt"), store.card.dt
     if here and there and abs(here - there) > SAME_STEP * max(here, there):
         raise UserError(

@@ -177,6 +177,8 @@ def check_view(world: World, store: EpisodeStore) -> None:
             f"The World reads {wanted[0]} agents of {wanted[1]} entries and {wanted[2]} actions, the logs hold "
             f"{shape[0]} of {shape[1]} and {shape[2]}; fit a World to these logs."
         )
+    if world.origins != store.card.origins:
+        raise UserError("The logs were moved by other origins than those of the World; fit a World to these logs.")
     names = store.card.observation_names
     if names and not world.map.reads_state:
         for name, entry in zip(world.map.names, world.map.plus[0]):

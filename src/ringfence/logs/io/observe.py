@@ -23,7 +23,8 @@ def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] |
 
     `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
     `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
-    are homogeneous, any number in any order.
+    are homogeneous, any number in any order. Numbers are as they were measured: where the card tells origins, they are
+    in double precision, and whoever acts on them takes the origins from them.
     """
     fields = stored.card(card.to_dict() if isinstance(card, StoreCard) else card)
     names: list[str] = list(fields.get("observation_names") or ())
@@ -37,7 +38,8 @@ def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] |
         raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")
     whom = _seen_by_each(fields, columns, _others_in(names))
     now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
-    return np.stack([now.entry(name) for name in names], 1).astype(np.float32)
+    seen = np.stack([now.entry(name) for name in names], 1)
+    return seen if fields.get("observation_origins") else seen.astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,10 +48,11 @@ class Values:
     columns: Columns  # (M,) each of state, action and goal
     reward: np.ndarray  # (M,)
     cost: np.ndarray  # (M, K)
+    single: tuple[str, ...] = ()  # columns that the table holds in single precision
 
     def chosen(self, kept: np.ndarray) -> Values:
         columns = {name: column[kept] for name, column in self.columns.items()}
-        return Values(columns, self.reward[kept], self.cost[kept])
+        return Values(columns, self.reward[kept], self.cost[kept], self.single)
 
     def stacked(self, names: tuple[str, ...]) -> np.ndarray:
         """(M, columns)"""
@@ -108,7 +109,8 @@ def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
     zero = np.zeros(len(rows.time))
     reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
     costs = [numbers(columns, name)[rows.order] for name in schema.cost]
-    return Values(read, reward, np.stack(costs or [zero], 1))
+    single = tuple(name for name in read if columns[name].dtype == np.float32)
+    return Values(read, reward, np.stack(costs or [zero], 1), single)
 
 
 def clock_of(rows: Rows, schema: TableSchema) -> Clock:
@@ -177,7 +179,7 @@ def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Ite
     if schema.position:
         yield from _doubtful_velocities(rows, values, schema)
         yield from _jumps(rows, values, schema)
-    yield from _far_from_zero(rows, values)
+    yield from blurred(rows, values)
     if clock.dt >= LONG:
         yield f"a step is {clock.dt:g} s: if times are in ms or µs, scale them to seconds"
     if schema.dt is None:
@@ -198,16 +200,18 @@ def _speeds(rows: Rows, values: Values, schema: TableSchema) -> np.ndarray:
     return np.linalg.norm(_moved(rows, values, schema), axis=1)
 
 
-def _far_from_zero(rows: Rows, values: Values) -> Iterator[str]:
-    """Columns whose numbers 32 bits tell apart by more than a part of what they usually change by, such as UTM."""
-    for name, column in values.columns.items():
+def blurred(rows: Rows, values: Values) -> Iterator[str]:
+    """Columns of single precision that tells their numbers apart by more than a part of what they usually change by,
+    such as UTM. Those of double precision are moved (`logs.moving`)."""
+    for name in values.single:
+        column = values.columns[name]
         change = np.abs(np.diff(column))[rows.follows]
         usual = float(np.median(change[change > 0])) if (change > 0).any() else 0.0
         gap = float(np.spacing(np.float32(np.abs(column).max())))
         if usual and gap > COARSE * usual:
             yield (
                 f"{name} reaches {np.abs(column).max():.4g} and changes by {usual:.2g} a row, which single precision "
-                f"tells apart by {gap:.2g}: subtract an origin from it, the same from all columns that share it"
+                f"tells apart by {gap:.2g}: write the column in double precision"
             )
 
 

@@ -24,6 +24,7 @@ from ringfence.logs.io.rows import (
     Clock,
     Rows,
     Values,
+    blurred,
     clock_of,
     doubts,
     refuse_jumps,
@@ -110,6 +111,7 @@ def _read(
     refuse_jumps(rows, values, schema)
     clock = clock_of(rows, schema)
     doubtful = list(doubts(rows, values, clock, schema))
+    lost = any(blurred(rows, values))
     recordings = int(rows.recording.max()) + 1
     if share is not None:
         rows, values = parted(rows, values, share)
@@ -117,7 +119,10 @@ def _read(
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
     warnings = [*notes, *angles, *dropped, *doubtful, *_made_of(schema), *episodes.notes]
-    return _steps(motion, episodes, warnings, card or {}), int(early.sum())
+    steps = _steps(motion, episodes, warnings, card or {})
+    if lost:  # what the table has lost is not found again by moving it
+        steps |= {name: steps[name].astype(np.float32) for name in ("observations", "final_observations")}
+    return steps, int(early.sum())
 
 
 def read_layout(table: Table, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
