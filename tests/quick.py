@@ -1,5 +1,7 @@
 """What several test files ask for by name."""
 
+import jax
+
 # A World that is fitted in a second and knows little.
 QUICK_WORLD = dict(
     num_ensemble=2,
@@ -10,3 +12,9 @@ QUICK_WORLD = dict(
     barrier_width=8,
     future_updates=20,
 )
+
+
+def in_one_program(function, *arguments):
+    """What a function of JAX gives, compiled as a whole: operation by operation takes a program each."""
+    fixed = tuple(k for k, x in enumerate(arguments) if isinstance(x, int))
+    return jax.jit(lambda *given: function(*given), static_argnums=fixed)(*arguments)
