@@ -1,5 +1,7 @@
 """What several test files ask for by name."""
 
+import functools
+
 import jax
 
 # A World that is fitted in a second and knows little.
@@ -18,3 +20,21 @@ def in_one_program(function, *arguments):
     """What a function of JAX gives, compiled as a whole: operation by operation takes a program each."""
     fixed = tuple(k for k, x in enumerate(arguments) if isinstance(x, int))
     return jax.jit(lambda *given: function(*given), static_argnums=fixed)(*arguments)
+
+
+class Compiled:
+    """A simulator whose methods are a program each; what is no method of arrays is its own."""
+
+    METHODS = ("reset", "step", "observe", "global_state", "from_global_state", "clearance")
+
+    def __init__(self, env):
+        self.env = env
+
+    def __getattr__(self, name):
+        found = getattr(self.env, name)
+        return _program(self.env, name) if name in self.METHODS else found
+
+
+@functools.cache
+def _program(env, name):
+    return jax.jit(getattr(env, name), static_argnums=1 if name == "reset" else ())

@@ -25,12 +25,12 @@ from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save
 from ringfence.world.logged import held_out
-from tests.quick import QUICK_WORLD
+from tests.quick import QUICK_WORLD, Compiled
 
 
 def lone(velocity, **room) -> tuple[Crossing, CrossingState]:
     """One disc at the room's centre with its goal to the right."""
-    env = Crossing(n_agents=1, **room)
+    env = Compiled(Crossing(n_agents=1, **room))
     state = env.reset(jax.random.key(0), 1)
     zero = jnp.zeros((1, 1, 2))
     return env, state._replace(position=zero, velocity=zero + jnp.asarray(velocity), goal=zero + jnp.array([9.0, 0.0]))
@@ -60,7 +60,7 @@ def test_drivers_of_the_pool_keep_to_their_sides():
     """Somebody comes head on: two of the four go to one side each, the others do as their certificates say; with nobody
     near all go straight. All four drive equally often, and the card says who."""
     env = Crossing(n_agents=2)
-    state = env.reset(jax.random.key(0), 1)
+    state = Compiled(env).reset(jax.random.key(0), 1)
     way = jnp.array([[[1.0, 0.0], [-1.0, 0.0]]])
     for gap, turned in ((0.6, True), (2.9, False)):
         place = jnp.array([[[0.0, 0.0], [gap, 0.0]]])
@@ -79,15 +79,15 @@ def test_drivers_of_the_pool_keep_to_their_sides():
 
 @pytest.mark.parametrize("room", [{}, {"n_agents": 64}, {"n_agents": 3, "obstacles": 4, "walls": True}])
 def test_everybody_starts_at_rest_and_free_and_the_state_tells_all(room):
-    env = Crossing(**room)
-    state = jax.jit(env.reset, static_argnums=1)(jax.random.key(1), 50)
+    env = Compiled(Crossing(**room))
+    state = env.reset(jax.random.key(1), 50)
     assert float(env.clearance(state).min()) > 0.05 and float(jnp.abs(state.velocity).max()) == 0
     again = env.from_global_state(env.global_state(state))
     assert all(jnp.array_equal(a, b) for a, b in zip(state, again))
     assert env.global_state(state).shape[-1] == len(env.state_names)
     assert jax.eval_shape(env.observe, state).shape[-1] == len(env.observation_names) == env.observation_dim
     push = jax.random.uniform(jax.random.key(2), (50, env.n_agents, 2), minval=-1.0, maxval=1.0)
-    step = jax.jit(env.step)
+    step = env.step
     (a, told), (b, same) = step(state, push), step(again, push)
     assert all(jnp.array_equal(x, y) for x, y in zip((*a, *told), (*b, *same)))  # even where a goal is drawn anew
 
@@ -99,10 +99,10 @@ def comes_within(offset, speed) -> float:
 
 
 def test_agents_see_first_who_comes_near():
-    env = Crossing(n_agents=12)
-    state = jax.jit(env.reset, static_argnums=1)(jax.random.key(3), 4)
+    env = Compiled(Crossing(n_agents=12))
+    state = env.reset(jax.random.key(3), 4)
     state = state._replace(velocity=jax.random.normal(jax.random.key(4), state.velocity.shape))
-    seen, names = np.asarray(jax.jit(env.observe)(state)), env.observation_names
+    seen, names = np.asarray(env.observe(state)), env.observation_names
     p, v = np.asarray(state.position), np.asarray(state.velocity)
     at = names.index("other0.dx")
     for b, i in ((0, 0), (2, 7), (3, 11)):
@@ -121,12 +121,12 @@ def test_agents_see_first_who_comes_near():
 
 
 def test_costs_are_of_those_who_touch():
-    env = Crossing(n_agents=3)
+    env = Compiled(Crossing(n_agents=3))
     state = env.reset(jax.random.key(0), 1)
     place = jnp.array([[[0.0, 0.0], [1.9 * RADIUS, 0.0], [2.0, 0.0]]])
     _, out = env.step(state._replace(position=place), jnp.zeros((1, 3, 2)))
     np.testing.assert_array_equal(out.cost, [[1, 1, 0]])
-    walled = Crossing(n_agents=1, walls=True)
+    walled = Compiled(Crossing(n_agents=1, walls=True))
     state = walled.reset(jax.random.key(0), 1)
     state = state._replace(position=jnp.full((1, 1, 2), walled.side / 2 - RADIUS - 0.01), velocity=jnp.ones((1, 1, 2)))
     after, out = walled.step(state, jnp.zeros((1, 1, 2)))
@@ -154,7 +154,7 @@ def test_what_is_foreseen_of_others_who_coast_is_exact():
 
 def test_certificates_keep_apart_who_would_touch():
     env = Crossing()
-    first = env.reset(jax.random.key(5), 20)
+    first = Compiled(env).reset(jax.random.key(5), 20)
 
     def contacts(name: str) -> float:
         habits = jnp.array(astuple(recipe.DRIVERS[name]))
@@ -212,7 +212,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
     assert result["variant"] == "default+shield-learned+correction_steps1+horizon1+agents3"
     assert evaluate(run, episodes=2)["agents"] == 8
     pilot = Controller(run, guard="shield", world=world, agents=5)
-    env = Crossing(n_agents=5)
+    env = Compiled(Crossing(n_agents=5))
     seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1))[0])
     acted = pilot.act(seen)
     assert acted.shape == (5, 2)
@@ -228,7 +228,7 @@ def test_it_is_learned_guarded_and_played_by_any_number(logs, tmp_path, monkeypa
 
 
 def test_episodes_are_drawn():
-    env = Crossing(n_agents=3, obstacles=1)
+    env = Compiled(Crossing(n_agents=3, obstacles=1))
     state = env.reset(jax.random.key(0), 1)
     touching = state._replace(position=state.position.at[:, 1].set(state.position[:, 0] + 0.1))
     states = np.concatenate([env.global_state(state), env.global_state(touching)])

@@ -16,7 +16,7 @@ from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play
 from ringfence.problem import constraints
 from ringfence.training import loop, worlds
-from tests.quick import QUICK_WORLD
+from tests.quick import QUICK_WORLD, Compiled
 
 TASK = registry.get("spread_alike-expert")
 
@@ -32,7 +32,7 @@ def seen(env, state) -> list[dict[str, float]]:
 
 
 def test_who_comes_is_told_before_who_is_near():
-    env = SpreadAlike(n_agents=4)
+    env = Compiled(SpreadAlike(n_agents=4))
     place = jnp.array([[[0.0, 0.0], [0.5, 0.0], [0.0, 0.6], [-1.0, 0.0]]])
     speed = jnp.array([[[0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [2.0, 0.0]]])
     landmarks = jnp.array([[[1.0, 0.0], [0.0, 0.5], [-0.2, 0.0], [9.0, 0.0]]])
@@ -47,22 +47,22 @@ def test_what_is_not_there_looks_like_what_is_far():
     """Two agents see what three see of whom one is beyond sight."""
     place = jnp.array([[[0.0, 0.0], [0.5, 0.0], [9.0, 9.0]]])
     marks = jnp.array([[[0.0, 0.3], [0.7, 0.0], [9.0, 0.0]]])
-    three = SpreadAlike().observe(SpreadState(place, 0 * place, marks))
-    two = SpreadAlike(n_agents=2).observe(SpreadState(place[:, :2], 0 * place[:, :2], marks[:, :2]))
+    three = Compiled(SpreadAlike()).observe(SpreadState(place, 0 * place, marks))
+    two = Compiled(SpreadAlike(n_agents=2)).observe(SpreadState(place[:, :2], 0 * place[:, :2], marks[:, :2]))
     np.testing.assert_array_equal(three[:, :2], two)
-    told = seen(SpreadAlike(), SpreadState(place, 0 * place, marks))[0]
+    told = seen(Compiled(SpreadAlike()), SpreadState(place, 0 * place, marks))[0]
     assert (told["other1.dx"], told["other1.seen"], told["landmark2.dx"]) == (SIGHT, 0.0, SIGHT)
 
 
 @pytest.mark.parametrize("agents", [1, 2, 3, 6])
 def test_every_team_sees_alike_in_a_room_as_crowded(agents):
-    env = SpreadAlike(n_agents=agents)
+    env = Compiled(SpreadAlike(n_agents=agents))
     state = env.reset(jax.random.key(0), 20)
     assert env.observe(state).shape == (20, agents, len(SpreadAlike().observation_names))
     assert (2 * env.half_width) ** 2 / agents == pytest.approx(4 / 3)
     assert float(jnp.abs(state.position).max()) <= env.half_width
     after, transition = env.step(state, jnp.zeros((20, agents, 2)))
-    whole, told = env.whole.step(state, jnp.zeros((20, agents, 2)))
+    whole, told = Compiled(env.whole).step(state, jnp.zeros((20, agents, 2)))
     np.testing.assert_array_equal(after.position, whole.position)
     assert transition.cost.shape == (20, agents)
     np.testing.assert_array_equal(transition.cost.max(-1), told.cost)  # who touches, and whether anybody does

@@ -6,6 +6,7 @@ rows past its end repeat its last one and are marked invalid.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import jax
@@ -56,6 +57,7 @@ def draw(arrays: dict[str, Array], key: Key, batch: int, horizon: int, history: 
     return at(arrays, step, horizon, history)
 
 
+@functools.partial(jax.jit, static_argnums=(2, 3))
 def at(arrays: dict[str, Array], step: Array, horizon: int, history: int = 0) -> Batch:
     """The windows whose present is the state before `step` (B,)."""
     offset = jnp.arange(-history, horizon)

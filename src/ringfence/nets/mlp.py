@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,13 +32,7 @@ class MLP(eqx.Module):
         are entries of actions of `acts` are 0 where an agent has none."""
         self.spec = None if acts is None or acts.action_sizes is None else acts
         self.linear = jnp.zeros((groups, sizes[0], sizes[-1])) if linear else None
-        self.weights, self.biases = [], []
-        keys = jax.random.split(key, len(sizes) - 1)
-        for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:]):
-            last = fan_out is sizes[-1] and len(self.weights) == len(sizes) - 2
-            gain = (1.0 / fan_in) ** 0.5 * final_scale if last else (2.0 / fan_in) ** 0.5
-            self.weights.append(jax.random.normal(k, (groups, fan_in, fan_out)) * gain)
-            self.biases.append(jnp.zeros((groups, fan_out)))
+        self.weights, self.biases = _initial(key, tuple(sizes), groups, final_scale)
 
     def __call__(self, x: Array) -> Array:
         """(..., N, F_out)"""
@@ -59,3 +55,15 @@ class MLP(eqx.Module):
             x = jax.nn.relu(x) if n < len(self.weights) - 1 else x
         x = x if self.linear is None else x + jax.lax.batch_matmul(first, self.linear)
         return jnp.moveaxis(x, 0, 1).reshape(*shape[:-1], x.shape[-1])
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))  # operation by operation takes a program each
+def _initial(key: Key, sizes: tuple[int, ...], groups: int, final_scale: float) -> tuple[list[Array], list[Array]]:
+    """Weights (G, F_in, F_out) and biases (G, F_out) of each layer."""
+    weights = []
+    keys = jax.random.split(key, len(sizes) - 1)
+    for layer, (k, fan_in, fan_out) in enumerate(zip(keys, sizes[:-1], sizes[1:])):
+        last = layer == len(sizes) - 2
+        gain = (1.0 / fan_in) ** 0.5 * final_scale if last else (2.0 / fan_in) ** 0.5
+        weights.append(jax.random.normal(k, (groups, fan_in, fan_out)) * gain)
+    return weights, [jnp.zeros((groups, fan_out)) for fan_out in sizes[1:]]

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -97,15 +98,18 @@ class BoundHazard:
         return costs > 0, costs == 0
 
 
-def least(x: list[Array]) -> Array:
-    """Elementwise minimum. Not `min` over an axis: its derivative asks which entry *equals* the result, and 0/0 where a
-    compiler rounds the two differently."""
-    return functools.reduce(jnp.minimum, x)
-
-
+@jax.custom_jvp
 def lowest(x: Array) -> Array:
-    """(...,) the least of the last axis, of agents or constraints, as `least` takes it."""
-    return least([x[..., k] for k in range(x.shape[-1])])
+    """(...,) the least of the last axis, of agents or constraints. Its derivative is that of the first entry that is
+    least; that of `min` asks which entries *equal* the result, and is 0/0 where a compiler rounds the two
+    differently."""
+    return x.min(-1)
+
+
+@lowest.defjvp
+def _slope_of_lowest(x: tuple[Array], moved: tuple[Array]) -> tuple[Array, Array]:
+    first = x[0].argmin(-1, keepdims=True) == jnp.arange(x[0].shape[-1])
+    return lowest(x[0]), jnp.where(first, moved[0], 0.0).sum(-1)
 
 
 def bind(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> BoundHazard:
@@ -137,7 +141,7 @@ def _bind_all(hazard: All, names: tuple[str, ...], n_agents: int) -> BoundHazard
     scales = [1.0 if margin == unit else unit / margin for margin in margins]
 
     def clearance(x: Numbers) -> Array:
-        return least([scale * formula(x) for scale, formula in zip(scales, formulas, strict=True)])
+        return lowest(jnp.stack([scale * formula(x) for scale, formula in zip(scales, formulas, strict=True)], -1))
 
     return BoundHazard(hazard, clearance, unit, parts)
 
@@ -164,7 +168,7 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
     def clearance(x: Numbers) -> Array:
         squared = (offsets(x) ** 2).sum(-1)
         distance = jnp.sqrt(jnp.maximum(squared, 1e-12))
-        return least([distance[..., j] for j in range(distance.shape[-1])]) - hazard.radius
+        return lowest(distance) - hazard.radius
 
     return BoundHazard(hazard, clearance, hazard.safe_margin)
 

@@ -29,7 +29,7 @@ import optax
 
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
-from ringfence.problem.constraints import least, lowest
+from ringfence.problem.constraints import lowest
 from ringfence.problem.features import FeatureMap, numbered
 from ringfence.types import Array, Key
 from ringfence.world.cause_nets import Score, blank, scores, worst
@@ -84,7 +84,7 @@ class Barrier(eqx.Module):
             each = jnp.concatenate([scores(net, after) for net in self.causes], -1)
         else:
             z = self.standardised(before, after)
-            each = jnp.stack(_scores(self.label, self.shape, z, after.shape[:-1]), -1)
+            each = _scores(self.label, self.shape, z, after.shape[:-1])
         return soft(each) / self.unit
 
     @property
@@ -259,10 +259,10 @@ def _still(shape: Shape) -> Shape:
 
 def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
     """Scores (..., N) of standardised entries (..., N, D or 2D); `agents` is that shape."""
-    return least(_scores(nets, shape, z, agents))
+    return lowest(_scores(nets, shape, z, agents))
 
 
-def _scores(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> list[Array]:
+def _scores(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
     """What `_score` is the least of: own entries, and each thing."""
     half = z.shape[-1] // (2 if shape.use_transition else 1)
     if shape.joint:
@@ -274,13 +274,13 @@ def _scores(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...
 
     parts = []
     if "own" in nets:
-        parts.append(jnp.broadcast_to(nets["own"](read(np.array(shape.own)))[..., 0], agents))
+        parts.append(jnp.broadcast_to(nets["own"](read(np.array(shape.own))), (*agents, 1)))
     for (kind, entries), (place, speed) in zip(shape.pairs, shape.offsets):
         pair = _with_distance(read(np.array(entries)), place, speed)
         each = nets[kind](pair.reshape(*z.shape[:-2], -1, pair.shape[-1]))[..., 0]
         each = each.reshape(*z.shape[:-1], len(entries))
-        parts += [each[..., j] for j in range(len(entries))]
-    return parts
+        parts.append(each)
+    return jnp.concatenate(parts, -1)
 
 
 def _with_distance(pair: Array, place: tuple[int, ...], speed: tuple[int, ...]) -> Array:

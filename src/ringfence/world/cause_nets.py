@@ -20,7 +20,7 @@ import optax
 
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
-from ringfence.problem.constraints import least, lowest
+from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
@@ -85,8 +85,12 @@ def scores(net: Score, x: Array) -> Array:
 
 def worst(nets: Sequence[Score], x: Array) -> Array:
     """(..., N) the score of features (..., N, D): of the worst thing by the worst cause."""
-    parts = [scores(net, x) for net in nets]
-    return least([part[..., j] for part in parts for j in range(part.shape[-1])])
+    return _worst(tuple(nets), x)
+
+
+@jax.jit
+def _worst(nets: tuple[Score, ...], x: Array) -> Array:
+    return lowest(jnp.concatenate([scores(net, x) for net in nets], -1))
 
 
 def blank(found: Found, width: int, key: Key | None = None) -> tuple[Score, ...]:

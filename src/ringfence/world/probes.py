@@ -81,7 +81,7 @@ def _curve(net: Score, unit: float) -> Probe:
     if net.cause.length and edge.at:
         low, high = 0.0, min(high, FARTHEST * edge.at)
     at = np.linspace(low, high, POINTS)
-    scores = np.asarray(net.of_values(jnp.asarray(at[:, None], jnp.float32))) / unit
+    scores = np.asarray(_scores_of_values(net, jnp.asarray(at[:, None], jnp.float32))) / unit
     return _along(net.cause.name, at, scores, edge.at)
 
 
@@ -98,7 +98,7 @@ def _map(net: Score, unit: float) -> ProbeMap:
     """Scores of a cause that reads two numbers, over their plane."""
     axes = [_axis(low, high) for low, high in zip(net.edge.low, net.edge.high)]
     places = np.stack(np.meshgrid(*axes), -1)
-    return _over(net.cause.name, axes, np.asarray(net.of_values(jnp.asarray(places, jnp.float32))) / unit)
+    return _over(net.cause.name, axes, np.asarray(_scores_of_values(net, jnp.asarray(places, jnp.float32))) / unit)
 
 
 def _over(name: str, axes: Sequence[np.ndarray], scores: np.ndarray) -> ProbeMap:
@@ -201,3 +201,8 @@ def _speed_entries(names: Sequence[str], place: np.ndarray) -> np.ndarray | None
 @jax.jit
 def _scores_of_all(barrier: Barrier | MinBarrier, before: Array, after: Array) -> Array:
     return barrier.of_steps(before, after)
+
+
+@jax.jit
+def _scores_of_values(net: Score, values: Array) -> Array:
+    return net.of_values(values)

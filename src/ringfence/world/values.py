@@ -113,13 +113,19 @@ def _targets(arrays: dict[str, Array], rewards: Array, picked: Array) -> tuple[A
     """States, the reward on arriving in each and the return-to-go from it: the critic's two targets are those of a
     state that was arrived in by a step and left by another. First rows take the reward of their own first step, a fair
     stand-in. An episode that ended for good left a state that nothing follows; guards predict such states, too."""
+    over = picked[np.flatnonzero(np.asarray(arrays["terminated"])[np.asarray(picked)])]
+    return _targets_of(arrays, rewards, picked, over)
+
+
+@jax.jit
+def _targets_of(arrays: dict[str, Array], rewards: Array, picked: Array, over: Array) -> tuple[Array, Array, Array]:
+    """The same, where `over` are the steps after which nothing follows."""
     x = arrays["features"]
     row = arrays["row"][picked]
     first = row == arrays["first_row"][picked]
     if rewards.ndim == 2:
         first = first[:, None]
     arrived = jnp.where(first, rewards[picked], rewards[jnp.maximum(picked - 1, 0)])
-    over = picked[jnp.flatnonzero(arrays["terminated"][picked])]
     return (
         jnp.concatenate([x[row], x[arrays["row"][over] + 1]]),
         jnp.concatenate([arrived, rewards[over]]),
