@@ -16,6 +16,7 @@ from ringfence.errors import UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
+from ringfence.proposals.base import act_with
 from ringfence.proposals.options import PlanOptions
 from ringfence.training import loop, worlds
 from ringfence.types import Spec
@@ -48,10 +49,11 @@ def run(two_drivers, tmp_path_factory):
 def played(policy, steps: int = 3, batch: int = 64, entries: int = 3) -> np.ndarray:
     """Actions (B, steps, N) at the same kind of states."""
     carry = policy.initial_state(batch)
+    act = jax.jit(act_with)
     out = []
     for t in range(steps):
         seen = jax.random.normal(jax.random.key(t), (batch, 2, entries))
-        carry, step = policy.act(carry, seen, None, jax.random.key(10 + t))
+        carry, step = act(policy, carry, seen, None, jax.random.key(10 + t))
         out.append(np.asarray(step.action)[..., 0])
     return np.stack(out, 1)
 
@@ -155,7 +157,7 @@ def two_drifts(two_drivers):
     return EpisodeStore.from_episodes(seen, actions, rewards, costs, card={"task": "two-drifts"})
 
 
-PLANS = dict(num_updates=500, batch=64, width=32, depth=2, horizon=5, diffusion_steps=20, inverse_width=32, ema=0.95)
+PLANS = dict(num_updates=300, batch=32, width=32, depth=2, horizon=5, diffusion_steps=20, inverse_width=32, ema=0.95)
 
 
 @pytest.mark.parametrize("net", ["attention", "residual"])
