@@ -183,7 +183,7 @@ def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path, net):
     [
         ({"net": "unet"}, "drivers=2 are told to a plan of the whole team"),
         ({"observe": "single"}, "drivers=2 are told to a plan of the whole team"),
-        ({"drivers": 65}, "drivers=65 share 64 windows"),
+        ({"drivers": 33}, "drivers=33 share 32 windows"),
         ({"net": "unet", "drivers": 0, "distinguish_agents": True}, "distinguish_agents is of the net attention"),
     ],
 )

@@ -263,7 +263,7 @@ def _score(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]
 
 
 def _scores(nets: dict[str, MLP], shape: Shape, z: Array, agents: tuple[int, ...]) -> Array:
-    """What `_score` is the least of: own entries, and each thing."""
+    """(..., N, J) what `_score` is the least of: own entries, and each thing."""
     half = z.shape[-1] // (2 if shape.use_transition else 1)
     if shape.joint:
         z = z[..., :1, :]
