@@ -447,3 +447,58 @@ def test_splits_that_leave_nothing_are_refused(share, changed, said):
         options = dict(time="t", agent="id", state=["x", "y"])
     with pytest.raises(UserError, match=said):
         EpisodeStore.split_table(table, share, **options)
+
+
+# --- several tables ---
+def test_several_files_are_recordings_of_their_own(tmp_path, capsys):
+    import pandas as pd
+
+    files = []
+    for k in range(3):
+        table = track(60) | {"x": track(60)["x"] + k}
+        files.append(tmp_path / f"run{k}.csv")
+        pd.DataFrame(table).to_csv(files[-1], index=False)
+    names = ["--time", "t", "--agent", "id", "--state", "x", "y", "--separation", "0.1"]
+    app.main(["data", "import-table", *map(str, files), "--out", str(tmp_path / "all.h5"), *names])
+    store = EpisodeStore.load(tmp_path / "all.h5")
+    one = EpisodeStore.from_table(files[0], time="t", agent="id", state=["x", "y"])
+    assert store.episodes == 3 * one.episodes and store.steps == 3 * one.steps
+    np.testing.assert_allclose(entry(store, "own.x")[store.lengths[0] + 1, 0], track(60)["x"][0] + 1, atol=1e-6)
+    assert store.card.provenance == "table run0.csv and 2 more"
+    read = [pd.read_csv(file) for file in files]
+    schema = {"time": "t", "agent": "id", "state": ["x", "y"], "danger": Separation(0.1)}
+    assert EpisodeStore.from_table(read, **schema).content == store.content
+    learned, judged = EpisodeStore.split_table(read, 0.6, **schema)
+    assert (learned.episodes, judged.episodes) == (1, 2)
+
+
+def test_several_files_with_episodes_of_their_own():
+    parts = [track(40) | {"run": np.repeat([0, 1], 20).repeat(2)[:80]} for _ in range(2)]
+    schema = {"time": "t", "agent": "id", "state": ["x", "y"]}
+    whole = EpisodeStore.from_table(parts, **schema, episode="run")
+    assert whole.episodes == 2 * EpisodeStore.from_table(parts[0], **schema, episode="run").episodes
+    with pytest.raises(UserError, match="list of tables is empty"):
+        EpisodeStore.from_table([], **schema)
+    dates = parts[0] | {"t": parts[0]["t"].astype("datetime64[s]")}
+    with pytest.raises(UserError, match="t is datetime64.* and float64 in tables that are given together"):
+        EpisodeStore.from_table([parts[0], dates], **schema)
+
+
+def test_drones_telemetry_is_read_as_it_is(tmp_path):
+    """SynDrone-Swarm: a row per drone and frame, at times that jitter; z is down."""
+    head = "ScenarioID,DroneID,Frame,Time,X,Y,Z,Vel,VelX,VelY,VelZ,Roll,Pitch,Yaw,Role,Intent,Target,IsObserver,TimeStr"
+    lines = []
+    for frame in range(1, 40):
+        time = 0.8 * frame + 0.1 * (frame % 3)
+        for drone in (1, 2, 3):
+            place = f"{2 * time + 5 * drone:.3f},{drone:.3f},{-15 - 0.1 * time:.3f},2.0,2.000,0.000,-0.100"
+            lines.append(
+                f"A-BAS,Drone{drone},{frame},{time:.3f},{place},0,0,2.6,EGO,Patrolling,N/A,0,2025-06-20T11:31Z"
+            )
+    (tmp_path / "telemetry.csv").write_text("\n".join([head, *lines]) + "\n")
+    file = tmp_path / "telemetry.csv"
+    app.main(["data", "import-table", str(file), "--layout", "syndrone", "--separation", "2", "--out", f"{file}.h5"])
+    store = EpisodeStore.load(f"{file}.h5")
+    assert (store.episodes, store.n_agents, store.actions.shape[2]) == (1, 3, 3)
+    np.testing.assert_allclose(entry(store, "own.vz"), -0.1, atol=1e-5)
+    np.testing.assert_allclose(entry(store, "other0.dx")[:, 0], 5.0, atol=1e-2)

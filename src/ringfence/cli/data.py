@@ -81,7 +81,7 @@ def make(
 
 
 def import_table(
-    file: Positional[Path],
+    files: Positional[list[Path]],
     out_file: Out,
     time: str = "time",
     agent: str = "agent",
@@ -94,7 +94,7 @@ def import_table(
     goal: list[str] = [],  # noqa: B006
     rename: list[str] = [],  # noqa: B006
     wide: str | None = None,
-    layout: Literal["highd", "interaction", "sumo", "obsmat"] | None = None,
+    layout: Literal["highd", "interaction", "syndrone", "sumo", "obsmat"] | None = None,
     split: float | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
     task: str | None = None,
@@ -102,7 +102,8 @@ def import_table(
     """Import a table with a row per agent and time; CSV and Parquet need the extra `ringfence[tables]`.
 
     Args:
-        file: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml or an obsmat.txt.
+        files: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml or an obsmat.txt; several are
+            recordings, each with episodes of its own.
         out_file: the store to write.
         time: column of times, s (or of dates).
         agent: column that tells agents apart.
@@ -122,12 +123,15 @@ def import_table(
     """
     from ringfence.logs.store import EpisodeStore
 
+    if not files:
+        raise UserError("import-table got no file; name one, or several recordings.")
+    named = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     kept = writable(out_file)
     rest = None if split is None else writable(kept.with_name(f"{kept.stem}-rest{kept.suffix}"))
     options = {
         **episodes.options(),
         "cost": cost,
-        "card": {"task": task or kept.stem, "provenance": f"table {file.name}", **_limits_of(cost, limits)},
+        "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)},
     }
     if layout is not None:
         if state or action or reward or goal or episode or rename or wide:
@@ -137,11 +141,11 @@ def import_table(
         options |= {"time": time, "agent": agent, "episode": episode, "state": state}
         options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
     if split is not None and rest is not None:
-        learned, judged = EpisodeStore.split_table(file, split, **options)
+        learned, judged = EpisodeStore.split_table(files, split, **options)
         imported(learned, kept)
         return imported(judged, rest)
     made = EpisodeStore.from_table if layout is None else EpisodeStore.from_layout
-    imported(made(file, **options), kept)
+    imported(made(files, **options), kept)
 
 
 def _pairs(rename: list[str]) -> dict[str, str]:

@@ -29,7 +29,7 @@ import h5py
 import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
-from ringfence.logs.io.columns import Table
+from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
 from ringfence.logs.moving import moved
@@ -354,7 +354,7 @@ class EpisodeStore:
     @classmethod
     def from_table(
         cls,
-        table: Table,
+        table: Tables,
         schema: TableSchema | None = None,
         *,
         notes: Sequence[str] = (),
@@ -362,7 +362,7 @@ class EpisodeStore:
         **options: Any,
     ) -> EpisodeStore:
         """A row per agent and time: a data frame (pandas, polars, pyarrow), a dictionary of columns, or a CSV or
-        Parquet file.
+        Parquet file. A list of these holds recordings, each with episodes of its own.
 
         What its columns are is a `TableSchema`, or the fields of one by name: `time`, `agent`, `state` and options.
         `card` adds fields to the store's; its warnings begin with the `notes`.
@@ -376,21 +376,21 @@ class EpisodeStore:
     @classmethod
     def from_layout(
         cls,
-        table: Table,
+        table: Tables,
         layout: str,
         *,
         notes: Sequence[str] = (),
         card: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> EpisodeStore:
-        """A table in a published format (`highd`, `interaction`, `sumo`, `obsmat`); options as of `from_table`."""
+        """A table in a published format (`highd`, `interaction`, `syndrone`, `sumo`, `obsmat`), or a list of them; options as of `from_table`."""
         columns, schema = read_layout(table, layout, renamed(options, OLD_OPTIONS, "from_layout"))
         return cls.from_table(columns, schema, notes=notes, card=card)
 
     @classmethod
     def split_table(
         cls,
-        table: Table,
+        table: Tables,
         share: float,
         *,
         layout: str | None = None,

@@ -18,6 +18,7 @@ from ringfence.logs.io.obsmat import read_obsmat
 from ringfence.logs.io.sumo import read_fcd
 
 Table = Mapping[str, Any] | str | Path | Any  # or a data frame that narwhals reads
+Tables = Table | list[Table] | tuple[Table, ...]  # one, or several recordings
 Columns = dict[str, np.ndarray]
 READERS: dict[str, Callable[[Path], Columns]] = {
     ".jsonl": read_json_lines,

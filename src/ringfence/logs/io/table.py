@@ -8,14 +8,14 @@ follows from what (docs/data.md).
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ringfence.errors import UserError, unknown
+from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.angles import without_angles
-from ringfence.logs.io.columns import Columns, Table, numbers, read_columns, seconds
+from ringfence.logs.io.columns import Columns, Table, Tables, numbers, read_columns, seconds, words
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.lists import expanded
@@ -38,6 +38,7 @@ from ringfence.logs.io.wide import read_wide
 from ringfence.problem.constraints import CostColumn
 
 USUAL = 0.999  # of accelerations, that are no outliers
+RECORDING = "ringfence.recording"  # column that tells apart what is of several tables
 STANDS_OUT = 2.0  # times that, above which the largest are outliers
 
 
@@ -64,16 +65,23 @@ LAYOUTS = {
     # INTERACTION (Zhan et al. 2019), vehicle_tracks_xxx.csv.
     "interaction": Layout({"time": "timestamp_ms", "agent": "track_id"}, 1e-3),
     # What the readers of these files call time, agent, x, y, vx and vy.
+    # SynDrone-Swarm (Unall 2025), telemetry.csv: multirotors of AirSim, z is down.
+    "syndrone": Layout(
+        {"time": "Time", "agent": "DroneID", "x": "X", "y": "Y", "z": "Z", "vx": "VelX", "vy": "VelY", "vz": "VelZ"},
+        1.0,
+        state=("x", "y", "z", "vx", "vy", "vz"),
+    ),
     "sumo": Layout({}, 1.0),
     "obsmat": Layout({}, 1.0),
 }
 
 
 def read_table(
-    table: Table, schema: TableSchema, *, notes: Sequence[str] = (), card: Mapping[str, Any] | None = None
+    table: Tables, schema: TableSchema, *, notes: Sequence[str] = (), card: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
     """What `EpisodeStore.from_steps` takes, of a table with a row per agent and time, in any order of agents; each
-    agent's times increase.
+    agent's times increase. Several tables are recordings of their own: no episode is of two, and rows are counted over
+    all of them.
 
     The card's warnings say what was taken for what, and what was left out, after the `notes` of whoever read the
     table. `card` adds fields to it; its `constraints` holds the limits of several costs (0 by default). `StoreError`
@@ -83,7 +91,7 @@ def read_table(
 
 
 def read_parts(
-    table: Table,
+    table: Tables,
     schema: TableSchema,
     share: float,
     *,
@@ -96,14 +104,14 @@ def read_parts(
 
 
 def _read(
-    table: Table,
+    table: Tables,
     schema: TableSchema,
     notes: Sequence[str],
     card: Mapping[str, Any] | None,
     share: float | None = None,
 ) -> tuple[dict[str, Any], int]:
     """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
-    columns, schema = _columns_of(table, schema)
+    columns, schema = _joined([_columns_of(one, schema) for one in _each(table)])
     columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
     values = values_of(columns, rows, schema)
@@ -125,12 +133,15 @@ def _read(
     return steps, int(early.sum())
 
 
-def read_layout(table: Table, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
-    """A table in a published format (`LAYOUTS`) as one that `read_table` takes, and its schema; options are those of a
-    `TableSchema` beside columns."""
+def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
+    """A table in a published format (`LAYOUTS`), or several, as one that `read_table` takes, and its schema; options
+    are those of a `TableSchema` beside columns."""
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
-    known = LAYOUTS[layout]
+    return _joined([_of_layout(one, LAYOUTS[layout], layout, options) for one in _each(table)])
+
+
+def _of_layout(table: Table, known: Layout, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
     names = {"time": "time", "agent": "agent", "state": known.state, "action": known.action}
     for name in names:
         if name in options:
@@ -145,6 +156,39 @@ def read_layout(table: Table, layout: str, options: Mapping[str, Any]) -> tuple[
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
     return columns, schema
+
+
+def _each(table: Tables) -> Sequence[Table]:
+    """Tables, of one or several."""
+    if not isinstance(table, list | tuple):
+        return [table]
+    if not table:
+        raise UserError("The list of tables is empty; give one table, or several.")
+    return table
+
+
+def _joined(tables: list[tuple[Columns, TableSchema]]) -> tuple[Columns, TableSchema]:
+    """Tables after one another, each a recording of its own."""
+    if len(tables) == 1:
+        return tables[0]
+    first = tables[0][1]
+    for k, (_, schema) in enumerate(tables):
+        if schema != first:
+            raise StoreError(f"Table {k} has other entries in its lists than table 0; give tables of one kind.")
+    episodes = []
+    for k, (columns, schema) in enumerate(tables):
+        own = [""] * len(columns[schema.time]) if schema.episode is None else words(columns, schema.episode)
+        episodes.append(np.array([f"{k:06d}/{name}" for name in own]))
+    columns = {name: _one_after_another(name, [columns[name] for columns, _ in tables]) for name in tables[0][0]}
+    return columns | {RECORDING: np.concatenate(episodes)}, replace(first, episode=RECORDING)
+
+
+def _one_after_another(name: str, parts: list[np.ndarray]) -> np.ndarray:
+    try:
+        return np.concatenate(parts)
+    except (TypeError, ValueError):  # dates after numbers
+        kinds = " and ".join(sorted({str(part.dtype) for part in parts}))
+        raise StoreError(f"{name} is {kinds} in tables that are given together; write it in one way.") from None
 
 
 def _columns_of(table: Table, schema: TableSchema) -> tuple[Columns, TableSchema]:
