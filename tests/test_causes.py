@@ -14,8 +14,8 @@ from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
-from ringfence.world import cause_search, causes, probes, verdict
-from ringfence.world.card import BarrierScores, Card, Data, PredictionError, Verdict
+from ringfence.world import cause_search, causes, foresight, probes, verdict
+from ringfence.world.card import BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
@@ -278,6 +278,53 @@ def test_verdicts_give_their_reasons():
     blind = PredictionError(steps_ahead=(1,), error_of_change=(1.3,), by_entry={}, coasting=(0.9,))
     found = verdict.judge(Card(data=data, barrier=good, prediction_error=blind))
     assert found.word == "weak" and "constant velocity errs by 90%" in found.reasons[0]
+
+
+def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
+    data = Data(task="t", hazard={})
+    good = BarrierScores(entries=100, recall=0.99, margin_kept=0.9, probed=1.0)
+
+    def card(error, coasting, seconds=(0.96, 2.0)):
+        one = Foresight("length of other.dx, other.dy, of the nearest", (12, 25), error, coasting, 2.0, seconds)
+        prediction = PredictionError(steps_ahead=(1,), error_of_change=(0.1,), by_entry={}, read=(one,))
+        return Card(data=data, barrier=good, prediction_error=prediction)
+
+    blind = card((0.1, 0.4), (0.2, 0.3))
+    assert verdict.judge(blind).word == "weak"
+    assert verdict.judge(blind).reasons == (
+        "it errs by 0.4 in length of other.dx, other.dy, of the nearest at 2 s, and constant velocity by 0.3",
+    )
+    assert "foreseen to 0.1 at 0.96 s, 0.4 at 2 s (constant velocity: 0.2, 0.3, which foresees it better)" in str(blind)
+    assert verdict.judge(card((0.1, 0.2), (0.2, 0.3))).word == "fit"
+    assert verdict.judge(card((0.0, 0.019), (0.0, 0.0))).word == "fit", "so little is no error"
+    assert "at 25 steps" in str(card((0.1, 0.2), (0.2, 0.3), ()))
+
+
+def test_foresight_is_of_what_the_barrier_reads(fitted):
+    read = {one.name: one for one in fitted.card.prediction_error.read}
+    assert set(read) == {"own.v", *(n for n in read if "own.x" in n), "length of other.dx, other.dy, of the nearest"}
+    near = read["length of other.dx, other.dy, of the nearest"]
+    assert near.steps_ahead == (1, 3, 8) and near.seconds == ()
+    assert near.error[0] < near.coasting[0] and near.beats_coasting
+
+
+def test_foresight_reads_the_thing_in_most_danger():
+    """Two others at 3 and 4 m, who change places in the list: the nearest is where it was."""
+    x = np.array([3.0, 0.0, 0.0, 4.0]).reshape(1, 1, 1, 4)
+    (cause,) = causes.offsets([f"other{j}.d{c}" for j in range(2) for c in "xy"])
+    near, far = Edge((0.0,), (9.0,), at=1.0), Edge((0.0,), (9.0,), at=1.0, below=False)
+    assert foresight._read(x, cause, near) == foresight._read(x[..., [2, 3, 0, 1]], cause, near) == 3.0
+    assert foresight._read(x, cause, far) == 4.0
+    assert foresight._read(x, causes.narrowed(cause, ((0, 1),)), near) == 4.0
+    place = foresight._read(x, Cause("own.x, own.y", ((0, 3),)), None)
+    assert place.shape == (1, 1, 2) and foresight._rms(place) == (5.0,)
+
+
+def test_foresight_is_told_in_seconds_where_logs_say_how_long_a_step_is():
+    world = fit(store_of(60, dt=0.25), **QUICK_WORLD)
+    assert world.card.data.dt == 0.25
+    for one in world.card.prediction_error.read:
+        assert one.steps_ahead == (4, 8) and one.seconds == (1.0, 2.0)
 
 
 def test_episodes_with_danger_are_held_out_like_the_others():

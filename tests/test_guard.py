@@ -166,6 +166,23 @@ def test_a_guard_looks_as_far_as_the_card_says(small_world, avoided, kept, optio
     assert not build(Constant(world.spec), world, None, "shield", "learned", {}, **options).guard.options.terminal_value
 
 
+def test_a_horizon_in_seconds_is_one_in_steps(small_world):
+    def horizon(dt, **options):
+        data = msgspec.structs.replace(small_world.card.data, dt=dt)
+        world = dataclasses.replace(small_world, card=msgspec.structs.replace(small_world.card, data=data))
+        return ringfence.guard(Constant(world.spec), world, anyway=True, **options).guard.options.horizon
+
+    assert horizon(0.1, horizon_seconds=1.5) == 15
+    assert horizon(0.4, horizon_seconds=0.1) == 1
+    assert horizon(None, horizon=4) == 4
+    with pytest.raises(UserError, match="horizon_seconds=2 needs a World of logs whose card says how long a step is"):
+        horizon(None, horizon_seconds=2.0)
+    with pytest.raises(UserError, match="horizon=4 and horizon_seconds=2.0 both say how far the guard looks"):
+        horizon(0.1, horizon=4, horizon_seconds=2.0)
+    with pytest.raises(UserError, match="horizon_seconds=-1"):
+        horizon(0.1, horizon_seconds=-1.0)
+
+
 def test_the_shield_stays_within_its_bound(small_world, bound, present):
     """Even where that is not enough, which is counted as always."""
     guard = Guard(

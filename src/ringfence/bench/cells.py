@@ -153,6 +153,8 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
         return bool(guard) and played == wanted | {name: played[name] for name in newer}
     options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **asked))
     wanted = names.guard_options(dataclasses.asdict(options)) | {name: played[name] for name in newer}
+    if options.horizon_seconds:  # how many steps these are, the World knew
+        wanted["horizon"] = played["horizon"]
     if task.guard_by_card:  # how far the guard looked was the World's affair
         looked = {"horizon", "terminal_value"} - asked.keys()
         wanted |= {name: played[name] for name in looked}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
@@ -15,6 +15,7 @@ Rounds = Annotated[int, Meta(ge=0, le=10**6)]
 Fall = Annotated[float, Meta(gt=0, le=1, description="lie in (0, 1]: at 0 a barrier could never fall")]
 Late = Annotated[int, Meta(ge=0, le=100)]
 Held = Annotated[int, Meta(ge=1, le=100)]
+Horizon = Annotated[float, Meta(ge=0, le=1e5)]
 Few = Annotated[int, Meta(ge=0, le=100)]
 CostRate = Annotated[float, Meta(gt=0, lt=1, description="be a share of steps between 0 and 1")]
 Distance = Annotated[float, Meta(gt=0, le=2, description="lie in (0, 2]: actions lie in [-1, 1]")]
@@ -35,6 +36,7 @@ class GuardOptions:
     correction_restarts: Few = 0  # times that one which falls short is begun again from fixed plans
     max_correction: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
     horizon: Samples = 3  # predicted rows that are judged
+    horizon_seconds: Horizon = 0.0  # the same in seconds, where logs say how long a step is; 0: as many as `horizon`
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: Fall = 0.5  # share of what is left of the distance that one step may use up
     margin: float = 0.6  # distance that is kept
@@ -63,6 +65,19 @@ class GuardOptions:
     def judges(self) -> bool:
         """Whether it does anything at all."""
         return self.select or self.optimizer_steps > 0 or self.correction_steps > 0
+
+
+def in_steps(options: GuardOptions, dt: float | None) -> GuardOptions:
+    """The options with a horizon that was given in seconds in steps of so many."""
+    seconds = options.horizon_seconds
+    if not seconds:
+        return options
+    if dt is None:
+        raise UserError(
+            f"horizon_seconds={seconds:g} needs a World of logs whose card says how long a step is (dt), and this one "
+            "does not; fit it again to such logs, or give horizon in steps."
+        )
+    return replace(options, horizon=max(1, round(seconds / dt)))
 
 
 _SHIELD = {"correction_steps": 10, "correction_restarts": 1}

@@ -16,7 +16,7 @@ import numpy as np
 from ringfence.errors import NoSafeAction, UserError, unknown
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
-from ringfence.guards.options import GUARDS, GuardOptions
+from ringfence.guards.options import GUARDS, GuardOptions, in_steps
 from ringfence.guards.reasons import reasons
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
@@ -33,6 +33,7 @@ LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in
 BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
 FARTHEST = 15  # rows (benchmarks/proving.py plays more of them)
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
+HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
 FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps
 
 Paid = float | Mapping[str, float]  # what a step cost, in all or by each constraint's name
@@ -307,9 +308,11 @@ def build(
     if barrier != "analytic":
         require(world.card, anyway)
     if usual is None:
-        looks = barrier == "learned" and not {"horizon", "terminal_value"} & set(changes)
+        looks = barrier == "learned" and not {*HORIZONS, "terminal_value"} & set(changes)
         usual = far_sighted(world) if looks else {}
+    _refuse_two_horizons(changes)
     options = build_config(GuardOptions, options_of(name, barrier, usual, **changes), "the guard")
+    options = in_steps(options, world.card.data.dt)
     if not options.judges:
         raise UserError(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
@@ -317,6 +320,12 @@ def build(
     _refuse_far(options, world)
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
     return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value), options))
+
+
+def _refuse_two_horizons(changes: Mapping[str, Any]) -> None:
+    if set(HORIZONS) <= set(changes):
+        both = " and ".join(f"{name}={changes[name]}" for name in HORIZONS)
+        raise UserError(f"{both} both say how far the guard looks; give one of them.")
 
 
 def _refuse_far(options: GuardOptions, world: World) -> None:

@@ -16,6 +16,7 @@ from ringfence.datasets.task import Task
 from ringfence.envs.base import Env, Measured
 from ringfence.errors import UserError
 from ringfence.guards import BarrierSource, Guard, Guarded, GuardOptions, options_of
+from ringfence.guards.options import in_steps
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key, Policy, PyTree, Spec
@@ -117,8 +118,10 @@ def guarded(policy: Policy, task: Task, name: str, changes: Mapping[str, Any]) -
 
 def options(name: str, task: Task, changes: Mapping[str, Any]) -> GuardOptions:
     """The named guard's options, looking `AHEAD` s ahead."""
-    horizon = {"horizon": max(1, round(AHEAD / known(task).dt))}
-    return build_config(GuardOptions, {**options_of(name, "analytic"), **horizon, **changes}, "the guard")
+    dt = known(task).dt
+    horizon = {"horizon": max(1, round(AHEAD / dt))}
+    given = build_config(GuardOptions, {**options_of(name, "analytic"), **horizon, **changes}, "the guard")
+    return in_steps(given, dt)
 
 
 def known(task: Task) -> Known:

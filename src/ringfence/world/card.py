@@ -16,6 +16,8 @@ from ringfence.world.causes import Edge, Found
 from ringfence.world.settings import Settings, settings_named
 
 JUDGED = 3  # steps ahead that the margin is calibrated for
+NO_ERROR = 0.01  # of the deviation of what is predicted: less is exact enough
+SHOWN = 3  # things that a barrier reads, beside distances, that its words show the foresight of
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
 
@@ -33,6 +35,7 @@ class Data(Part, frozen=True):
     constraints: dict[str, float] | None = None  # limit per episode of each one that the logs name
     observation_width: int | None = None  # entries of what an agent sees
     state_width: int | None = None  # of the global state
+    dt: float | None = None  # seconds of a step, where the logs say
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
     observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
     state_origins: list[float] | None = None
@@ -45,6 +48,22 @@ class HeldOut(Part, frozen=True):
     steps: int
 
 
+class Foresight(Part, frozen=True):
+    """How well one thing that a barrier reads is predicted, in its own unit."""
+
+    name: str
+    steps_ahead: tuple[int, ...]
+    error: tuple[float, ...]  # root mean square, by steps ahead, along the logged actions
+    coasting: tuple[float, ...]  # the same, where all goes on as it did in the last step
+    deviation: float  # of what was logged
+    seconds: tuple[float, ...] = ()  # that these steps take, where the logs say
+
+    @property
+    def beats_coasting(self) -> bool:
+        """Whether anything is gained by its predictions; errors of a hundredth of what is logged are none."""
+        return self.error[-1] <= max(self.coasting[-1], NO_ERROR * self.deviation)
+
+
 class PredictionError(Part, frozen=True):
     """Errors of the forward models, rolled out along logged actions."""
 
@@ -52,6 +71,7 @@ class PredictionError(Part, frozen=True):
     error_of_change: tuple[float, ...]  # root mean square error as a share of the change, by steps ahead
     by_entry: dict[str, tuple[float, ...]]  # root mean square error in the entry's unit: 1, 3 and all steps ahead
     coasting: tuple[float, ...] = ()  # the same share, where all goes on as it did in the last step
+    read: tuple[Foresight, ...] = ()  # of everything that the barrier reads
 
 
 class ValueScores(Part, frozen=True):
@@ -236,6 +256,7 @@ def _of_prediction(card: Card) -> Iterator[str]:
         coasting = card.prediction_error.coasting
         beside = f" (constant velocity: {percent(coasting[-1])} at {len(coasting)})" if coasting else ""
         yield f"Predictions err by this share of what changes, steps ahead: {far}{beside}."
+        yield from _of_foresight(card.prediction_error.read)
     if card.values is not None:
         yield (
             f"Rewards of steps {_explained(card.values.reward_r2)}, returns-to-go {_explained(card.values.value_r2)}."
@@ -245,6 +266,19 @@ def _of_prediction(card: Card) -> Iterator[str]:
             f"Out of distribution is where its forward models are more than {card.ood.threshold:.2g} usual steps "
             f"apart: {100 * card.ood.level:g} % of held-out episodes never are."
         )
+
+
+def _of_foresight(read: tuple[Foresight, ...]) -> Iterator[str]:
+    """What a barrier reads, in its own unit: distances, and of the rest what constant velocity tells nearly as well."""
+    order = sorted(read, key=lambda one: one.coasting[-1] / max(one.error[-1], 1e-9))
+    shown = [one for one in order if one.name.startswith("length of ")]
+    shown += [one for one in order if one not in shown][:SHOWN]
+    for one in shown:
+        when = [f"{s:g} s" for s in one.seconds] or [f"{k} steps" for k in one.steps_ahead]
+        far = ", ".join(f"{error:.3g} at {at}" for error, at in zip(one.error, when))
+        coasting = ", ".join(f"{error:.3g}" for error in one.coasting)
+        beaten = "" if one.beats_coasting else ", which foresees it better"
+        yield f"  {one.name}: foreseen to {far} (constant velocity: {coasting}{beaten})"
 
 
 def _explained(share: float) -> str:

@@ -168,6 +168,7 @@ def _data(store: EpisodeStore, several: bool) -> Data:
         constraints=store.limits if several else None,
         observation_width=store.observations.shape[2],
         state_width=None if store.state is None else store.state.shape[1],
+        dt=store.card.dt,
         unsafe_costs={name: _unsafe_cost(store, name) for name in store.limits} if several else None,
         observation_origins=store.card.observation_origins,
         state_origins=store.card.state_origins,

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from msgspec.structs import replace
 
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
@@ -24,6 +25,7 @@ from ringfence.world.card import (
     ValueScores,
 )
 from ringfence.world.dynamics import Dynamics
+from ringfence.world.foresight import foresight
 from ringfence.world.logged import Logged
 from ringfence.world.margins import (
     OUTLIERS,
@@ -78,7 +80,8 @@ def validate(
     """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above."""
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
-    prediction_error = _prediction_error(world.dynamics, logged, rng)
+    read = foresight(world.dynamics, world.barrier, logged, np.random.default_rng(1))
+    prediction_error = replace(_prediction_error(world.dynamics, logged, rng), read=read)
     explained = _value_scores(world.values, logged, world.alone, rng)
     ood = _threshold(world.dynamics, logged)
     barrier = world.barrier

@@ -72,14 +72,22 @@ def _word(value: float, limits: tuple[float, float]) -> Word:
 
 def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
     error = card.prediction_error
-    if error is None or not error.coasting:
+    if error is None:
+        return
+    remedy = "log more episodes, or more of what decides how agents move"
+    for one in error.read:
+        if not one.beats_coasting:
+            when = f"{one.seconds[-1]:g} s" if one.seconds else f"{one.steps_ahead[-1]} steps"
+            ours, theirs = f"{one.error[-1]:.3g}", f"{one.coasting[-1]:.3g}"
+            yield "weak", f"it errs by {ours} in {one.name} at {when}, and constant velocity by {theirs}", remedy
+    if not error.coasting:
         return
     ours, theirs = error.error_of_change[-1], error.coasting[-1]
     if ours > theirs:
         yield (
             "weak",
             f"its predictions err by {ours:.0%} of what changes where constant velocity errs by {theirs:.0%}",
-            "log more episodes, or more of what decides how agents move",
+            remedy,
         )
 
 
