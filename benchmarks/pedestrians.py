@@ -12,19 +12,11 @@ correction is begun again; the other recordings have chosen nothing.
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import tempfile
 from pathlib import Path
-from typing import Any
 
-import ringfence
-from ringfence.logs.store import EpisodeStore
-from ringfence.problem import constraints
-from ringfence.training.runs import write_json
+from replayed import NEIGHBOURS, OUT, by_cost, replayed, write
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "replay"
 RADIUS = 0.5  # m: in the first 70 % there are 33 entries below 0.4 m, 98 below 0.5 and 151 below 0.6
-NEIGHBOURS = 6
 STEPS = 10  # of a window: 4 s
 
 
@@ -36,18 +28,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="default: results/replay/RECORDING.json")
     a = parser.parse_args()
     out = a.out or OUT / f"{a.recording}.json"
-    learn, judge = by_cost(obsmat(a.folder, a.recording), a.radius, a.recording)
-    world = ringfence.fit(learn)
-    print(world.card)
-    with tempfile.TemporaryDirectory() as runs:
-        (run,) = ringfence.train("bc", learn, seeds=(0,), out=runs)
-        how = {"world": world, "radius": a.radius, "steps": STEPS, "windows": 1000, "anyway": True}
-        result = ringfence.replay(run, judge, **how)
-        beside = ringfence.replay(run, judge, **how, baselines=False, correction_restarts=0)
-    print(*result.summary(), "Without restarts of the correction:", *beside.summary(), sep="\n")
-    out.parent.mkdir(parents=True, exist_ok=True)
-    paired = {"without restarts": beside.to_json()["rows"]}
-    write_json(out, result.to_json() | paired | {"world": told(world)})
+    how = {"layout": "obsmat", "neighbours": NEIGHBOURS}
+    learn, judge = by_cost(obsmat(a.folder, a.recording), a.radius, a.recording, **how)
+    write(out, replayed(learn, judge, radius=a.radius, steps=STEPS, windows=1000))
 
 
 def obsmat(folder: Path, recording: str = "zara02") -> Path:
@@ -56,21 +39,6 @@ def obsmat(folder: Path, recording: str = "zara02") -> Path:
     if not found:
         raise SystemExit(f"'{folder}' holds no obsmat.txt of {recording}; get it from github.com/crowdbotp/OpenTraj.")
     return found[0]
-
-
-def by_cost(file: Path, radius: float, name: str = "zara02") -> tuple[EpisodeStore, EpisodeStore]:
-    """Logs to learn by and to judge by, whose costs are all that is known of danger."""
-    how = {"neighbours": NEIGHBOURS, "danger": constraints.Separation(radius, radius / 4)}
-    parts = EpisodeStore.split_table(file, 0.7, layout="obsmat", card={"task": name}, **how)
-    hazard = constraints.to_dict(constraints.CostColumn())
-    learn, judge = (dataclasses.replace(part, card=part.card.updated(hazard=hazard)) for part in parts)
-    return learn, judge
-
-
-def told(world: Any) -> dict[str, Any]:
-    """What the World's card says of itself."""
-    card = world.card.to_json()
-    return {"verdict": card["verdict"], "barrier": {k: v for k, v in card["barrier"].items() if k != "calibration"}}
 
 
 if __name__ == "__main__":

@@ -176,6 +176,34 @@ def test_xml_that_cannot_be_is_refused(tmp_path, text, said):
         EpisodeStore.from_layout(tmp_path / "fcd.xml", "sumo")
 
 
+# --- a swarm ---
+
+SYNDRONE = (
+    "ScenarioID,DroneID,Frame,Time,X,Y,Z,Vel,VelX,VelY,VelZ,AngVelX,AngVelY,AngVelZ,Roll,Pitch,Yaw,Role,Intent,Target,"
+    "IsObserver,TimeStr"
+)
+
+
+def test_a_swarm_flies_in_space_by_the_places_of_its_telemetry(tmp_path):
+    """Velocities of these files are of another clock than their times."""
+    lines = [SYNDRONE]
+    for k in range(12):
+        for who, role, x, speed in (("Drone1", "EGO", 0.0, 1.0), ("AttackDrone", "ADV", 9.0, -1.0)):
+            place = f"{x + 0.5 * k * speed:.3f},2.000,{-10 - 0.25 * k:.3f}"
+            moves = f"9.9,{1.5 * speed},0.000,-0.750,0.0,0.0,0.0,0.0,0.0,0.0"
+            when = f"{k + 1},{0.266 + 0.5 * k:.3f}"
+            lines.append(f"A-DEN,{who},{when},{place},{moves},{role},Patrolling,N/A,0,2025-06-20")
+    (tmp_path / "telemetry.csv").write_text("\n".join(lines) + "\n")
+    command = ["data", "import-table", str(tmp_path / "telemetry.csv"), "--layout", "syndrone", "--separation", "2"]
+    app.main([*command, "--neighbours", "1", "--out", str(tmp_path / "swarm.h5")])
+    store = EpisodeStore.load(tmp_path / "swarm.h5")
+    assert (store.episodes, store.steps, store.card.dt) == (2, 22, 0.5)
+    np.testing.assert_allclose(entry(store, "own.vz"), -0.5, atol=1e-3)
+    np.testing.assert_allclose(np.abs(entry(store, "own.vx")), 1.0, atol=1e-3)
+    assert abs(entry(store, "other0.dx")[0, 0]) == pytest.approx(9.0, abs=1e-3)
+    assert store.costs.sum() == 2 * 3, "nearer than 2 m after eight, nine and ten steps"
+
+
 # --- pedestrians ---
 def test_pedestrians_have_a_line_every_two_fifths_of_a_second(tmp_path):
     rows = []
@@ -500,5 +528,4 @@ def test_drones_telemetry_is_read_as_it_is(tmp_path):
     app.main(["data", "import-table", str(file), "--layout", "syndrone", "--separation", "2", "--out", f"{file}.h5"])
     store = EpisodeStore.load(f"{file}.h5")
     assert (store.episodes, store.n_agents, store.actions.shape[2]) == (1, 3, 3)
-    np.testing.assert_allclose(entry(store, "own.vz"), -0.1, atol=1e-5)
     np.testing.assert_allclose(entry(store, "other0.dx")[:, 0], 5.0, atol=1e-2)

@@ -13,10 +13,12 @@ from ringfence.errors import UserError
 from ringfence.evaluation.replay import judge
 from ringfence.evaluation.replay.judge import Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.motion import kinematics_of
+from ringfence.evaluation.replay.result import Film
 from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
 from ringfence.faults import Faults
 from ringfence.logs.store import EpisodeStore
+from ringfence.report import replay_page
 from ringfence.world import save
 from ringfence.world.card import Verdict
 from tests.quick import QUICK_WORLD
@@ -83,6 +85,38 @@ def test_who_drives_blindly_touches_and_a_guard_prevents_or_causes():
     assert (perfect.contacts, perfect.prevented, perfect.caused) == (0, EPISODES, 0)
     assert (bad.prevented, bad.caused) == (0, EPISODES)  # it leads the second one to the first one, who stands
     assert perfect.prevented_interval == pytest.approx((0.7354, 1.0), abs=1e-3)  # Clopper and Pearson, 12 of 12
+
+
+def flyers() -> EpisodeStore:
+    """The walkers in a plane that stands aslant in space."""
+    aslant = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0][:2]
+    store = walkers()
+    pairs = store.observations.reshape(*store.observations.shape[:2], 3, 2)
+    names = [f"{of}{axis}" for of in ("own.v", "other0.d", "other0.dv") for axis in "xyz"]
+    return dataclasses.replace(
+        store,
+        observations=(pairs @ aslant).reshape(*pairs.shape[:2], 9).astype(np.float32),
+        actions=(store.actions @ aslant).astype(np.float32),
+        card=store.card.updated(observation_names=names),
+    )
+
+
+def test_who_flies_is_replayed_in_space(tmp_path):
+    plane, stage = stage_of(walkers()), stage_of(flyers())
+    assert stage.kinematics.name == "double_integrator" and stage.kinematics.gain == pytest.approx(DT, rel=1e-3)
+    assert stage.windows.place.shape[-1] == 3
+    for driver in ("straight", "accelerate", "hasty", "seek"):
+        np.testing.assert_array_equal(stage.play(driver).contact, plane.play(driver).contact)
+    moved = np.array([0.3, -0.2, 0.5])
+    w = stage.windows
+    seen, _ = w.observed(5, w.place[:, 5] + moved, w.velocity[:, 5], np.zeros(w.count))
+    mine = seen[np.arange(w.count), w.driven] - w.observations[np.arange(w.count), 5, w.driven]
+    np.testing.assert_allclose(mine[:, 3:6], np.tile(-moved, (w.count, 1)), atol=1e-5)
+    with pytest.raises(UserError, match="kinematics='bicycle' moves in a plane, and these logs are of space"):
+        ringfence.replay(None, flyers(), radius=RADIUS, guard="none", kinematics="bicycle")
+    place = stage.play("seek").place[0]
+    film = Film("seek", others=w.others_at[0], logged=w.place[0], alone=place, guarded=place)
+    assert "<svg" in replay_page._drawn(film, RADIUS, 0)
 
 
 def test_driven_agents_observe_what_they_would():

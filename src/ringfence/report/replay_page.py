@@ -33,12 +33,12 @@ def build_replay(out: str | Path, result: ReplayResult) -> Path:
 
 def _drawn(film: Film, radius: float, number: int) -> str:
     """Paths of the driven agent without guard, with it and as logged, among the others'."""
-    own = np.concatenate([film.logged, film.alone, film.guarded])
+    own = np.concatenate([film.logged, film.alone, film.guarded])[:, :2]  # from above
     low, high = own.min(0) - BEYOND, own.max(0) + BEYOND
     with style():
         made = figure(8.2, 4.6)
         ax = made.add_subplot()
-        for other in np.moveaxis(film.others, 1, 0):
+        for other in np.moveaxis(film.others[..., :2], 1, 0):
             there = ((other > low) & (other < high)).all(-1)
             shown = np.where(there[:, None], other, np.nan)
             # Dots and no line: where others are listed by distance, a place in the list may change its owner.
@@ -49,11 +49,11 @@ def _drawn(film: Film, radius: float, number: int) -> str:
             "with guard": (film.guarded, "-"),
         }
         for name, (path, line) in lines.items():
-            ax.plot(*path.T, color=INK, linewidth=1.6, linestyle=line, label=name)
+            ax.plot(*path[:, :2].T, color=INK, linewidth=1.6, linestyle=line, label=name)
             if path is film.logged:
                 continue
             nearest = np.linalg.norm(film.others - path[:, None], axis=-1).min(-1).argmin()
-            around = Circle(tuple(path[nearest]), radius, fill=False, color=INK, linewidth=0.8, linestyle=line)
+            around = Circle(tuple(path[nearest, :2]), radius, fill=False, color=INK, linewidth=0.8, linestyle=line)
             ax.add_patch(around)  # contact, where it was nearest to another
         ax.set_xlim(low[0], high[0])
         ax.set_ylim(low[1], high[1])

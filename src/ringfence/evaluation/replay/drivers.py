@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ringfence.evaluation.replay.motion import Kinematics
+from ringfence.evaluation.replay.motion import SLOW, Kinematics
 
 AHEAD = 1.0  # s that the brake looks ahead, beside the time that stopping takes
 ROOM = 1.15  # radii that it keeps
@@ -15,14 +15,14 @@ ROOM = 1.15  # radii that it keeps
 
 @dataclass(frozen=True, eq=False)
 class Now:
-    """The driven agents of W windows at one moment; others as they were logged."""
+    """The driven agents of W windows at one moment, along X axes; others as they were logged."""
 
-    velocity: np.ndarray  # (W, 2) m/s
+    velocity: np.ndarray  # (W, X) m/s
     heading: np.ndarray  # (W,)
-    begun: np.ndarray  # (W, 2) velocity at the window's beginning
-    goal: np.ndarray  # (W, 2) m from here
-    others: np.ndarray  # (W, K, 2) m from here
-    others_move: np.ndarray  # (W, K, 2) m/s
+    begun: np.ndarray  # (W, X) velocity at the window's beginning
+    goal: np.ndarray  # (W, X) m from here
+    others: np.ndarray  # (W, K, X) m from here
+    others_move: np.ndarray  # (W, K, X) m/s
     max_speed: float
 
 
@@ -36,7 +36,12 @@ def _straight(now: Now) -> np.ndarray:
 
 
 def _accelerate(now: Now) -> np.ndarray:
-    return _along(np.stack([np.cos(now.heading), np.sin(now.heading)], -1), now.max_speed)
+    ahead = np.zeros_like(now.velocity)
+    ahead[:, :2] = np.stack([np.cos(now.heading), np.sin(now.heading)], -1)
+    if ahead.shape[1] > 2:  # in space, where it flies; who hovers goes where it is turned to
+        flies = np.linalg.norm(now.velocity, axis=-1, keepdims=True) > SLOW
+        ahead = np.where(flies, now.velocity, ahead)
+    return _along(ahead, now.max_speed)
 
 
 def _hasty(now: Now) -> np.ndarray:
@@ -48,7 +53,7 @@ def _seek(now: Now) -> np.ndarray:
     return _along(now.others[np.arange(len(nearest)), nearest], now.max_speed)
 
 
-# The velocity (W, 2) that each of them wants: hold speed and course; speed up ahead; to the goal, fast; to the nearest.
+# The velocity (W, X) that each of them wants: hold speed and course; speed up ahead; to the goal, fast; to the nearest.
 DRIVERS: dict[str, Callable[[Now], np.ndarray]] = {
     "straight": _straight,
     "accelerate": _accelerate,

@@ -16,6 +16,7 @@ from ringfence.problem import normalise
 from ringfence.world import World
 
 KINEMATICS = ("double_integrator", "holonomic", "unicycle", "bicycle", "world")
+TURNING = ("unicycle", "bicycle")  # that have a heading
 LINEAR = ("double_integrator", "holonomic")  # whose next velocity is a sum of this one and the action
 EXPLAINED = 0.5  # of what velocities change by: kinematics that explain less are refused
 WELL = 0.9  # the same of kinematics that nobody asked for
@@ -62,8 +63,13 @@ class Kinematics:
         return heading, (speed + action[:, 0] * self.dt)[:, None] * _unit(heading)
 
     def toward(self, wanted: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        """(W, A) the action within bounds that leads to a velocity (W, 2) soonest."""
+        """(W, A) the action within bounds that leads to a velocity (W, X) soonest."""
         if self.name in ("world", *LINEAR):
+            if len(self.low) != wanted.shape[1]:
+                raise UserError(
+                    f"Who drives badly on purpose needs an action for each of {wanted.shape[1]} axes, and these logs "
+                    f"have {len(self.low)}; replay a run with drivers=()."
+                )
             action = (wanted - (1 - self.drag) * velocity) / self.gain
             return np.clip(action, self.low, self.high)
         speed = (velocity * _unit(heading)).sum(-1)
@@ -79,14 +85,14 @@ class Kinematics:
     @property
     def brakes(self) -> float:
         """m/s² that it brakes by."""
-        gain = 1.0 if self.name in ("unicycle", "bicycle") else self.gain / self.dt
+        gain = 1.0 if self.name in TURNING else self.gain / self.dt
         return float(max(abs(gain) * min(abs(self.low[0]), abs(self.high[0])), 1e-3))
 
 
 def foreseen_velocity(world: World) -> Any:
-    """A compiled function (features (B, N, D), actions (B, N, A) in [−1, 1]) -> change of velocities (B, N, 2)."""
+    """A compiled function (features (B, N, D), actions (B, N, A) in [−1, 1]) -> change of velocities (B, N, X)."""
     names = list(world.spec.feature_names)
-    at = np.array([names.index("own.vx"), names.index("own.vy")])
+    at = np.array([names.index(name) for name in ("own.vx", "own.vy", "own.vz") if name in names])
 
     @jax.jit
     def change(world: World, before: Any, action: Any) -> Any:
@@ -103,19 +109,23 @@ def kinematics_of(
     if name is not None:
         known("kinematics", name, KINEMATICS)
     size = store.actions.shape[2]
-    if size != 2 and name != "world":
-        raise UserError(f"kinematics='{name or KINEMATICS[0]}' takes two actions an agent, the logs have {size}.")
+    axes = motion.offset.shape[-1]
+    if name in TURNING and axes > 2:
+        raise UserError(f"kinematics='{name}' moves in a plane, and these logs are of space; name another.")
+    if name is not None and name != "world" and size != axes:
+        raise UserError(f"kinematics='{name}' takes {axes} actions an agent, the logs have {size}.")
     low, high = _bounds(store)
     speeds = np.zeros(1) if motion.velocity is None else np.linalg.norm(motion.velocity, axis=-1)
     fastest = float(np.quantile(speeds, 0.999)) or 1.0
     made = Kinematics(name or KINEMATICS[0], dt, low, high, fastest, motion.late, wheelbase=wheelbase, world=world)
-    if name in ("unicycle", "bicycle"):
+    if name in TURNING:
         return made
-    fitted = _fitted(made, store, motion) if size == 2 else made
-    world_can = world is not None and {"own.vx", "own.vy"} <= set(world.spec.feature_names)
+    fitted = _fitted(made, store, motion) if size == axes else made
+    needed = [f"own.v{axis}" for axis in "xyz"[:axes]]
+    world_can = world is not None and set(needed) <= set(world.spec.feature_names)
     if name == "world" or (name is None and not fitted.explained >= WELL and world_can):
         if not world_can:
-            raise UserError("kinematics='world' needs a World whose view holds own.vx and own.vy; name another.")
+            raise UserError(f"kinematics='world' needs a World whose view holds {' and '.join(needed)}; name another.")
         return replace(fitted, name="world")
     if not fitted.explained >= EXPLAINED:
         raise UserError(

@@ -51,10 +51,10 @@ class Film:
     """One window: places in metres."""
 
     title: str
-    others: np.ndarray  # (L+1, K, 2)
-    logged: np.ndarray  # (L+1, 2)
-    alone: np.ndarray  # (L+1, 2) the policy without guard
-    guarded: np.ndarray  # (L+1, 2)
+    others: np.ndarray  # (L+1, K, X) along X axes
+    logged: np.ndarray  # (L+1, X)
+    alone: np.ndarray  # (L+1, X) the policy without guard
+    guarded: np.ndarray  # (L+1, X)
 
 
 @dataclass(frozen=True)

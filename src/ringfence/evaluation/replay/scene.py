@@ -13,7 +13,6 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import others
 from ringfence.problem.kinematics import late_share
 
-AXES = ("x", "y")
 NOBODY = 1e6  # m: how far away is who is not there
 
 
@@ -31,13 +30,19 @@ class Names:
         states = store.card.state_names or () if store.state is not None else ()
         return cls({n: d for d, n in enumerate(names)}, {n: d for d, n in enumerate(states)}, store.n_agents)
 
+    @cached_property
+    def axes(self) -> str:
+        """Along which agents move: a plane, or space where something is logged along z."""
+        along_z = [*self.observation, *self.state]
+        return "xyz" if any(re.fullmatch(r"own\.v?z|other0\.dz|agent0\.v?z", name) for name in along_z) else "xy"
+
     def pair(self, pattern: str) -> list[int] | None:
-        """Entries of x and y, where both are observed; `pattern` as own.v{}."""
-        found = [self.observation.get(pattern.format(axis)) for axis in AXES]
+        """Entries of x and y (and z in space), where all are observed; `pattern` as own.v{}."""
+        found = [self.observation.get(pattern.format(axis)) for axis in self.axes]
         return None if None in found else [d for d in found if d is not None]
 
     def state_pair(self, pattern: str) -> list[int] | None:
-        found = [self.state.get(pattern.format(axis)) for axis in AXES]
+        found = [self.state.get(pattern.format(axis)) for axis in self.axes]
         return None if None in found else [d for d in found if d is not None]
 
     def pairs(self, pattern: str, count: int) -> list[list[int]] | None:
@@ -81,9 +86,9 @@ class Names:
 class Motion:
     """What M logged moments say of each agent's motion."""
 
-    place: np.ndarray | None  # (M, N, 2) m; None: to be summed up from velocities
-    velocity: np.ndarray | None  # (M, N, 2) m/s; None: by differences
-    offset: np.ndarray  # (M, N, K, 2) m to others, NOBODY where nobody is seen
+    place: np.ndarray | None  # (M, N, X) m, X axes; None: to be summed up from velocities
+    velocity: np.ndarray | None  # (M, N, X) m/s; None: by differences
+    offset: np.ndarray  # (M, N, K, X) m to others, NOBODY where nobody is seen
     seen: np.ndarray  # (M, N, K) bool
     late: float  # share of a step that a body goes with its next velocity; the rest with this one
 
@@ -147,13 +152,14 @@ def _velocities(store: EpisodeStore, names: Names, x: np.ndarray) -> np.ndarray 
     entry = names.observation
     speed = entry.get("own.v", entry.get("own.speed"))
     if speed is not None and "own.cos" in entry and "own.sin" in entry:
-        return x[..., [entry["own.cos"], entry["own.sin"]]] * x[..., speed, None]
+        along = x[..., [entry["own.cos"], entry["own.sin"]]] * x[..., speed, None]
+        return along if names.axes == "xy" else None
     return None
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """W windows of L steps; in each of them agent `driven` (W,) is driven. Rows are L+1."""
+    """W windows of L steps; in each of them agent `driven` (W,) is driven. Rows are L+1, axes X."""
 
     names: Names
     sorted: bool  # others are observed in the order of their distance
@@ -163,10 +169,10 @@ class Windows:
     observations: np.ndarray  # (W, L+1, N, O)
     state: np.ndarray | None  # (W, L+1, S)
     actions: np.ndarray  # (W, L, N, A) as logged
-    place: np.ndarray  # (W, L+1, 2) of the driven agent, as logged
-    velocity: np.ndarray  # (W, L+1, 2)
-    offset: np.ndarray  # (W, L+1, K, 2) to others, from its logged place
-    goal: np.ndarray  # (W, 2)
+    place: np.ndarray  # (W, L+1, X) of the driven agent, as logged
+    velocity: np.ndarray  # (W, L+1, X)
+    offset: np.ndarray  # (W, L+1, K, X) to others, from its logged place
+    goal: np.ndarray  # (W, X)
     dt: float  # s
 
     @property
@@ -179,12 +185,12 @@ class Windows:
 
     @cached_property
     def others_at(self) -> np.ndarray:
-        """(W, L+1, K, 2) places of the others."""
+        """(W, L+1, K, X) places of the others."""
         return self.place[:, :, None] + self.offset
 
     @cached_property
     def others_move(self) -> np.ndarray:
-        """(W, L+1, K, 2) m/s: as observed, or by differences."""
+        """(W, L+1, K, X) m/s: as observed, or by differences."""
         if drift := self.names.pairs("other{}.dv{{}}", self.names.slots):
             mine = self.observations[np.arange(self.count), :, self.driven]
             return mine[..., np.array(drift)] + self.velocity[:, :, None]
@@ -192,7 +198,7 @@ class Windows:
         return np.concatenate([moved, moved[:, -1:]], 1)
 
     def distances(self, t: int, place: np.ndarray) -> np.ndarray:
-        """(W, K) m from places (W, 2) to the others at row t."""
+        """(W, K) m from places (W, X) to the others at row t."""
         return np.linalg.norm(self.others_at[:, t] - place[:, None], axis=-1)
 
     @cached_property
@@ -203,8 +209,8 @@ class Windows:
     def observed(
         self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Observations (W, N, O) and state (W, S) at row t, where the driven agent is at `place` (W, 2) and moves with
-        `velocity` (W, 2), turned to `heading` (W,)."""
+        """Observations (W, N, O) and state (W, S) at row t, where the driven agent is at `place` (W, X) and moves with
+        `velocity` (W, X), turned to `heading` (W,)."""
         moved = place - self.place[:, t]
         faster = velocity - self.velocity[:, t]
         x = np.array(self.observations[:, t], np.float64)
@@ -220,7 +226,7 @@ class Windows:
         for pattern, change in (("own.{}", moved), ("own.v{}", faster), ("goal.d{}", -moved)):
             if pair := self.names.pair(pattern):
                 mine[:, pair] += change
-        along = (velocity * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)
+        along = (velocity[:, :2] * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)
         known = {"own.v": along, "own.speed": along, "own.cos": np.cos(heading), "own.sin": np.sin(heading)}
         for name, value in (known | {"own.heading": heading, "own.yaw": heading, "own.theta": heading}).items():
             if name in self.names.observation:
@@ -242,7 +248,7 @@ class Windows:
         whats = [m[1] for n in self.names.observation if (m := re.fullmatch(r"other0\.(\w+)", n))]
         entries = np.array([[self.names.observation[f"other{j}.{w}"] for w in whats] for j in range(self.names.slots)])
         blocks = mine[:, entries]  # (W, K, C)
-        far = np.hypot(blocks[..., whats.index("dx")], blocks[..., whats.index("dy")])
+        far = np.linalg.norm(blocks[..., [whats.index(f"d{axis}") for axis in self.names.axes]], axis=-1)
         if "seen" in whats:
             far = np.where(blocks[..., whats.index("seen")] > 0.5, far, NOBODY)
         order = np.argsort(far, -1, kind="stable")
@@ -321,7 +327,7 @@ def windows_of(
 
 
 def _tracks(motion: Motion, rows: np.ndarray, driven: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places and velocities (W, L+1, 2) of the driven agents."""
+    """Places and velocities (W, L+1, X) of the driven agents."""
     who = driven[:, None]
     place = None if motion.place is None else motion.place[rows, who]
     if motion.velocity is not None:

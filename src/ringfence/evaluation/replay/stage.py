@@ -62,7 +62,7 @@ class _Bad:
 class Driven:
     """What came of W windows."""
 
-    place: np.ndarray  # (W, L+1, 2)
+    place: np.ndarray  # (W, L+1, X) along X axes
     contact: np.ndarray  # (W,) bool
     info: dict[str, np.ndarray] = field(default_factory=dict)  # (W, L)
 

@@ -64,13 +64,10 @@ LAYOUTS = {
     ),
     # INTERACTION (Zhan et al. 2019), vehicle_tracks_xxx.csv.
     "interaction": Layout({"time": "timestamp_ms", "agent": "track_id"}, 1e-3),
+    # SynDrone-Swarm (Unal 2026), telemetry.csv: multirotors of AirSim, z is down. Its times are the computer's, which
+    # the simulator does not keep up with, so that its velocities are 1.5 times what places change by.
+    "syndrone": Layout({"time": "Time", "agent": "DroneID", "x": "X", "y": "Y", "z": "Z"}, 1.0, state=("x", "y", "z")),
     # What the readers of these files call time, agent, x, y, vx and vy.
-    # SynDrone-Swarm (Unall 2025), telemetry.csv: multirotors of AirSim, z is down.
-    "syndrone": Layout(
-        {"time": "Time", "agent": "DroneID", "x": "X", "y": "Y", "z": "Z", "vx": "VelX", "vy": "VelY", "vz": "VelZ"},
-        1.0,
-        state=("x", "y", "z", "vx", "vy", "vz"),
-    ),
     "sumo": Layout({}, 1.0),
     "obsmat": Layout({}, 1.0),
 }
