@@ -1,80 +1,176 @@
 """A guarded run behind faults, as the guard is and with what it can be told of them.
 
-python benchmarks/stress.py               # writes results/stress/crossing-hasty.csv; two minutes a row, on one core
+python benchmarks/stress.py                         # writes results/stress/crossing-hasty.csv, a row when it is played
+python benchmarks/stress.py --jobs 16 --rows delay3/told drop0.6/told      # some rows, each in a process of its own
+python benchmarks/stress.py --list
+python benchmarks/stress.py --table                 # writes the table of docs/stress.md
+
+Half a minute for 50 episodes of a row, on one core that has nothing else to do.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import subprocess
+import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import _rows
 
-from ringfence.deploy import zoo
-from ringfence.errors import UserError
-from ringfence.evaluation.stress import stress
-
-OUT = Path(__file__).resolve().parent.parent / "results" / "stress" / "crossing-hasty.csv"
+ROOT = Path(__file__).resolve().parent.parent
+OUT = ROOT / "results" / "stress" / "crossing-hasty.csv"
+PAGE = ROOT / "docs" / "stress.md"
 FIELDS = ("faults", "guard", "told", "episodes", "return", "violation_rate", "violation_upper", "infeasible_rate")
-DELAYS = [{}, {"delay": 1}, {"delay": 2}, {"delay": 3}]
+RUN = "crossing-hasty/bc"
+LESS = {"others_acceleration": 0.7}  # m/s², where the World says 1.0
 FARTHER = {"margin": 1.5, "horizon": 5}  # chosen on 50 validation episodes with three late steps
-OTHERS = [
+MIDDLE = {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5}
+FAULTS: tuple[dict[str, Any], ...] = (
+    {},
+    {"delay": 1},
+    {"delay": 2},
+    {"delay": 3},
+    {"jitter": 2},
     {"drop": 0.3},
     {"drop": 0.6},
     {"asynchrony": 0.667},
     {"noise": 0.005},
     {"noise": 0.02},
+    {"bias": 0.02},
     {"gain": 0.8},
     {"gain": 0.6},
-    {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5},
-]
+    {"spread": 0.2},
+    {"stop": 0.002},
+    MIDDLE,
+)
+TOLD = ("delay", "jitter", "drop", "asynchrony")  # faults that a guard can be told of
+
+Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether the guard is told, its other options
+
+
+def trials() -> dict[str, Trial]:
+    """All rows by name, e.g. `delay3/told`."""
+    found: dict[str, Trial] = {}
+    for faults in FAULTS:
+        name = name_of(faults)
+        found[name] = faults, False, {}
+        if not faults.keys() & set(TOLD):
+            continue
+        found[f"{name}/told"] = faults, True, {}
+        if faults.keys() & {"delay", "drop"}:
+            found[f"{name}/told/less"] = faults, True, LESS
+    found["delay3/told/farther"] = {"delay": 3}, True, FARTHER
+    return found
+
+
+def name_of(faults: dict[str, Any]) -> str:
+    return "+".join(f"{k}{v}" for k, v in faults.items()) or "none"
+
+
+def guard_of(options: dict[str, Any]) -> str:
+    return ", ".join(["shield", *(f"{k} {v}" for k, v in options.items())])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--delays", action="store_true", help="late actions alone")
+    parser.add_argument("--rows", nargs="*", help="all by default")
+    parser.add_argument("--jobs", type=int, default=1, help="rows that are played side by side")
+    parser.add_argument("--agents", type=int, help="of another team than that of the logs")
+    parser.add_argument("--list", action="store_true")
+    parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
-    done = {(row["faults"], row["guard"], row["told"]) for row in _rows.read(a.out)}
+    every = trials()
+    if a.list:
+        print(*every, sep="\n")
+        return
+    if a.table:
+        write_table(a.out)
+        return
+    unknown = set(a.rows or ()) - set(every)
+    if unknown:
+        raise SystemExit(f"There is no row {sorted(unknown)[0]}; --list says which there are.")
+    wanted = a.rows or list(every)
+    if a.jobs > 1:
+        side_by_side(wanted, a.jobs, a.episodes, a.out, a.agents)
+        return
     with tempfile.TemporaryDirectory() as folder:
-        run = zoo.pretrained("crossing-hasty/bc", folder)
-        for faults in DELAYS if a.delays else DELAYS + OTHERS:
-            told = bool(faults.keys() & {"delay", "drop"})
-            trials = [
-                (False, {}),
-                *([(True, {})] if told else []),
-                *([(True, FARTHER)] if faults == {"delay": 3} else []),
-            ]
-            for how, options in trials:
-                row = _row(run, faults, how, options, a.episodes, done)
-                if row is not None:
-                    print(row, flush=True)
-                    _rows.append(a.out, row, FIELDS)
+        from ringfence.deploy import zoo
+
+        run = zoo.pretrained(RUN, folder)
+        for name in wanted:
+            play(run, every[name], a.episodes, a.out, a.agents)
 
 
-def _row(
-    run: Any, faults: dict[str, Any], told: bool, options: dict[str, Any], episodes: int, done: set
-) -> dict[str, Any] | None:
-    name = "+".join(f"{k}{v}" for k, v in faults.items()) or "none"
-    guard = ", ".join(["shield", *(f"{k} {v}" for k, v in options.items())])
-    if (name, guard, str(told)) in done:
-        return None
+def play(run: Any, trial: Trial, episodes: int, out: Path, agents: int | None) -> None:
+    """Play a row and add it to the file, unless it is there."""
+    from ringfence.errors import UserError
+    from ringfence.evaluation.stress import stress
+
+    faults, told, options = trial
+    row: dict[str, Any] = {"faults": name_of(faults), "guard": guard_of(options), "told": told, "episodes": episodes}
+    done = {tuple(r[k] for k in FIELDS[:4]) for r in _rows.read(out)}
+    if tuple(str(row[k]) for k in FIELDS[:4]) in done:
+        return
+    given = {} if agents is None else {"agents": agents}
     try:
-        result = stress(run, faults, episodes=episodes, guard="shield", compensate=told, **options)
+        result = stress(run, faults, episodes=episodes, guard="shield", compensate=told, **options, **given)
     except UserError as error:  # more late steps than the World's predictions are known for
-        print(f"{name}, {guard}, told {told}: {error}", flush=True)
-        return None
-    return {
-        "faults": name,
-        "guard": guard,
-        "told": told,
-        "episodes": episodes,
-        "return": round(result["return_mean"], 3),
-        **{field: round(result[field], 4) for field in FIELDS[5:]},
-    }
+        print(f"{row}: {error}", flush=True)
+        return
+    row |= {"return": round(result["return_mean"], 3), **{field: round(result[field], 4) for field in FIELDS[5:]}}
+    print(row, flush=True)
+    _rows.append(out, row, FIELDS)
+
+
+def side_by_side(wanted: Sequence[str], jobs: int, episodes: int, out: Path, agents: int | None) -> None:
+    """Every row in a process with one core; each adds its own."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if not out.exists():
+        out.write_text(",".join(FIELDS) + "\n")
+    one_core = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "NPROC": "1", "OPENBLAS_NUM_THREADS": "1"}
+    command = [sys.executable, __file__, "--episodes", str(episodes), "--out", str(out)]
+    command += [] if agents is None else ["--agents", str(agents)]
+    waiting = list(wanted)
+    running: list[subprocess.Popen] = []
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            running.append(subprocess.Popen([*command, "--rows", waiting.pop(0)], env={**os.environ, **one_core}))
+        running.pop(0).wait()
+
+
+def write_table(out: Path) -> None:
+    """The table of docs/stress.md between its markers."""
+    rows = _rows.read(out)
+    plain = {r["episodes"]: float(r["return"]) for r in rows if r["faults"] == "none"}
+    order = {name: k for k, name in enumerate(name_of(faults) for faults in FAULTS)}
+    head = "faults | guard | told | episodes | return | of that without faults | episodes with contact (95 % ≤)"
+    lines = [f"| {head} | infeasible steps |", "|---" * 8 + "|"]
+    for r in sorted(rows, key=lambda r: (order[r["faults"]], r["told"] == "True", r["guard"])):
+        base = plain.get(r["episodes"], next(iter(plain.values())))
+        share, rate, upper, infeasible = (
+            100 * float(x)
+            for x in (float(r["return"]) / base, r["violation_rate"], r["violation_upper"], r["infeasible_rate"])
+        )
+        faults = re.sub(r"([a-z])([\d.]+)", r"\1 \2", r["faults"]).replace("+", ", ")
+        told = "yes" if r["told"] == "True" else "no"
+        cells = [
+            faults,
+            r["guard"].replace("_", " "),
+            told,
+            r["episodes"],
+            f"{float(r['return']):.2f}",
+            f"{share:.0f} %",
+        ]
+        lines.append("| " + " | ".join([*cells, f"{rate:.1f} % (≤ {upper:.1f})", f"{infeasible:.0f} %"]) + " |")
+    table = "<!-- stress -->\n" + "\n".join(lines) + "\n<!-- /stress -->"
+    PAGE.write_text(re.sub(r"<!-- stress -->.*?<!-- /stress -->", lambda _: table, PAGE.read_text(), flags=re.S))
 
 
 if __name__ == "__main__":

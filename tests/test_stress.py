@@ -17,14 +17,14 @@ from ringfence.deploy import zoo
 from ringfence.envs import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.pettingzoo import CrossingParallel
-from ringfence.errors import UserError
+from ringfence.errors import NoSafeAction, UserError
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import compensated, own_acceleration
 from ringfence.faults import Faults, Faulty, under_faults
-from ringfence.faults.certificate import Certificate
+from ringfence.faults.certificate import Certificate, digest
 from ringfence.faults.monitor import Monitor
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
@@ -32,6 +32,7 @@ from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.types import PolicyStep
+from ringfence.utils.chained import records
 
 LIGHT = {"correction_steps": 1, "correction_restarts": 0, "horizon": 1, "terminal_value": False}  # compiles soon
 
@@ -435,6 +436,67 @@ def test_a_kept_promise_seldom_raises_an_alarm_and_a_broken_one_soon():
             Monitor(**wrong)
     with pytest.raises(UserError, match="must be true or false"):
         Monitor(0.1).observe(0.3)
+
+
+def test_what_is_done_on_an_alarm_is_an_option(run, tmp_path):
+    """Reported, refused, with a wider margin, or by somebody else."""
+    how = {"guard": "shield", **LIGHT}
+    guard = load(run, **how)[1].one.guard
+    made = Certificate(
+        policy=digest(load(run)[1].one),
+        world=digest(guard.world),
+        task="crossing-hasty",
+        agents=8,
+        guard=dataclasses.asdict(guard.options),
+        barrier="learned",
+        faults={},
+        confidence=0.95,
+        bound=0.02,
+        episodes=300,
+        violations=2,
+        rounds=(),
+        agreed=True,
+        held=1.0,
+        infeasible_rate=0.0,
+    )
+    file = made.save(tmp_path / "cert.json")
+    env = Crossing()
+    seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1)))[0]
+
+    def alarmed(**given):
+        controller = Controller(run, certificate=file, log=tmp_path / f"{given}.log", **given, **how)
+        first = controller.act(seen)
+        info = controller.info
+        assert info["covered"] == ~(info["infeasible"] | info["ood"]) and not info["alarm"]
+        assert not controller.finished(False)
+        alarms = [controller.finished(True) for _ in range(4)]
+        assert alarms[-1] and sorted(alarms) == alarms
+        return controller, first
+
+    reports, first = alarmed()
+    np.testing.assert_allclose(reports.act(seen), first, atol=1e-6)
+    assert reports.info["alarm"] and not reports.info["covered"]
+    reports.close()
+    assert [r["kind"] for r in records(tmp_path / "{}.log")].count("finished") == 5
+    stops, _ = alarmed(on_alarm="stop")
+    with pytest.raises(NoSafeAction, match="More episodes violate than the certificate allows"):
+        stops.act(seen)
+    widens, _ = alarmed(on_alarm="widen")
+    assert widens.policy.one.guard.options.margin == pytest.approx(1.5 * made.guard["margin"])
+    widens.act(seen)
+    hands_over, _ = alarmed(on_alarm="hand_over", fallback=lambda seen, state: np.full((8, 2), 0.25))
+    np.testing.assert_array_equal(hands_over.act(seen), 0.25)
+    for wrong, words in (
+        ({"on_alarm": "panic"}, "is none of its choices"),
+        ({"on_alarm": "hand_over"}, "go together"),
+        ({"fallback": print}, "go together"),
+    ):
+        with pytest.raises(UserError, match=words):
+            Controller(run, certificate=file, **wrong, **how)
+    with pytest.raises(UserError, match="read by nothing without a certificate"):
+        Controller(run, on_alarm="stop", **how)
+    with pytest.raises(UserError, match="Nothing was promised"):
+        Controller(run, **how).finished(True)
 
 
 def test_a_controller_is_told_how_old_observations_are(run):

@@ -512,7 +512,7 @@ def replay(
     from ringfence.report.replay_page import build_replay
     from ringfence.training.runs import write_json
 
-    given = playing.arguments() | {"faults": wrong.faults()}
+    given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults()}
     out_file = None if out_file is None else writable(out_file)
     report = None if report is None else writable(report)
     policy = None if run.is_file() else _runs([run])[0]

@@ -17,14 +17,19 @@ from ringfence.datasets.task import Task
 from ringfence.envs.base import Measured, NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
-from ringfence.evaluation.rollout import COUNTED, rollout
+from ringfence.evaluation.rollout import rollout
 from ringfence.faults import Faults, under_faults
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy
 from ringfence.utils.renamed import policy_of_before
 
-RATES = {"infeasible": "infeasible_rate", "ood": "ood_rate"}  # columns of what is counted in steps
+RATES = {  # columns of what is counted in steps
+    "infeasible": "infeasible_rate",
+    "ood": "ood_rate",
+    "proved": "proved_rate",
+    "agent_proved": "agent_proved_rate",
+}
 NO_FAULTS = Faults()
 PROTOCOL = 1  # results of different protocols are never mixed in one table
 
@@ -57,7 +62,7 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
         "violation_rate": float(violated.mean()),
         "violation_interval": statistics.clopper_pearson(int(violated.sum()), episodes),
         "violation_upper": statistics.upper_bound(int(violated.sum()), episodes),
-        **{RATES[k]: float(played[k].sum() / steps.sum()) for k in COUNTED if k in played},
+        **{RATES[k]: float(played[k].sum() / steps.sum()) for k in RATES if k in played},
         # Share of (agent, episode) with a cost of the agent's own.
         **({"agent_violation_rate": float(played["violated"].any(1).mean())} if "violated" in played else {}),
         "unsafe_starts": int(hazard_at_start.sum()),

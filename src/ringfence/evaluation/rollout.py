@@ -17,9 +17,11 @@ from ringfence.utils.progress import Progress
 
 RESETS = {"test": 7_000_001, "validation": 9_000_001}  # roots of the reset keys
 CHUNK = 50  # episodes per compiled batch
-COUNTED = ("infeasible", "ood")  # of every step: a guard's condition could not be met; its World knew nothing there
+# of every step: a guard's condition could not be met; its World knew nothing there; its plan was proved
+COUNTED = ("infeasible", "ood", "proved")
+SHARES = ("agent_proved",)  # of every step: the share of agents, e.g. of those whose own plan was proved
 FORESEEN = "next_clearance"  # by the guard: the least score of the state that its action leads to
-CUT = ("reward", "cost", "state", "violated", FORESEEN, *COUNTED)  # of as many episodes as were asked for
+CUT = ("reward", "cost", "state", "violated", FORESEEN, *COUNTED, *SHARES)  # of as many episodes as were asked for
 
 Played = dict[str, np.ndarray]
 
@@ -152,7 +154,7 @@ def _rollout_native(
             outcomes.append(simulation.step(np.asarray(decided.action)))
             states.append(simulation.state().astype(np.float32))
             carry = with_cost(policy, carry, outcomes[-1].cost)
-            counted.append({name: np.asarray(value) & running for name, value in _counted(decided).items()})
+            counted.append({name: np.asarray(value) * running for name, value in _counted(decided).items()})
             if num_recorded:
                 drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})
             bar.advance(1)
@@ -171,11 +173,12 @@ def _rollout_native(
 
 
 def _counted(decided: PolicyStep) -> dict[str, Array]:
-    return {name: decided.info[name] for name in COUNTED if name in decided.info}
+    counted = {name: decided.info[name] for name in COUNTED if name in decided.info}
+    return counted | {name: decided.info[name].mean(-1) for name in SHARES if name in decided.info}
 
 
 def _drawn(decided: PolicyStep) -> dict[str, Array]:
-    return {name: value for name, value in decided.info.items() if name not in (*COUNTED, FORESEEN)}
+    return {name: value for name, value in decided.info.items() if name not in (*COUNTED, *SHARES, FORESEEN)}
 
 
 def _foreign(policy: Policy) -> bool:

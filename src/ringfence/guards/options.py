@@ -48,6 +48,10 @@ class GuardOptions:
     hold: Held = 1  # steps for which an action is held: agents that act every so many steps
     # m/s² that others may accelerate by while nobody sees them: late and old observations have them nearer by so much
     others_acceleration: NonNegative = 0.0
+    proof: NonNegative = 0.0  # what every entry may be off by, while plans are still proved; 0: nothing is proved
+    proof_rows: Samples = 10  # rows of a plan, and of braking after it, that are proved
+    proof_residual: NonNegative = 0.0  # by which a predicted row of the own velocity may be off, in its own unit
+    proof_backup: bool = True  # where a plan is not proved, the last one that was goes on
 
     def __post_init__(self):
         check_bounds(self)

@@ -17,6 +17,7 @@ from ringfence.errors import NoSafeAction, UserError, unknown
 from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions, in_steps
+from ringfence.guards.proof import Prover
 from ringfence.guards.reasons import reasons
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
@@ -71,6 +72,9 @@ class Guarded(HadStart, eqx.Module):
             shape = (batch, options.delay + options.max_age, spec.n_agents, spec.action_dim)
             carry["sent"] = jnp.broadcast_to(nothing, shape)  # the oldest first
             carry["observed_age"] = jnp.zeros((batch, spec.n_agents), jnp.int32)
+        if options.proof:
+            carry["proved_plan"] = jnp.zeros((batch, options.proof_rows, spec.n_agents, spec.action_dim))
+            carry["proved_left"] = jnp.zeros((batch, spec.n_agents), jnp.int32)  # rows of it that are left
         if constraints > 1:
             carry["costs"] = jnp.full((batch, constraints), jnp.nan, jnp.float32)
         return carry
@@ -128,6 +132,10 @@ class Guarded(HadStart, eqx.Module):
             acting = self.when_it_acts(carry, present)
             unseen = guard.options.delay + carry["observed_age"]
         found = guard.decide(acting, actions, carry["last"], margin, key, unseen)
+        action = found.plan[:, 0]
+        proof = {}
+        if guard.options.proof:
+            carry, action, proof = self._with_proof(carry, acting, found.plan, unseen)
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -138,13 +146,13 @@ class Guarded(HadStart, eqx.Module):
             "agent_clearance": found.safety,
             "agent_infeasible": found.short,
             "agent_ood": found.ood,
+            **proof,
         }
         spec = guard.world.spec
-        action = normalise.from_unit(found.plan[:, 0], spec.action_low, spec.action_high)
         if self.explains:
             info |= reasons(guard, acting, actions[:, 0])
         if "sent" in carry:
-            carry = {**carry, "sent": jnp.concatenate([carry["sent"][:, 1:], found.plan[:, :1]], 1)}
+            carry = {**carry, "sent": jnp.concatenate([carry["sent"][:, 1:], action[:, None]], 1)}
         unknown_costs = {name: jnp.full_like(carry[name], jnp.nan) for name in ("cost", "costs") if name in carry}
         carry = {
             **carry,
@@ -154,7 +162,29 @@ class Guarded(HadStart, eqx.Module):
             "before": present,
             "age": carry["age"] + 1,
         }
-        return carry, PolicyStep(action, info)
+        return carry, PolicyStep(normalise.from_unit(action, spec.action_low, spec.action_high), info)
+
+    def _with_proof(
+        self, carry: PyTree, acting: Array, plan: Array, unseen: Array | None
+    ) -> tuple[PyTree, Array, dict[str, Array]]:
+        """(carry, actions (B, N, A), what is known): the plan's where it is proved, else those of the last plan that
+        was, as long as it has rows left (Sha 2001, the simplex architecture)."""
+        options = self.guard.options
+        prover = prover_of(self.guard.world, options)
+        whole = prover.braked(acting, plan)
+        new = prover.lower_bounds(acting, whole, unseen).min(1) >= 0
+        kept = jnp.concatenate([carry["proved_plan"][:, 1:], carry["proved_plan"][:, -1:]], 1)
+        left = jnp.maximum(carry["proved_left"] - 1, 0)
+        backup = ~new & (left > 0) & options.proof_backup
+        action = jnp.where(backup[..., None], kept[:, 0], plan[:, 0])
+        chosen = new[:, None, :, None]
+        kept = {
+            "proved_plan": jnp.where(chosen, whole, kept),
+            "proved_left": jnp.where(new, options.proof_rows, left * backup),
+        }
+        proved = new | backup
+        info = {"proved": proved.all(-1), "agent_proved": proved, "agent_backup": backup}
+        return {**carry, **kept}, action, info
 
     def when_it_acts(self, carry: PyTree, present: Array) -> Array:
         """(B, N, D) where the team will be when the action that is decided now takes effect: the World goes on from
@@ -318,6 +348,10 @@ def build(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
     _refuse_far(options, world)
+    if options.proof:
+        if barrier != "learned":
+            raise UserError(f"proof is of a barrier that was learned, and barrier='{barrier}'; leave one of them out.")
+        prover_of(world, options)
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
     return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value), options))
 
@@ -326,6 +360,11 @@ def _refuse_two_horizons(changes: Mapping[str, Any]) -> None:
     if set(HORIZONS) <= set(changes):
         both = " and ".join(f"{name}={changes[name]}" for name in HORIZONS)
         raise UserError(f"{both} both say how far the guard looks; give one of them.")
+
+
+def prover_of(world: World, options: GuardOptions) -> Prover:
+    """Who proves a guard's plans; Worlds that it cannot prove anything of are refused."""
+    return Prover(world, options.proof, options.others_acceleration, options.proof_rows, options.proof_residual)
 
 
 def _refuse_far(options: GuardOptions, world: World) -> None:

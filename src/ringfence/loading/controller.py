@@ -19,6 +19,7 @@ from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_
 from ringfence.guards.wrap import Callback, under_guard
 from ringfence.loading.evidence import Evidence, explaining, guarded_of
 from ringfence.loading.resolve import load
+from ringfence.loading.watch import Fallback, Watch, widened
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, agent_policy, team_policy
 from ringfence.proposals.base import act_with, with_cost
@@ -55,6 +56,10 @@ class Controller:
     from it. `info["covered"]` then says whether the guard kept its condition where its World knows its way: of other
     steps the certificate counts how they end, and says no more.
 
+    `finished(violated)` after an episode watches whether the certificate's bound is kept. `on_alarm` says what is done
+    when it is not: report (`info["alarm"]`), stop (refuse to act), widen (half as much margin again), or hand_over (to
+    `fallback`, a callable (observations, state) -> actions that nothing guards).
+
     log: a file, to which a record of every step is added before its action is returned: what was requested and what
     is executed, why, how old the observations were, whether it was covered (docs/stress.md). Each record holds a digest
     of the one before; `evidence.last` is that of the last one. `close()` ends the log.
@@ -67,6 +72,8 @@ class Controller:
         seed: int = 0,
         certificate: str | Path | None = None,
         log: str | Path | None = None,
+        on_alarm: str = "report",
+        fallback: Fallback | None = None,
         **options: Any,
     ):
         keep_programs()
@@ -75,6 +82,7 @@ class Controller:
             if options.get("guard", "none") == "none":
                 raise UserError(UNGUARDED)
             options = {"margin": promised.guard["margin"], **options}
+        self._watch = Watch(promised, on_alarm, fallback)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._source = _source(run, planner, options)
         self.policy: Policy = self._source.policy
@@ -103,6 +111,17 @@ class Controller:
         if self.evidence is not None:
             self.evidence.reset()
 
+    def finished(self, violated: bool) -> bool:
+        """An episode has ended, and violated or not. Whether the certificate's promise is known not to be kept: of
+        promises that are kept at most 1 % ever raise this alarm."""
+        before = self._watch.alarm
+        alarm = self._watch.finished(violated)
+        if self.evidence is not None:
+            self.evidence.finished(bool(violated), alarm)
+        if alarm and not before and self._watch.on_alarm == "widen":
+            self._source.policy = self.policy = widened(self.policy)
+        return alarm
+
     def close(self) -> None:
         """End the log, if there is one."""
         if self.evidence is not None:
@@ -125,6 +144,7 @@ class Controller:
         source = self._source
         begun = time.perf_counter()
         with no_safe_action(self.last_action), self._recorded():
+            self._watch.check()
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
             before = self._carry if age is None else self._aged(age)
@@ -132,7 +152,10 @@ class Controller:
             carry, step = source.act(before, seen, paid, now)
             action, info = acted(step, source.name)
             if self.certificate is not None:
-                info["covered"] = ~(info["infeasible"] | info["ood"])
+                info["covered"] = ~(info["infeasible"] | info["ood"]) & (not self._watch.alarm)
+                info["alarm"] = np.array(self._watch.alarm)
+            taken_over = self._watch.taken_over(*seen, action.shape)
+            action = action if taken_over is None else taken_over
         if self.evidence is not None:
             self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()

@@ -41,6 +41,10 @@ class Evidence:
         """An episode begins."""
         self._log.add({"kind": "reset", "t": _now()})
 
+    def finished(self, violated: bool, alarm: bool) -> None:
+        """An episode has ended."""
+        self._log.add({"kind": "finished", "t": _now(), "violated": violated, "alarm": alarm})
+
     def step(
         self,
         seen: tuple[np.ndarray, np.ndarray | None],
@@ -64,7 +68,9 @@ class Evidence:
             record["clearance"] = _numbers(info["agent_clearance"])
             record["infeasible"] = np.flatnonzero(info["agent_infeasible"]).tolist()
             record["ood"] = np.flatnonzero(info["agent_ood"]).tolist()
-        for name in ("covered", "proved"):
+        if "agent_backup" in info:
+            record["backup"] = np.flatnonzero(info["agent_backup"]).tolist()
+        for name in ("covered", "proved", "alarm"):
             if name in info:
                 record[name] = bool(np.all(info[name]))
         self._log.add(record)

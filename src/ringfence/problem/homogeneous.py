@@ -67,6 +67,8 @@ def agent_policy(policy: Any) -> Any:
 def merge_agents(step: PolicyStep, shape: tuple[int, int]) -> PolicyStep:
     """What B N teams of one decided, as B teams of N."""
     info = {k: step.info[k].reshape(shape).any(1) for k in ("infeasible", "ood") if k in step.info}
+    if "proved" in step.info:
+        info["proved"] = step.info["proved"].reshape(shape).all(1)
     for name in ("clearance", "next_clearance"):
         if name in step.info:
             info[name] = step.info[name].reshape(shape).min(1)

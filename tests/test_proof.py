@@ -1,0 +1,185 @@
+"""Bounds hold for whatever is sampled, and plans are proved where all that is predicted of them is safe."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from ringfence.deploy import zoo
+from ringfence.envs import Crossing
+from ringfence.errors import UserError
+from ringfence.guards.policy import build
+from ringfence.guards.proof import Box, Prover, score_below
+from ringfence.guards.wrap import Nothing
+from ringfence.loading.resolve import load
+from ringfence.nets import bounds
+from ringfence.nets.mlp import MLP
+from ringfence.world.barrier import Barrier
+from ringfence.world.cause_nets import CauseNet, Distance, worst
+from ringfence.world.causes import Cause, Edge
+
+ROWS = 10
+
+
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory):
+    return load(zoo.pretrained("crossing-hasty/bc", tmp_path_factory.mktemp("runs")), guard="shield")[1].one
+
+
+@pytest.fixture(scope="module")
+def present(guarded):
+    """States (24, 1, D) of three teams on their way."""
+    env = Crossing()
+    state = env.reset(jax.random.key(0), 3)
+    state = state._replace(
+        velocity=0.7 * jax.random.uniform(jax.random.key(1), state.velocity.shape, minval=-1.0, maxval=1.0),
+        position=0.6 * state.position,
+    )
+    return guarded.guard.world.map(env.observe(state).reshape(24, 1, -1), None)
+
+
+def anywhere(key, center, radius, tries):
+    """(tries, ...) points in boxes: half of them anywhere, half in corners, where most is at its extreme."""
+    key_inside, key_corner = jax.random.split(key)
+    shape = (tries // 2, *center.shape)
+    inside = jax.random.uniform(key_inside, shape, minval=-1.0, maxval=1.0)
+    corner = jax.random.rademacher(key_corner, shape, jnp.float32)
+    return center + radius * jnp.concatenate([inside, corner])
+
+
+@pytest.mark.parametrize("linear", [False, True])
+def test_no_output_of_a_network_lies_beyond_its_bounds(linear):
+    """A million inputs of five boxes."""
+    key_net, key_center, key_try = jax.random.split(jax.random.key(0), 3)
+    net = MLP(key_net, (9, 64, 64, 64, 2), linear=linear)
+    if linear:
+        net = eqx.tree_at(lambda net: net.linear, net, jax.random.normal(key_net, (1, 9, 2)))
+    center = jax.random.normal(key_center, (5, 9))
+    radius = jnp.array([0.0, 0.01, 0.1, 0.5, 2.0])[:, None] * jnp.ones(9)
+    inputs = bounds.Inputs(center, None, radius)
+    low, high = jax.jit(lambda inputs: bounds.output_bounds(net, inputs))(inputs)
+    matrix, least, most = jax.jit(lambda inputs: bounds.linear_bounds(net, inputs))(inputs)
+
+    @jax.jit
+    def beyond(key):
+        x = anywhere(key, center, radius, 20_000)
+        y = net(x)
+        line = (matrix * x[..., None, :]).sum(-1)
+        gaps = [low - y, y - high, line + least - y - 1e-4, y - line - most - 1e-4]
+        return jnp.stack([gap.max() for gap in gaps]), y.max(0), y.min(0)
+
+    tried = [beyond(key) for key in jax.random.split(key_try, 10)]
+    assert max(float(gap.max()) for gap, _, _ in tried) <= 0.0
+    widest = np.max([high for _, high, _ in tried], 0) - np.min([low for _, _, low in tried], 0)
+    assert ((high - low)[1:3] < 3.0 * widest[1:3] + 1e-3).all(), "bounds of small boxes are tight"
+
+
+def test_a_network_within_other_bounds_is_still_bounded():
+    """Inputs that follow from fewer numbers, and that may be off by some more."""
+    net = MLP(jax.random.key(0), (5, 32, 32, 1))
+    map = jax.random.normal(jax.random.key(1), (5, 3))
+    center, radius, rest = jnp.ones(5), jnp.array([0.1, 0.2, 0.0]), jnp.array([0.0, 0.0, 0.05, 0.0, 0.3])
+    low, high = bounds.output_bounds(net, bounds.Inputs(center, map, radius, rest))
+    delta = anywhere(jax.random.key(2), jnp.zeros(3), radius, 20_000)
+    off = anywhere(jax.random.key(3), jnp.zeros(5), rest, 20_000)
+    y = net((center + delta @ map.T + off)[:, None])[:, 0]
+    assert (y >= low).all() and (y <= high).all()
+
+
+def test_no_state_and_no_score_lies_beyond_what_is_proved(guarded, present):
+    """From a million rows that begin in the box, by the actions of the plan: others seen now, and some not for two
+    steps, after any acceleration."""
+    world = guarded.guard.world
+    prover = Prover(world, 0.02, 1.0, ROWS)
+    plan = jax.random.uniform(jax.random.key(5), (24, 3, 1, 2), minval=-1.0, maxval=1.0)
+    unseen = jnp.arange(24)[:, None] % 3
+
+    @jax.jit
+    def known(present):
+        actions = prover.braked(present, plan)
+        box = prover.reached(present, actions, unseen)
+        return actions, box, prover.lower_bounds(present, actions, unseen), prover._possible(present, unseen)
+
+    actions, box, low, spread = known(present)
+
+    @jax.jit
+    def beyond(key):
+        def step(x, given):
+            action, box, low = given
+            after, _ = world.dynamics.step(x, jnp.broadcast_to(action, (*x.shape[:-1], 2)))
+            score = world.barrier.apart(x, after)[..., 0]
+            out = jnp.abs(after - box.center) - box.radius
+            return after, (out.max(), (low - score).max(), score.min(0) - low)
+
+        by_row = [jnp.moveaxis(x, 1, 0) for x in (actions, *box, low)]
+        given = by_row[0], Box(by_row[1], by_row[2]), by_row[3]
+        return jax.lax.scan(step, anywhere(key, present, spread, 420), given)[1]
+
+    found = [beyond(key) for key in jax.random.split(jax.random.key(6), 10)]
+    assert max(float(out.max()) for out, _, _ in found) <= 0.0
+    assert max(float(below.max()) for _, below, _ in found) <= 0.0
+    assert np.median(np.min([gap for _, _, gap in found], 0)) < 0.3, "in margins: bounds are near what was met"
+    assert (spread[unseen[:, 0] == 2].max() > 0.03).all() and spread[unseen[:, 0] == 0].max() == pytest.approx(0.02)
+
+
+def test_braking_ends_in_standing(guarded, present):
+    world = guarded.guard.world
+    prover = Prover(world, 0.02, 0.0, 16)
+    actions = prover.braked(present, jnp.zeros((24, 3, 1, 2)))
+    x = present
+    for k in range(16):
+        x, _ = world.dynamics.step(x, actions[:, k])
+    assert np.abs(x[..., :2]).max() < 0.05 and np.abs(actions).max() <= 1.0
+    np.testing.assert_array_equal(actions[:, :3], 0.0)
+
+
+def test_causes_are_bounded_too():
+    """Distances with one edge and several, of a length and of an entry, and a network of a cause."""
+    length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
+    entry = Cause("own.x", ((4,),))
+    pair = Cause("own.x, own.y", ((4, 5),))
+    edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
+    walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
+    nets = (
+        Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), length, edge),
+        Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
+        CauseNet(MLP(jax.random.key(0), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), pair, edge),
+    )
+    barrier = Barrier({}, {}, *(jnp.ones(6),) * 4, jnp.ones(()), shape=None, causes=nets)
+    center = jax.random.normal(jax.random.key(1), (40, 1, 6))
+    radius = 0.3 * jax.random.uniform(jax.random.key(2), center.shape)
+    low = score_below(barrier, Box(center, radius))
+    score = worst(nets, anywhere(jax.random.key(3), center, radius, 20_000))
+    assert (score.min(0) >= low).all()
+    assert np.median(score.min(0) - low) < 0.3
+
+
+def test_where_a_plan_is_not_proved_the_last_one_that_was_goes_on(guarded, present):
+    """And the record says so: proved by a plan of now, or of before while its rows last."""
+    world = guarded.guard.world
+    options = {"proof": 0.02, "proof_rows": 4, "correction_steps": 1, "correction_restarts": 0, "horizon": 1}
+    policy = build(Nothing(), world, None, "shield", "learned", terminal_value=False, **options)
+    prover = Prover(world, 0.02, 0.0, 4)
+    far, near = jnp.array([2.5, 0.0, 0.0, 0.0, 1.0]), jnp.array([0.15, 0.0, 0.0, 0.0, 1.0])  # dx, dy, dvx, dvy, seen
+    safe, danger = (present.at[..., 4:].set(jnp.tile(other, 6)) for other in (far, near))
+    wanted = jnp.full((24, 1, 1, 1, 2), 0.3)
+    carry, step = policy.decided(policy.initial_state(24), safe, wanted, jax.random.key(0))
+    assert step.info["proved"].all() and not step.info["agent_backup"].any()
+    plan = prover.braked(safe, step.action[:, None])
+    np.testing.assert_allclose(carry["proved_plan"], plan, atol=1e-6)
+    for k in range(1, 5):
+        carry, step = policy.decided(carry, danger, wanted, jax.random.key(k))
+        left = k < 4
+        assert (step.info["proved"] == left).all() and (step.info["agent_backup"] == left).all()
+        if left:
+            np.testing.assert_allclose(step.action, plan[:, k], atol=1e-6)
+    carry, step = policy.decided(policy.initial_state(24), danger, wanted, jax.random.key(0))
+    assert not step.info["proved"].any()
+
+
+def test_what_cannot_be_proved_is_refused(guarded, small_world):
+    with pytest.raises(UserError, match="proof is of Worlds of homogeneous agents"):
+        build(Nothing(), small_world, None, "shield", "learned", proof=0.02)
+    with pytest.raises(UserError, match="proof=-1"):
+        build(Nothing(), guarded.guard.world, None, "shield", "learned", proof=-1.0)
