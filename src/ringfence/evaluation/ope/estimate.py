@@ -8,13 +8,14 @@ and is not the one that guards. How far to believe each number, where the truth 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import jax
 import numpy as np
 
 from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.evaluation.ope.fqe import FQE, fitted_q
+from ringfence.evaluation.ope.fqe import FQE, Values, fitted_q
 from ringfence.evaluation.ope.logs import Logs
 from ringfence.evaluation.ope.model_rollout import rollout
 from ringfence.evaluation.ope.responses import Respondent, behaviour
@@ -26,6 +27,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem.origins import Origins
 from ringfence.training import worlds
 from ringfence.training.runs import Run
+from ringfence.types import Key
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
@@ -66,12 +68,7 @@ def ope(
     `ahead` is how many steps are predicted from each logged state.
     """
     check_sizes(states, transitions, updates, seed)
-    whole_number("ahead", ahead, 1)
-    whole_number("rollout_episodes", rollout_episodes, 0)
-    whole_number("rollout_steps", rollout_steps, 1)
-    whole_number("num_ensemble", num_ensemble, 2, 100)
-    if not 0 <= discount < 1:
-        raise UserError(f"discount={discount} must be from 0 to below 1.")
+    _check(ahead, rollout_episodes, rollout_steps, num_ensemble, discount)
     run = Run.of(run)
     check(run, store)
     spec = PolicySpec.of(run, planner=planner, **options)
@@ -96,17 +93,7 @@ def ope(
 
     learned = rng.choice(logs.steps, min(transitions, logs.steps), replace=False)
     starts = rng.permutation(logs.starts)[:STARTS]
-    settings = FQE(discount, num_ensemble, updates)
-    next_actions = ask(logs.row[learned] + 1).action
-    first_actions = ask(starts).action
-    label = "" if quiet else "what the policy is worth"
-    values = fitted_q(logs, learned, next_actions, starts, first_actions, settings, key, label)
-    values_of_logs = None
-    if compare:
-        next_logged = logs.actions[np.minimum(learned + 1, logs.last_step[learned])]
-        first_logged = logs.actions[logs.step_of_start[np.searchsorted(logs.starts, starts)]]
-        label = "" if quiet else "what the logs are worth"
-        values_of_logs = fitted_q(logs, learned, next_logged, starts, first_logged, settings, key, label)
+    worth = _Worth(logs, learned, starts, FQE(discount, num_ensemble, updates), key, quiet)
     return OPEResult(
         task=job.task.name,
         algorithm=job.algorithm.name,
@@ -119,9 +106,45 @@ def ope(
         behaviour=behaviour(logs, asked, responses, world),
         safety=safety(logs, asked, responses, world, ahead),
         rollout=played,
-        values=values,
-        values_of_logs=values_of_logs,
+        values=worth.of_policy(ask),
+        values_of_logs=worth.of_logs() if compare else None,
     )
+
+
+def _check(ahead: int, rollout_episodes: int, rollout_steps: int, num_ensemble: int, discount: float) -> None:
+    whole_number("ahead", ahead, 1)
+    whole_number("rollout_episodes", rollout_episodes, 0)
+    whole_number("rollout_steps", rollout_steps, 1)
+    whole_number("num_ensemble", num_ensemble, 2, 100)
+    if not 0 <= discount < 1:
+        raise UserError(f"discount={discount} must be from 0 to below 1.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Worth:
+    """What actions are worth by fitted Q evaluation, from the same logged steps and first states."""
+
+    logs: Logs
+    learned: np.ndarray  # (M,) steps
+    starts: np.ndarray  # (S,) rows of first states
+    settings: FQE
+    key: Key
+    quiet: bool
+
+    def of_policy(self, ask: Respondent) -> Values:
+        following = ask(self.logs.row[self.learned] + 1).action
+        first = ask(self.starts).action
+        return self._fitted(following, first, "what the policy is worth")
+
+    def of_logs(self) -> Values:
+        logs = self.logs
+        following = logs.actions[np.minimum(self.learned + 1, logs.last_step[self.learned])]
+        first = logs.actions[logs.step_of_start[np.searchsorted(logs.starts, self.starts)]]
+        return self._fitted(following, first, "what the logs are worth")
+
+    def _fitted(self, following: np.ndarray, first: np.ndarray, label: str) -> Values:
+        label = "" if self.quiet else label
+        return fitted_q(self.logs, self.learned, following, self.starts, first, self.settings, self.key, label)
 
 
 def _trained_on(run: Run, store: EpisodeStore) -> int | None:

@@ -104,15 +104,7 @@ def replay(
         formula = _formula(known_world, radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}
         notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
-    players: dict[str, str | Policy] = {name: name for name in drivers}
-    if run is not None:
-        players = {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy} | players
-    shown: list[Played] = []
-    for name, player in players.items():
-        under = {filter: stage.play(player, one) for filter, one in filters.items()}
-        if baselines:
-            under["brake"] = stage.play(player, brake=True)
-        shown.append(Played(name, stage.play(player), under))
+    shown = _played(stage, _players(run, drivers), filters, baselines)
     return ReplayResult(
         task=store.card.task,
         radius=float(radius),
@@ -137,6 +129,25 @@ class Played:
     name: str
     plain: Driven
     under: dict[str, Driven]
+
+
+def _players(run: Run | None, drivers: Sequence[str]) -> dict[str, str | Policy]:
+    """Who drives, by name: the run first."""
+    bad: dict[str, str | Policy] = {name: name for name in drivers}
+    return bad if run is None else {run.config["algorithm"]: resolve(PolicySpec.of(run)).policy} | bad
+
+
+def _played(
+    stage: Stage, players: Mapping[str, str | Policy], filters: Mapping[str, Guarded], brake: bool
+) -> list[Played]:
+    """Each driver without a filter, and under each."""
+    shown = []
+    for name, player in players.items():
+        under = {filter: stage.play(player, one) for filter, one in filters.items()}
+        if brake:
+            under["brake"] = stage.play(player, brake=True)
+        shown.append(Played(name, stage.play(player), under))
+    return shown
 
 
 def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], anyway: bool) -> Guarded:
