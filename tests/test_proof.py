@@ -123,6 +123,22 @@ def test_no_state_and_no_score_lies_beyond_what_is_proved(guarded, present):
     assert (spread[unseen[:, 0] == 2].max() > 0.03).all() and spread[unseen[:, 0] == 0].max() == pytest.approx(0.02)
 
 
+def test_the_way_out_that_scores_best_is_taken(guarded, present):
+    """It begins with the action that was asked for, and is no worse than braking."""
+    world = guarded.guard.world
+    prover = Prover(world, 0.02, 0.0, ROWS)
+    plan = jax.random.uniform(jax.random.key(7), (24, 3, 1, 2), minval=-1.0, maxval=1.0)
+
+    @jax.jit
+    def known(present):
+        found, braked = prover.continued(present, plan), prover.braked(present, plan)
+        return found, [prover._predicted(present, x[:, None])[:, 0] for x in (found, braked)]
+
+    found, (best, braked) = known(present)
+    np.testing.assert_allclose(found[:, 0], plan[:, 0], atol=1e-6)
+    assert (best >= braked - 1e-4).all() and (best > braked + 0.1).any()
+
+
 def test_braking_ends_in_standing(guarded, present):
     world = guarded.guard.world
     prover = Prover(world, 0.02, 0.0, 16)
@@ -166,7 +182,7 @@ def test_where_a_plan_is_not_proved_the_last_one_that_was_goes_on(guarded, prese
     wanted = jnp.full((24, 1, 1, 1, 2), 0.3)
     carry, step = policy.decided(policy.initial_state(24), safe, wanted, jax.random.key(0))
     assert step.info["proved"].all() and not step.info["agent_backup"].any()
-    plan = prover.braked(safe, step.action[:, None])
+    plan = prover.continued(safe, step.action[:, None])
     np.testing.assert_allclose(carry["proved_plan"], plan, atol=1e-6)
     for k in range(1, 5):
         carry, step = policy.decided(carry, danger, wanted, jax.random.key(k))

@@ -151,13 +151,17 @@ def fixed_plans(rows: int, agents: int, dim: int, rounds: int) -> np.ndarray:
     """(R, S, K, N, A) plans in [−1, 1] that a correction may begin from: nothing at all, or for one, some or all of the
     rows half or all of what an agent can do, into each direction, and nothing thereafter. Every agent goes through all
     of them, in an order of its own and of each round."""
-    directions = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=min(dim, 3)) if any(d)])
-    if dim > directions.shape[1]:
-        directions = np.random.default_rng(0).choice((-1.0, 0.0, 1.0), (DIRECTIONS, dim))
     plans = [np.zeros((rows, dim))]
-    for direction, first, size in itertools.product(directions, sorted({1, (rows + 1) // 2, rows}), (0.5, 1.0)):
+    for direction, first, size in itertools.product(directions(dim), sorted({1, (rows + 1) // 2, rows}), (0.5, 1.0)):
         active = np.arange(rows)[:, None] < first
         plans.append(size * direction * active)
     random = np.random.default_rng(0)
     orders = [[random.permutation(len(plans)) for _ in range(agents)] for _ in range(rounds)]
     return np.stack(plans)[np.array(orders)].transpose(0, 2, 3, 1, 4)
+
+
+def directions(dim: int) -> np.ndarray:
+    """(S, A) actions of full size, into each direction; some of them, where actions have more than three numbers."""
+    if dim > 3:
+        return np.random.default_rng(0).choice((-1.0, 0.0, 1.0), (DIRECTIONS, dim))
+    return np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=dim) if any(d)])

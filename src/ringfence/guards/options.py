@@ -49,7 +49,7 @@ class GuardOptions:
     # m/s² that others may accelerate by while nobody sees them: late and old observations have them nearer by so much
     others_acceleration: NonNegative = 0.0
     proof: NonNegative = 0.0  # what every entry may be off by, while plans are still proved; 0: nothing is proved
-    proof_rows: Samples = 10  # rows of a plan, and of braking after it, that are proved
+    proof_rows: Samples = 10  # rows of the way out that is proved
     proof_residual: NonNegative = 0.0  # by which a predicted row of the own velocity may be off, in its own unit
     proof_backup: bool = True  # where a plan is not proved, the last one that was goes on
 

@@ -171,7 +171,7 @@ class Guarded(HadStart, eqx.Module):
         was, as long as it has rows left (Sha 2001, the simplex architecture)."""
         options = self.guard.options
         prover = prover_of(self.guard.world, options)
-        whole = prover.braked(acting, plan)
+        whole = prover.continued(acting, plan)
         new = prover.lower_bounds(acting, whole, unseen).min(1) >= 0
         kept = jnp.concatenate([carry["proved_plan"][:, 1:], carry["proved_plan"][:, -1:]], 1)
         left = jnp.maximum(carry["proved_left"] - 1, 0)

@@ -1,9 +1,9 @@
 """A plan is proved where all that the World predicts of it is safe, from all states that observations allow.
 
 Observations may be off by ε in every entry, and old: others may have accelerated since. From that box of states the
-World's dynamics lead to another, row by row, and the least score in each is bounded from below (`nets/bounds.py`). A
-plan is proved if that is 0 or more in every row of the plan and of braking after it. This says nothing of a World that
-errs by more than `residual` a row, nor of others who do not keep their velocity while the plan is done.
+World's dynamics lead to another, row by row, and the least score in each is bounded from below (`nets/bounds.py`). An
+action is proved if that is 0 or more in every row of a plan that begins with it: some way out is left. This says
+nothing of a World that errs by more than `residual` a row, nor of others who do not keep their velocity meanwhile.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.guards.correction import directions
 from ringfence.nets.bounds import Inputs, linear_bounds, lower_bounds
 from ringfence.problem.features import FeatureMap, motion_rules, others_offsets
 from ringfence.types import Array
@@ -64,9 +65,33 @@ class Prover(eqx.Module):
                 "another; leave proof out."
             )
 
-    def proved(self, present: Array, plan: Array, unseen: Array | None = None) -> Array:
-        """(B, N) whether plans (B, K, N, A), braking after them, are proved from the present (B, N, D)."""
-        return self.lower_bounds(present, self.braked(present, plan), unseen).min(1) >= 0
+    def continued(self, present: Array, plan: Array) -> Array:
+        """(B, rows, N, A) what begins with the first action of plans (B, K, N, A), and scores best by prediction: the
+        plan and braking after it, braking at once, or pushing in one direction. Each agent has its own."""
+        first = plan[:, :1]
+        pushes = jnp.asarray(directions(plan.shape[-1]), plan.dtype)
+        shape = (len(plan), len(pushes), self.rows - 1, *plan.shape[2:])
+        pushed = jnp.broadcast_to(pushes[None, :, None, None], shape)
+        pushed = jnp.concatenate([jnp.broadcast_to(first[:, None], (*shape[:2], 1, *shape[3:])), pushed], 2)
+        braked = jnp.stack([self.braked(present, plan), self.braked(present, first)], 1)
+        found = jnp.concatenate([braked, pushed], 1)  # (B, S, rows, N, A)
+        best = self._predicted(present, found).argmax(1)
+        return jnp.take_along_axis(found, best[:, None, None, :, None], 1)[:, 0]
+
+    def _predicted(self, present: Array, plans: Array) -> Array:
+        """(B, S, N) the least score along plans (B, S, K, N, A), as predicted from the middle of the box."""
+        barrier = self.world.barrier
+        assert isinstance(barrier, Barrier), "checked when it was made"
+        before = jnp.broadcast_to(present[:, None], (*plans.shape[:2], *present.shape[1:]))
+
+        def step(carry: tuple[Array, Array], action: Array) -> tuple[tuple[Array, Array], None]:
+            x, lowest = carry
+            after, _ = self.world.dynamics.step(x, action)
+            return (after, jnp.minimum(lowest, barrier.of_steps(x, after))), None
+
+        begun = before, jnp.full(before.shape[:-1], jnp.inf)
+        (_, lowest), _ = jax.lax.scan(step, begun, jnp.moveaxis(plans, 2, 0))
+        return lowest
 
     def lower_bounds(self, present: Array, plan: Array, unseen: Array | None = None) -> Array:
         """(B, K, N) below the least score, in margins, of the rows after every action of plans (B, K, N, A)."""
