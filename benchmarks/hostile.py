@@ -1,13 +1,14 @@
-"""Broken files by the thousand: how many are refused in a sentence, raise anything else, are believed although they
-have changed, hang, or leave something behind; and the memory that all of them take.
+"""Broken files, and values of every wrong kind, by the thousand: how many are refused in a sentence, raise anything
+else, are believed although they have changed, hang, or leave something behind; and the memory that they take.
 
-    python benchmarks/hostile.py            # writes results/hostile.csv and docs/security.md's table; some minutes
+    python benchmarks/hostile.py                     # results/hostile.csv and docs/security.md's table; a quarter hour
+    python benchmarks/hostile.py --parts tables run  # parts by the beginning of their names; the others keep their rows
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
+import contextlib
 import os
 import random
 import resource
@@ -20,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import _rows
 import numpy as np
 from readme import put
 
@@ -36,12 +38,14 @@ from ringfence.report import board  # noqa: E402
 from ringfence.report.table import sections  # noqa: E402
 from ringfence.training import loop, worlds  # noqa: E402
 from ringfence.training.runs import Run  # noqa: E402
-from tests import corpus  # noqa: E402
+from tests import corpus, strange  # noqa: E402
 from tests.corpus import TASK  # noqa: E402
 from tests.quick import QUICK_WORLD  # noqa: E402
 
 SECONDS = 20  # after which reading hangs
+OUT = ROOT / "results" / "hostile.csv"
 HEAD = ("files", "tried", "refused", "read, unchanged", "traceback", "believed though changed", "hang", "left behind")
+HEAD += ("MiB more",)
 
 
 class Hang(BaseException):
@@ -55,33 +59,32 @@ def late(*_):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--times", type=int, default=2, help="as many inputs as the tests try")
-    times = parser.parse_args().times
+    parser.add_argument("--parts", nargs="*", default=[""], help="of which the names begin so")
+    options = parser.parse_args()
     signal.signal(signal.SIGALRM, late)
     warnings.simplefilter("ignore")
-    before, found = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, []
-    with tempfile.TemporaryDirectory() as place:
-        os.environ["RINGFENCE_HOME"] = str(Path(place) / "home")
-        for name, cases in (
-            ("JSON of runs and results folders", json_files),
-            ("stores", stores),
-            ("checkpoints", checkpoints),
-            ("Worlds", world_files),
-            ("archives of results", archives),
-            ("recordings", films),
-        ):
-            found.append([name, *count(cases(Path(place), times), Path(place))])
-    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
-    with (ROOT / "results" / "hostile.csv").open("w") as f:
-        writer = csv.writer(f, lineterminator="\n")
-        writer.writerows([HEAD, *found])
+    found = {row["files"]: row for row in _rows.read(OUT)}
+    bad = False
+    for name, cases in PARTS.items():
+        if not name.startswith(tuple(options.parts)):
+            continue
+        with tempfile.TemporaryDirectory() as place:
+            os.environ["RINGFENCE_HOME"] = str(Path(place) / "home")
+            before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+            counts = count(cases(Path(place), options.times), Path(place))
+            grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
+        bad |= any(counts[3:])
+        found[name] = dict(zip(HEAD, (name, *counts, grown)))
+        print(*found[name].values(), sep=", ", flush=True)
+        _rows.write(OUT, [{field: found[each].get(field, "") for field in HEAD} for each in PARTS if each in found])
+    rows = [[found[name].get(field, "") for field in HEAD] for name in PARTS if name in found]
     lines = ["| " + " | ".join(HEAD) + " |", "|---" * len(HEAD) + "|"]
-    lines += ["| " + " | ".join(map(str, row)) + " |" for row in found]
-    lines.append(f"\nPeak memory grew by {grown:.0f} MiB over all of it.")
+    lines += ["| " + " | ".join(map(str, row)) + " |" for row in rows]
     put("docs/security.md", "hostile", "\n".join(lines))
-    sys.exit(any(sum(row[4:]) for row in found))
+    sys.exit(bad)
 
 
-Case = tuple[str, Callable, Callable]  # what was done, reading it, and whether what was read is what it was
+Case = strange.Case  # what was done, reading it, and whether what was read is what it was
 
 
 def count(cases: Iterator[Case], place: Path) -> list[int]:
@@ -91,6 +94,8 @@ def count(cases: Iterator[Case], place: Path) -> list[int]:
         signal.alarm(SECONDS)
         try:
             kind = "unchanged" if same(read()) else "believed"
+            if kind == "believed":
+                print(f"{what}: is believed", file=sys.stderr)
         except UserError:
             kind = "refused"
         except Hang:
@@ -181,6 +186,133 @@ def archives(place: Path, times: int) -> Iterator[Case]:
             shutil.rmtree(folder / loose, ignore_errors=True)
         archive.write_bytes(content)
         yield what, lambda: rows(folder), lambda found: found == good
+
+
+def of_run_time(place: Path, times: int) -> Iterator[Case]:
+    """What guards and controllers are given."""
+    import ringfence
+    from ringfence.world import save
+
+    rng = np.random.default_rng(0)
+    seen = rng.normal(size=(20, 11, 2, 4)).astype(np.float32)
+    actions = np.tanh(rng.normal(size=(20, 10, 2, 2)))
+    costs = (rng.random((20, 10)) < 0.2) * 1.0
+    named = {"a": costs, "b": np.roll(costs, 3)}
+    store = EpisodeStore.from_episodes(seen, actions, actions.sum(-1), named, card={"task": "strange"})
+    world = worlds.fit(store, **QUICK_WORLD)
+    changes = {"num_updates": 4, "width": 8, "cost_limit": None}
+    (run,) = loop.train("bc", store, changes=changes, quiet=True, out=place / "runs")
+    file = save(world, place / "w.safetensors")
+    good = store.observations[0]
+    still = lambda observations, state: np.zeros((2, 2))  # noqa: E731
+    controllers = {
+        "a function": ringfence.guard(still, world, guard="adapt", anyway=True),
+        "a run": ringfence.Controller(run, guard="adapt", world=file, anyway=True),
+    }
+
+    def fresh(controller):
+        def make():
+            controller.reset()
+            return controller
+
+        return make
+
+    yield from strange.at_run_time({name: fresh(each) for name, each in controllers.items()}, good)
+    guarded = ringfence.guard(still, world, anyway=True)
+
+    def asking(function):
+        guarded.policy.function = function  # one program for all of them
+        guarded.reset()
+        return guarded
+
+    yield from strange.of_functions(asking, good, np.zeros((2, 2), np.float32))
+
+
+def of_older_worlds(place: Path, times: int) -> Iterator[Case]:
+    """Worlds without a digest, as older versions wrote them, with junk in every field."""
+    import json
+
+    from safetensors import safe_open
+    from safetensors.numpy import save_file
+
+    from ringfence.world import save
+
+    file = save(worlds.fit(corpus.small_store(), **QUICK_WORLD), place / "world.safetensors")
+    with safe_open(file, "numpy") as opened:
+        about = json.loads(opened.metadata()["ringfence_world"])
+        arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
+    del about["digest"]
+    rng = random.Random(times)
+    for place_of, junk in ((p, j) for p in corpus.places(about, 4) for j in rng.sample(corpus.JUNK, 2 * times)):
+        words = corpus.with_junk(about, place_of, junk).decode()
+        save_file(arrays, file, {"ringfence_world": words})
+        yield f"{place_of} is {junk!r:.20}", lambda: worlds.load(file), lambda world: str(world.card) is not None
+    for name, array in arrays.items():
+        for what, other in (("NaN", array * np.nan), ("shorter", array.ravel()[:-1]), ("words", array.astype("S1"))):
+            with contextlib.suppress(Exception):  # what safetensors itself cannot write
+                save_file(arrays | {name: np.ascontiguousarray(other)}, file, {"ringfence_world": json.dumps(about)})
+                empty = array.size == 0
+                yield f"{name} {what}", lambda: worlds.load(file), lambda _, empty=empty: empty
+
+
+def of_simulators(place: Path, times: int) -> Iterator[Case]:
+    import ringfence
+
+    yield from strange.simulators(ringfence.collect)
+
+
+def of_tables(place: Path, times: int) -> Iterator[Case]:
+    yield from strange.tables()
+    yield from strange.files_of_tables(place, random.Random(times), times)
+
+
+def of_archives(place: Path, times: int) -> Iterator[Case]:
+    from ringfence.bench import unpack
+
+    yield from strange.archives(place, unpack)
+
+
+def of_words(place: Path, times: int) -> Iterator[Case]:
+    """Words of results that a page shows, and that commands to copy are made of."""
+    from ringfence.report import build_report, made
+
+    folder = corpus.one_cell(place / "words")
+    run = Run(next((folder / "cells" / TASK / "bc").iterdir()))
+
+    def commands(run: Run) -> list[str]:
+        return [line for section in sections([run]) for line in made.commands(section, place / "r.html")]
+
+    words = random.Random(times).sample(strange.WORDS, 8 * times)
+    yield from strange.words_of_results(run, lambda run, out: build_report([run], out), commands, words)
+
+
+def of_commands(place: Path, times: int) -> Iterator[Case]:
+    from ringfence.cli.app import main as command
+    from ringfence.world import save
+
+    store = corpus.small_store()
+    file = store.save(place / "store.h5")
+    (run,) = loop.train("bc", store, changes={"num_updates": 4, "width": 8}, quiet=True, out=place / "runs")
+    world = save(worlds.fit(store, **QUICK_WORLD), place / "w.safetensors")
+    yield from strange.command_lines(command, file, world, run.path, place)
+
+
+PARTS: dict[str, Callable[[Path, int], Iterator[Case]]] = {
+    "JSON of runs and results folders": json_files,
+    "stores": stores,
+    "checkpoints": checkpoints,
+    "Worlds": world_files,
+    "Worlds of older versions": of_older_worlds,
+    "archives of results": archives,
+    "members and links of archives": of_archives,
+    "recordings": films,
+    "arrays that become a store": lambda place, times: strange.arrays_of_stores(),
+    "tables": of_tables,
+    "simulators": of_simulators,
+    "run time: observations, costs, actions": of_run_time,
+    "words in reports and commands": of_words,
+    "command lines": of_commands,
+}
 
 
 if __name__ == "__main__":

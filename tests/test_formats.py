@@ -168,6 +168,7 @@ def test_sumos_output_is_read_as_it_is(tmp_path, kind):
         ('<!DOCTYPE a [<!ENTITY b "c">]><fcd-export/>', "declares a document type"),
         (ElementTree.tostring(fcd(angle=None), "unicode"), "vehicles without angle"),
         (ElementTree.tostring(fcd(), "unicode").replace('"10.0"', '"fast"'), "no number"),
+        (ElementTree.tostring(fcd(), "unicode").replace('angle="', 'angle="north '), "says angle='north"),
     ],
 )
 def test_xml_that_cannot_be_is_refused(tmp_path, text, said):

@@ -1,5 +1,6 @@
 """Nothing that is read can hurt: it is refused in a sentence, or it is what it was; nothing outside is touched."""
 
+import dataclasses
 import io
 import json
 import lzma
@@ -28,7 +29,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.report import board
 from ringfence.report.table import sections
 from ringfence.training.runs import Run
-from tests import corpus
+from tests import corpus, strange
 from tests.corpus import TASK
 
 
@@ -636,3 +637,69 @@ def test_flags_and_sizes_of_strangers():
     for field in ("dt", "cost_limit", "action_high"):
         with pytest.raises(UserError, match=field):
             EpisodeStore.from_episodes(*arrays, card={field: 10**400})
+
+
+@pytest.mark.parametrize("kind", ["agents", "words", "files", "simulators"])
+def test_some_of_what_is_tried_by_the_thousand(kind, tmp_path):
+    """Every twentieth of some kinds; `benchmarks/hostile.py` tries all of them."""
+    import ringfence
+
+    cases = {
+        "agents": strange.arrays_of_stores,
+        "words": strange.tables,
+        "files": lambda: strange.files_of_tables(tmp_path, random.Random(0), 1),
+        "simulators": lambda: strange.simulators(ringfence.collect),
+    }
+    for k, (what, read, sound) in enumerate(cases[kind]()):
+        if k % 20 == 0 or "bomb" in what or "pipe" in what:
+            found = []
+            assert tried(what, lambda read=read, found=found: found.append(read())) or sound(*found), what
+
+
+@pytest.mark.parametrize(
+    ("odd", "said"),
+    [
+        ({"observations": {"a": np.ma.masked_array(np.ones(3), True), "b": np.ones(3)}}, "is a masked array"),
+        ({"terminations": {"a": np.zeros(2), "b": False}}, "neither true nor false"),
+        ({"terminations": {"a": 0.5, "b": False}}, "neither true nor false"),
+        ({"infos": {"a": -1.0}}, "gave a the info '-1.0'; infos are a dict of each agent"),
+        ({"step": np.array(1.0)}, "returned 1 things"),
+    ],
+)
+def test_answers_of_simulators_that_are_none(odd, said):
+    import ringfence
+
+    with pytest.raises(UserError, match=said):
+        ringfence.collect(lambda: strange.Simulator(odd), episodes=1)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"time": 3}, "time=3 names no column"),
+        ({"agent": None}, "agent=None names no column"),
+        ({"episode": ""}, "episode='' names no column"),
+        ({"state": 3}, "state=3 is no list"),
+        ({"cost": [1.0]}, "cost=1.0 names no column"),
+        ({"wide": 1}, "wide=1 names no column"),
+        ({"rename": 5}, "rename=5 is no dictionary"),
+        ({"rename": {"x": 2}}, "rename=2 names no column"),
+        ({"dt": 10**400}, "dt=1000.* must be a number above 0, and at most"),
+    ],
+)
+def test_names_of_columns_are_words(options, said):
+    with pytest.raises(UserError, match=said):
+        strange.tabled(strange.columns(), **options)
+
+
+def test_a_member_whose_name_no_disk_holds_is_refused(tmp_path):
+    folder = archived(tmp_path / "results", [(tarfile.TarInfo(f"cells/{'x' * 300}/results.json"), b"{}")])
+    with pytest.raises(UserError, match="which is no file of a cell"):
+        unpack(folder)
+
+
+def test_bytes_in_another_order_are_said(tmp_path):
+    """JAX reads none of them."""
+    store = corpus.small_store()
+    with pytest.raises(UserError, match="rewards holds bytes in the order of another machine"):
+        dataclasses.replace(store, rewards=store.rewards.astype(">f4"))

@@ -27,6 +27,7 @@ ARCHIVES = {
     "curves.tar.xz": ("metrics.jsonl",),
 }
 LARGEST = 2**29  # bytes of an archive, unpacked
+LONGEST = 200  # bytes of a name in a path: `whole` adds some of its own to them
 MARK = Path("cells", ".unpacked.json")  # digests of the archives whose files are loose
 
 
@@ -72,7 +73,8 @@ def _place(out: Path, archive: Path, member: tarfile.TarInfo, tar: tarfile.TarFi
     """One file of an archive, where there is none yet; results join those that are there."""
     parts = PurePosixPath(member.name).parts
     known = parts and parts[0] in PLACES and ".." not in parts and parts[-1] in ARCHIVES[archive.name]
-    if not (known and member.isreg()) or member.issparse():  # a sparse one claims any size in a few bytes
+    short = all(len(part.encode(errors="replace")) <= LONGEST for part in parts) and len(member.name) <= 10 * LONGEST
+    if not (known and short and member.isreg()) or member.issparse():  # a sparse one claims any size in a few bytes
         raise UserError(f"'{archive}' holds '{member.name}', which is no file of a cell; restore that archive.")
     file = out.joinpath(*parts)
     try:

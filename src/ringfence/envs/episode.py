@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Sized
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
@@ -255,12 +255,17 @@ class Step(NamedTuple):
 def _checked(name: str, returned: Any) -> Step:
     """What `step` of the simulator of that name returned, five dictionaries or six."""
     if not isinstance(returned, tuple | list) or len(returned) not in (5, 6):
-        count = len(returned) if isinstance(returned, Sized) else 1
+        count = len(returned) if isinstance(returned, tuple | list | Mapping) else 1
         raise UserError(f"step() of {name} returned {count} things; a ParallelEnv's are five.")
     odd = [type(part).__name__ for part in returned if not isinstance(part, Mapping)]
     if odd:
         raise UserError(f"step() of {name} returned a {odd[0]}; each of its five is a dict by agent.")
     observations, rewards, *costs, terminations, truncations, infos = returned
+    for agent, info in infos.items():
+        if not isinstance(info, Mapping | None):
+            raise UserError(
+                f"step() of {name} gave {agent} the info {str(info)[:60]!r}; infos are a dict of each agent."
+            )
     return Step(observations, rewards, costs[0] if costs else None, terminations, truncations, infos)
 
 
@@ -274,7 +279,8 @@ def _costs_by_agent(step: Step) -> ByAgent:
 def _is_set(flags: ByAgent, agent: Any) -> bool:
     """Whether an agent's flag is set; text is none, though "False" is true to Python."""
     flag = flags.get(agent, False)
-    if not isinstance(flag, bool | int | float | np.bool_ | np.number | np.ndarray):
+    known = isinstance(flag, bool | int | float | np.bool_ | np.number | np.ndarray)
+    if not known or np.ma.is_masked(flag) or np.size(flag) != 1 or not np.isin(flag, (0, 1)).all():
         raise UserError(f"{agent} has the flag {str(flag)[:60]!r}, which is neither true nor false; give a bool.")
     return bool(flag)
 

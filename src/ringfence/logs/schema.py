@@ -358,6 +358,7 @@ def _kinds(store: Arrays) -> None:
         )
         kinds, what = expected.get(name, ("biuf", "real numbers"))
         _demand(array.dtype.kind in kinds, f"{name} holds entries of type {array.dtype}; it must hold {what}.")
+        _demand(array.dtype.isnative, f"{name} holds bytes in the order of another machine; call .astype('f4') on it.")
 
 
 def _arrays(store: Arrays) -> list[tuple[str, np.ndarray]]:

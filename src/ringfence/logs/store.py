@@ -407,8 +407,8 @@ class EpisodeStore:
         whole = cls.from_steps(**steps)
         if not 0 < early < whole.episodes:
             raise StoreError(
-                f"split={share:g} leaves {early} episodes in front of the cut and {whole.episodes - early} behind it; "
-                "give another share, or a smaller min_episode_steps."
+                f"split={share!r:.60} leaves {early} episodes in front of the cut and {whole.episodes - early} behind "
+                "it; give another share, or a smaller min_episode_steps."
             )
         first = np.arange(whole.episodes) < early
         return whole.select(first), whole.select(~first)
@@ -547,7 +547,7 @@ def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
         raise StoreError(f"{name} holds {kind} (dtype {array.dtype}); give an array of numbers.")
     if axes is not None and array.ndim != axes:
         raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
-    return array
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
 def _truths(name: str, value: Any) -> np.ndarray:

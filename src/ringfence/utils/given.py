@@ -28,7 +28,8 @@ def given_as(
     """
     letters = LETTERS[len(expected)]
     wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
-    if isinstance(value, np.ma.MaskedArray):
+    rows = value if isinstance(value, list | tuple) else ()
+    if any(isinstance(one, np.ma.MaskedArray) for one in (value, *rows)):
         raise UserError(f"{name} is a masked array, whose hidden entries nobody may act upon; fill them in.")
     try:
         array = np.asarray(value)

@@ -13,7 +13,7 @@ def parted(rows: Rows, values: Values, share: float) -> tuple[Rows, Values]:
     episode is of both. Recordings whose times overlap count from a start of their own: these stay whole and are parted
     in the order of the table."""
     if not (isinstance(share, int | float) and 0 < share < 1):
-        raise UserError(f"split={share!r} must be a number between 0 and 1: the share of the time to learn by.")
+        raise UserError(f"split={share!r:.60} must be a number between 0 and 1: the share of the time to learn by.")
     late = _late_recordings(rows, share) if _overlap(rows) else rows.time > np.quantile(rows.time, share)
     if late.all() or not late.any():
         raise StoreError(

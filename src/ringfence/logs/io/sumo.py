@@ -16,6 +16,7 @@ from ringfence.errors import StoreError
 
 KINDS = ("vehicle", "person")  # persons are read where there is no vehicle: they may ride in one
 WORDS = ("id", "type", "lane", "edge")
+MOTION = ("x", "y", "speed", "angle")  # which are numbers in every file
 
 
 def read_fcd(path: Path) -> dict[str, np.ndarray]:
@@ -69,7 +70,7 @@ def _columns(path: Path, times: list[float], rows: list[dict[str, str]]) -> dict
     if not rows:
         raise StoreError(f"'{path}' holds no vehicle and no person at any time; simulate longer.")
     common = [name for name in rows[0] if all(name in row for row in rows)]
-    lacking = [name for name in ("id", "x", "y", "speed", "angle") if name not in common]
+    lacking = [name for name in ("id", *MOTION) if name not in common]
     if lacking:
         raise StoreError(
             f"'{path}' has vehicles without {lacking[0]}; leave it in --fcd-output.attributes, or leave that option "
@@ -91,6 +92,10 @@ def _numbers(path: Path, name: str, rows: list[dict[str, str]]) -> np.ndarray:
     try:
         float(rows[0][name])
     except ValueError:
+        if name in MOTION:
+            raise StoreError(
+                f"'{path}' says {name}='{rows[0][name]:.60}', which is no number; write it again."
+            ) from None
         return np.array([row[name] for row in rows])
     return np.array([_number(path, name, row[name]) for row in rows])
 

@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-import numpy as np
-
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.problem.constraints import Hazard, Separation
 
 AXES = "xyz"
+LARGEST = 1e15  # number of a schema
 LISTS = ("state", "action", "goal", "cost")
 # Options as 0.1.0 called them.
 OLD_OPTIONS = {
@@ -117,14 +116,36 @@ class TableSchema:
 def _names(field: str, given: Iterable[str] | None) -> tuple[str, ...]:
     if isinstance(given, str):
         raise UserError(f"{field}='{given}' is one word; give a list of columns.")
+    if given is not None and not isinstance(given, Iterable):
+        raise UserError(f"{field}={given!r:.60} is no list; give names of columns.")
     names = tuple(given) if given is not None else ()
+    for name in names:
+        _require_word(field, name)
     twice = [name for name in names if names.count(name) > 1]
     if twice:
         raise UserError(f"{field} names the column '{twice[0]}' twice; name it once.")
     return names
 
 
+def _require_word(field: str, name: Any) -> None:
+    """Names of columns are words."""
+    if not isinstance(name, str) or not name:
+        raise UserError(f"{field}={name!r:.60} names no column; give its name, a word.")
+
+
 # --- rules, in the order in which they are asked ---
+def _words(schema: TableSchema) -> None:
+    for option in ("time", "agent", "episode", "reward", "wide"):
+        name = getattr(schema, option)
+        if name is not None or option in ("time", "agent"):
+            _require_word(option, name)
+    if not isinstance(schema.rename, Mapping):
+        raise UserError(f"rename={schema.rename!r:.60} is no dictionary; give our names by the table's.")
+    for theirs, ours in schema.rename.items():
+        _require_word("rename", theirs)
+        _require_word("rename", ours)
+
+
 def _one_kind_of_episode(schema: TableSchema) -> None:
     if schema.team is not None and schema.neighbours is not None:
         raise UserError("team and neighbours both say who an episode is of; give one of them.")
@@ -150,8 +171,8 @@ def _episode_steps(schema: TableSchema) -> None:
 def _numbers_above_zero(schema: TableSchema) -> None:
     for name in ("dt", "gap", "sensing_radius", "max_speed"):
         value = getattr(schema, name)
-        if value is not None and not (isinstance(value, int | float) and 0 < value < np.inf):
-            raise UserError(f"{name}={value!r} must be a number above 0.")
+        if value is not None and not (isinstance(value, int | float) and 0 < value <= LARGEST):
+            raise UserError(f"{name}={value!r:.60} must be a number above 0, and at most {LARGEST:g}.")
 
 
 def _state(schema: TableSchema) -> None:
@@ -205,6 +226,7 @@ def _action(schema: TableSchema) -> None:
 
 
 RULES: tuple[Callable[[TableSchema], None], ...] = (
+    _words,
     _one_kind_of_episode,
     _whole_numbers,
     _episode_steps,
