@@ -16,7 +16,7 @@ from ringfence.world.cause_nets import Score, least_margin, with_margin, worst
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 
-VERSION = 2  # of margins of causes: scores of another are learned again
+VERSION = 3  # of margins of causes: scores of another are learned again
 WINDOWS = 3000  # entries, and safe steps, that margins are read from
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin
@@ -114,7 +114,8 @@ def in_own_margins(
     blamed = by_each.argmin(-1)
     found = []
     for k, net in enumerate(nets):
-        ends = bad[blamed == k]
+        told = by_each[:, k] < least_margin(net)  # no margin foresees what a cause does not tell when it is there
+        ends = bad[(blamed == k) & told]
         found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, features[row[fine] + 1]))
     return tuple(found)
 
