@@ -14,6 +14,8 @@ import json
 import time
 from pathlib import Path
 
+from _common import machine
+
 import ringfence
 from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
@@ -77,6 +79,7 @@ def system(task: str, runs: Path, episodes: int, beside: bool, file: Path) -> di
         },
         **described(card),
         "seconds": {name: round(value, 1) for name, value in seconds.items()},
+        "machine": machine(),
         "rows": rows_of(file, card, episodes),
     }
     every = worlds.fit(store, seed=0, causes=False) if beside else None
