@@ -12,6 +12,7 @@ import pytest
 from ringfence import EpisodeStore, fit, guard
 from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
+from ringfence.guards import searched
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
 from ringfence.world import cause_search, causes, foresight, probes, verdict
@@ -19,7 +20,7 @@ from ringfence.world.card import BarrierScores, Card, Data, Foresight, Predictio
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
-from ringfence.world.logged import held_out
+from ringfence.world.logged import Logged, held_out, labels_of
 from tests.quick import QUICK_WORLD
 
 N, STEPS = 3, 40
@@ -253,7 +254,8 @@ def test_a_cause_of_a_place_has_a_map():
 def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     chance = np.random.default_rng(3)
     world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK_WORLD)
-    assert world.card.verdict.word == "unfit"
+    assert world.card.verdict.word == "unfit" and world.card.causes == {"": Found()}, "no cause explains chance"
+    assert "name the entries that tell danger, or log them" in world.card.verdict.remedies
     still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
     with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
         guard(still, world)
@@ -280,6 +282,11 @@ def test_verdicts_give_their_reasons():
     assert found.word == "weak" and "constant velocity errs by 90%" in found.reasons[0]
 
 
+def test_a_world_of_before_says_that_it_has_no_verdict():
+    card = Card(data=Data(task="t", hazard={}), format=4, barrier=BarrierScores(entries=100))
+    assert str(card).splitlines()[-1] == "VERDICT none: an earlier version fitted it; fit it again to have one."
+
+
 def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     data = Data(task="t", hazard={})
     good = BarrierScores(entries=100, recall=0.99, margin_kept=0.9, probed=1.0)
@@ -300,6 +307,17 @@ def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     assert "at 25 steps" in str(card((0.1, 0.2), (0.2, 0.3), ()))
 
 
+def test_a_guards_search_finds_no_danger_in_a_good_barrier_and_some_in_a_bad_one(fitted):
+    """The second one is blind to others, and drives into them."""
+    assert fitted.card.barrier.searched < 0.02
+    store = store_of()
+    blind = dataclasses.replace(fitted.barrier, causes=fitted.barrier.causes[:1])
+    assert "other" not in blind.causes[0].cause.name
+    map = fitted.map
+    logged = Logged.of(store, map, held_out(store, 0), labels_of(store, map, fitted.card.settings, None))
+    assert searched.false_safe(dataclasses.replace(fitted, barrier=blind), logged) > 0.02
+
+
 def test_foresight_is_of_what_the_barrier_reads(fitted):
     read = {one.name: one for one in fitted.card.prediction_error.read}
     assert set(read) == {"own.v", *(n for n in read if "own.x" in n), "length of other.dx, other.dy, of the nearest"}
@@ -318,6 +336,14 @@ def test_foresight_reads_the_thing_in_most_danger():
     assert foresight._read(x, causes.narrowed(cause, ((0, 1),)), near) == 4.0
     place = foresight._read(x, Cause("own.x, own.y", ((0, 3),)), None)
     assert place.shape == (1, 1, 2) and foresight._rms(place) == (5.0,)
+
+
+def test_constant_velocity_is_that_of_the_names():
+    """Who changes places in a list of others has not jumped."""
+    names = ("own.x", "other0.dx", "other0.dvx")
+    before, now = np.array([[[0.0, 5.0, 1.0]]]), np.array([[[1.0, -3.0, 2.0]]])
+    np.testing.assert_allclose(foresight._moved(names, now, before, 0.5), [[[1.0, 1.0, 1.0]]])
+    np.testing.assert_allclose(foresight._moved(names, now, before, None), [[[1.0, -8.0, 1.0]]])
 
 
 def test_foresight_is_told_in_seconds_where_logs_say_how_long_a_step_is():

@@ -7,6 +7,7 @@ from pathlib import Path
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, whole_number
+from ringfence.guards import searched
 from ringfence.logs.resolution import require_resolved
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints, features
@@ -83,7 +84,8 @@ def fit(
     needed = settings.labels == "formula" and settings.barrier
     bind = constraints.bind if needed else constraints.bind_or_none
     hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
-    return fit_view(store, map, spec, settings, hazard=hazard, seed=seed, cached=cached, quiet=quiet)
+    how = {"hazard": hazard, "seed": seed, "cached": cached, "quiet": quiet}
+    return fit_view(store, map, spec, settings, **how, search=searched.false_safe)
 
 
 @in_float32

@@ -152,6 +152,7 @@ class BarrierScores(Part, frozen=True):
     entries: float = UNKNOWN  # held-out steps that entered danger
     margin_kept: float = UNKNOWN  # share of the safe steps that have the default margin
     probed: float = UNKNOWN  # share of held-out states that are called unsafe with somebody put inside the radius
+    searched: float = UNKNOWN  # share of the steps that a guard's search calls safe, and the logs dangerous
     probes: tuple[Probe, ...] = ()
     maps: tuple[ProbeMap, ...] = ()
 
@@ -307,6 +308,11 @@ def _of_barrier(card: Card) -> Iterator[str]:
         )
     if scores.avoidable is not None:
         yield _of_horizon(scores.avoidable, scores.ahead_kept)
+    if not math.isnan(scores.searched):
+        yield (
+            "A guard that searches for actions, where drivers want anything, finds some that keep the margin; of the "
+            f"steps where these lead, the logs call {percent(scores.searched)} dangerous."
+        )
     if card.constraints is None:
         yield (
             f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, predicted from up to {JUDGED} "
@@ -319,6 +325,8 @@ def _of_barrier(card: Card) -> Iterator[str]:
 
 def _of_verdict(card: Card) -> Iterator[str]:
     if card.verdict is None:
+        if card.barrier is not None and card.format:
+            yield "VERDICT none: an earlier version fitted it; fit it again to have one."
         return
     reasons = "; ".join(card.verdict.reasons)
     remedies = " or ".join(card.verdict.remedies)

@@ -72,6 +72,7 @@ _NAME_OF_BEFORE = {new: old for old, new in stored.WORLD_SETTINGS.items()}
 _EXECUTION_OF_BEFORE = {new: old for old, new in stored.EXECUTIONS.items()}
 
 T = TypeVar("T")
+Search = Callable[[World, Logged], float | None]  # share of what a guard's search calls safe, and the logs dangerous
 
 
 def fit_view(
@@ -84,11 +85,12 @@ def fit_view(
     seed: int = 0,
     cached: bool = True,
     quiet: bool = True,
+    search: Search | None = None,
 ) -> World:
     """The World of a store in the view `map` of `spec`; from the cache where it has been fitted before.
 
     `hazard`, bound to the view, labels states where `settings.labels` is "formula". A tenth of the episodes is held
-    out of every part; the card says how good the World is on them.
+    out of every part; the card says how good the World is on them, and by `search` what a guard would find in it.
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
     parts = _Parts(settings, seed, formula, cached)
@@ -106,7 +108,7 @@ def fit_view(
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
-    world = _fitted(store, map, spec, hazard, parts, quiet)
+    world = _fitted(store, map, spec, hazard, parts, quiet, search)
     if cached:
         save(world, file)
     return world
@@ -119,6 +121,7 @@ def _fitted(
     hazard: constraints.BoundHazard | None,
     parts: _Parts,
     quiet: bool,
+    search: Search | None,
 ) -> World:
     begun = time.perf_counter()
     settings = parts.settings
@@ -153,9 +156,13 @@ def _fitted(
         barrier=found.scores,
         constraints=found.constraints,
     )
-    card = msgspec.structs.replace(card, verdict=judge(card))
     threshold = jnp.asarray(found.ood.threshold, jnp.float32)
-    return dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
+    world = dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
+    wrong = None if search is None else search(world, logged)
+    if wrong is not None and card.barrier is not None:
+        card = msgspec.structs.replace(card, barrier=msgspec.structs.replace(card.barrier, searched=round(wrong, 4)))
+    card = msgspec.structs.replace(card, verdict=judge(card))
+    return dataclasses.replace(world, card=card)
 
 
 def _data(store: EpisodeStore, several: bool) -> Data:

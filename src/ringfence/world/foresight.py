@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -34,9 +35,9 @@ def foresight(
     now = logged.picked("features", row)
     came = logged.picked("features", row[:, None] + index)
     predicted = np.asarray(rolled(dynamics, logged, starts, steps[-1])[0])[:, index - 1]
-    moved = now - logged.picked("features", row - 1)
-    coasted = now[:, None] + index[:, None, None] * moved[:, None]
     dt = logged.store.card.dt
+    moved = _moved(logged.map.names, now, logged.picked("features", row - 1), dt)
+    coasted = now[:, None] + index[:, None, None] * moved[:, None]
     found = []
     for name, (cause, edge) in _reads(barrier, logged.map.names).items():
         truth = _read(came, cause, edge)
@@ -51,6 +52,20 @@ def foresight(
             )
         )
     return tuple(found)
+
+
+def _moved(names: Sequence[str], now: np.ndarray, before: np.ndarray, dt: float | None) -> np.ndarray:
+    """What entries (W, N, D) change by in a step of constant velocity: by their velocities where names tell these,
+    since a place in a list of others may change its owner; else by what they changed by."""
+    moved = now - before
+    if dt is None:
+        return moved
+    at = {name: d for d, name in enumerate(names)}
+    for name, d in at.items():
+        velocity = at.get(re.sub(r"\.(d?)([xyz])$", r".\1v\2", name))
+        if velocity is not None and velocity != d:
+            moved[..., d] = dt * now[..., velocity]
+    return moved
 
 
 def _windows(logged: Logged) -> tuple[tuple[int, ...], np.ndarray]:

@@ -1,0 +1,92 @@
+"""Whether a barrier holds what a search for actions finds: a guard looks for what its World calls safe, and so it finds
+the pockets in which the World is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.guards.barrier import BarrierSource
+from ringfence.guards.correction import TOLERANCE
+from ringfence.guards.filter import Guard
+from ringfence.guards.options import GuardOptions
+from ringfence.proposals.base import held
+from ringfence.types import Array
+from ringfence.world import World, causes
+from ringfence.world.cause_counts import Explained, counted, some_steps
+from ringfence.world.causes import Cause
+from ringfence.world.cells import Cells
+from ringfence.world.logged import Logged
+
+STATES = 128  # held-out safe states from which actions are searched
+FEW = 10  # safe steps of what was found, with fewer of which nothing is said
+SURE = 0.8  # probability that being in a cell makes a step unsafe, from which on what was found there counts as wrong
+SHIELD = GuardOptions(correction_steps=10, correction_restarts=1, margin=1.0)
+
+
+def false_safe(world: World, logged: Logged) -> float | None:
+    """The share of predicted steps that a shield's search calls safe, and that the logs call dangerous: somebody is in
+    a place, or as near to something, as hardly any safe step was. None where names tell no places."""
+    known = _known(logged)
+    if world.barrier is None or not known:
+        return None
+    rng = np.random.default_rng(3)
+    steps = logged.held_steps
+    safe = steps[~logged.unsafe[steps]]
+    close = np.intersect1d(safe, np.flatnonzero(logged.close_to_danger()))
+    some = [rng.choice(these, min(STATES // 2, len(these)), replace=False) for these in (close, safe)]
+    present = logged.before(np.concatenate(some))
+    agents, entries = logged.arrays["actions"].shape[1:]
+    wanted = rng.choice((-1.0, 0.0, 1.0), (len(present), agents, entries)).astype(np.float32)
+    guard = Guard(BarrierSource(world, "learned", None, False), SHIELD)
+    rows, met = _searched(guard, jnp.asarray(present), jnp.asarray(wanted))
+    found = np.asarray(rows)[np.asarray(met)]  # (found, K, N, D)
+    if len(found) < FEW:
+        return None
+    wrong = np.logical_or.reduce([_dangerous(one, found) for one in known])
+    return float(wrong.mean())
+
+
+@eqx.filter_jit
+def _searched(guard: Guard, present: Array, wanted: Array) -> tuple[Array, Array]:
+    """Where corrected plans lead (B, K, N, D), and whether they keep the margin (B,)."""
+    limits = max(1, len(guard.barrier.limits))
+    shape = (len(present), present.shape[1], limits) if guard.world.alone else (len(present), limits)
+    margin = jnp.full(shape, guard.options.margin)
+    plan = held(guard.world.spec.own(wanted), guard.options.horizon)[:, 0]
+    plan = guard.shielded(present, plan, margin)
+    rows, spread = guard.predict(present, plan[:, None])
+    missing = guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin)
+    return rows[:, 0, 1:], (missing >= -TOLERANCE).all((1, 2))
+
+
+def _known(logged: Logged) -> list[Cells]:
+    """Where the logs have danger: one's own place, and how far things are, as names tell, counted cell by cell."""
+    names = logged.map.names
+    simple = [*_own_place(names), *causes.offsets(names)]
+    if not simple:
+        return []
+    steps = np.arange(logged.store.steps)
+    x = logged.after(steps)
+    counts = some_steps(x, logged.label, logged.store.episode_of_step, np.random.default_rng(0))
+    nothing = Explained.by(counts, [])
+    return [counted(counts, cause, nothing).cells for cause in simple]
+
+
+def _own_place(names: Sequence[str]) -> list[Cause]:
+    if not {"own.x", "own.y"} <= set(names):
+        return []
+    return [Cause("own.x, own.y", (tuple(list(names).index(name) for name in ("own.x", "own.y")),))]
+
+
+def _dangerous(cells: Cells, x: np.ndarray) -> np.ndarray:
+    """(W, K) bool: somebody is in a cell that the logs call dangerous, at features (W, K, N, D)."""
+    read = cells.cause.of(x)  # (W, K, N, J, width)
+    index = np.floor((read - cells.low) / (cells.high - cells.low) * cells.bins).astype(int)
+    inside = (((index >= 0) | cells.cause.length) & (index < cells.bins)).all(-1)  # nearer than ever is as the nearest
+    index = np.clip(index, 0, cells.bins - 1)
+    cell = np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), (cells.bins,) * cells.cause.width)
+    return (inside & (cells.danger[cell] > SURE)).any((-1, -2))
