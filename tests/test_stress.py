@@ -514,3 +514,33 @@ def test_a_controller_is_told_how_old_observations_are(run):
             controller.act(seen, age=age)
     with pytest.raises(UserError, match="age is read by nothing here"):
         Controller(run).act(seen, age=1)
+
+
+def test_ages_follow_from_times_and_clocks_that_run_backwards_are_refused(run):
+    now = [100.0]
+    controller = Controller(run, guard="shield", max_age=3, clock=lambda: now[0], **LIGHT)
+    env = Crossing()
+    seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1)))[0]
+    by_age = Controller(run, guard="shield", max_age=3, **LIGHT)
+    ages = np.array([0, 1, 2, 3, 0, 0, 0, 0])
+    for _ in range(3):
+        by_time = controller.act(seen, observed_at=now[0] - 0.1 * ages - 0.01)
+        np.testing.assert_allclose(by_time, by_age.act(seen, age=ages), atol=1e-6)
+        now[0] += 0.1
+    for stamp, words in (
+        (now[0] + 1.0, "The clock runs backwards"),
+        (50.0, "is before .* keep the newest"),
+        (np.nan, "must be a time in seconds"),
+        (np.zeros(3), "must be a time in seconds"),
+    ):
+        with pytest.raises(UserError, match=words):
+            controller.act(seen, observed_at=stamp)
+    with pytest.raises(UserError, match="give one of them"):
+        controller.act(seen, age=1, observed_at=now[0])
+    now[0] = 1.0
+    with pytest.raises(UserError, match="The clock runs backwards"):
+        controller.act(seen, observed_at=1.0)
+    controller.reset()
+    controller.act(seen, observed_at=1.0)
+    with pytest.raises(UserError, match="observed_at needs a World"):
+        Controller(run).act(seen, observed_at=0.0)

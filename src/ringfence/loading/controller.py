@@ -19,6 +19,7 @@ from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_
 from ringfence.guards.wrap import Callback, under_guard
 from ringfence.loading.evidence import Evidence, explaining, guarded_of
 from ringfence.loading.resolve import load
+from ringfence.loading.stamps import Stamps
 from ringfence.loading.watch import Fallback, Watch, widened
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, agent_policy, team_policy
@@ -74,6 +75,7 @@ class Controller:
         log: str | Path | None = None,
         on_alarm: str = "report",
         fallback: Fallback | None = None,
+        clock: Callable[[], float] = time.monotonic,
         **options: Any,
     ):
         keep_programs()
@@ -83,6 +85,7 @@ class Controller:
                 raise UserError(UNGUARDED)
             options = {"margin": promised.guard["margin"], **options}
         self._watch = Watch(promised, on_alarm, fallback)
+        self._stamps = Stamps(clock)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._source = _source(run, planner, options)
         self.policy: Policy = self._source.policy
@@ -108,6 +111,7 @@ class Controller:
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
         self._carry = self.policy.initial_state(1)
+        self._stamps.reset()
         if self.evidence is not None:
             self.evidence.reset()
 
@@ -133,12 +137,14 @@ class Controller:
         state: np.ndarray | None = None,
         cost: Paid | None = None,
         age: int | np.ndarray | None = None,
+        observed_at: float | np.ndarray | None = None,
     ) -> np.ndarray:
         """(N, A) joint action within the task's bounds; a callable is asked with the same arrays. `cost` is what the
         last step cost, in all or by each constraint's name, which an adapting guard follows. Arrays of another shape
         than the run's or the World's are refused, and so is what is not finite: indices beyond an array's end would be
         clipped in silence, and noise would follow NaN. `age` is how many steps old the observations are, of all or of
-        each agent, for a guard with `max_age`.
+        each agent, for a guard with `max_age`; `observed_at` is when they were made, in seconds by the controller's
+        `clock`, from which the age follows.
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
         source = self._source
@@ -147,6 +153,7 @@ class Controller:
             self._watch.check()
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
+            age = self._age(age, observed_at)
             before = self._carry if age is None else self._aged(age)
             key, now = jax.random.split(self._key)
             carry, step = source.act(before, seen, paid, now)
@@ -154,12 +161,22 @@ class Controller:
             if self.certificate is not None:
                 info["covered"] = ~(info["infeasible"] | info["ood"]) & (not self._watch.alarm)
                 info["alarm"] = np.array(self._watch.alarm)
-            taken_over = self._watch.taken_over(*seen, action.shape)
-            action = action if taken_over is None else taken_over
+            if self._watch.hands_over:
+                action = self._watch.taken_over(*self.job.origins.measured(*seen), action.shape)
         if self.evidence is not None:
             self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
         return action
+
+    def _age(self, age: Any, observed_at: Any) -> Any:
+        """How many steps old observations are, as it was given or by their time."""
+        if observed_at is None:
+            return age
+        if age is not None:
+            raise UserError("age and observed_at both say how old observations are; give one of them.")
+        guarded = guarded_of(self.policy)
+        dt = None if guarded is None else guarded.guard.world.map.dt
+        return self._stamps.ages(observed_at, self._source.agents, dt)
 
     @contextmanager
     def _recorded(self) -> Iterator[None]:

@@ -59,14 +59,16 @@ class Watch:
                 f"{self._monitor.episodes}); find out what has changed, and certify again."
             )
 
-    def taken_over(
-        self, observations: np.ndarray, state: np.ndarray | None, shape: tuple[int, int]
-    ) -> np.ndarray | None:
-        """(N, A) the fallback's actions, once it acts; they are not guarded."""
-        if self.fallback is None or not self.alarm:
-            return None
+    @property
+    def hands_over(self) -> bool:
+        """Whether the fallback acts now."""
+        return self.fallback is not None and self.alarm
+
+    def taken_over(self, observations: np.ndarray, state: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
+        """(N, A) the fallback's actions; they are not guarded."""
+        assert self.fallback is not None, "it acts now"
         wanted = self.fallback(observations.copy(), None if state is None else state.copy())
-        return given_as("fallback's actions", wanted, shape, "the task", "return one for each agent")
+        return given_as("the fallback's result", wanted, shape, "the task", "return one action for each agent")
 
 
 def widened(policy: Any) -> Any:
