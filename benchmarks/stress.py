@@ -1,6 +1,6 @@
 """A guarded run behind faults, as the guard is and with what it can be told of them.
 
-python benchmarks/stress.py                         # writes results/stress/crossing-hasty.csv, a row when it is played
+python benchmarks/stress.py                         # writes results/stress/crossing.csv, a row when it is played
 python benchmarks/stress.py --jobs 16 --rows delay3/told drop0.6/told      # some rows, each in a process of its own
 python benchmarks/stress.py --list
 python benchmarks/stress.py --table                 # writes the table of docs/stress.md
@@ -23,7 +23,7 @@ from typing import Any
 import _rows
 
 ROOT = Path(__file__).resolve().parent.parent
-OUT = ROOT / "results" / "stress" / "crossing-hasty.csv"
+OUT = ROOT / "results" / "stress" / "crossing.csv"
 PAGE = ROOT / "docs" / "stress.md"
 FIELDS = ("faults", "guard", "told", "episodes", "return", "violation_rate", "violation_upper", "infeasible_rate")
 RUN = "crossing-hasty/bc"
