@@ -5,8 +5,9 @@ python benchmarks/certificates.py play --jobs 16       # plays each setting unde
 python benchmarks/certificates.py judge                # writes results/stress/certificates.csv and .json from these
 
 Episodes of a margin are played once, so margins are those of a grid: a calibration takes the least of them that is no
-less than its quantile. A repetition draws its calibration episodes, its test episodes and its fresh ones from what was
-played, without putting any back, so that none is in two of them.
+less than its quantile. A repetition draws its calibration and its test
+episodes from what was played, none twice; its bound is compared with all episodes of its margin that it was not tested
+on.
 """
 
 from __future__ import annotations
@@ -141,7 +142,8 @@ def repetition(setting: str, pools: dict[float, dict[str, Any]], rng: np.random.
         margin = larger[0] if larger else margins[-1]
     left = orders[margin][used[margin] :]
     violated = np.array(pools[margin]["violated"])
-    tested, fresh = violated[left[:TESTED]], violated[left[TESTED:]]
+    tested = violated[left[:TESTED]]
+    fresh = violated[np.setdiff1d(np.arange(len(violated)), left[:TESTED])]
     bound = upper_bound(int(tested.sum()), len(tested), CONFIDENCE)
     rate = float(fresh.mean())
     return {
