@@ -118,7 +118,7 @@ def test_bounds_of_actions_change_no_lesson(learner, more):
         plain = Normaliser(jnp.zeros(3), jnp.ones(3), jnp.zeros((1, 3)), jnp.ones((1, 3)), 0, "displacement")
         state["frozen"] = {"normaliser": plain}
         batch = Batch(x, action, zeros == 0, zeros[:, 0], zeros, jnp.ones((8, 1, 2)), ~one)
-        new.append(learner.make_update(config, spec, None, None)(state, batch, k[2])[0]["params"])
+        new.append(jax.jit(learner.make_update(config, spec, None, None))(state, batch, k[2])[0]["params"])
     for a, b in zip(*map(jax.tree.leaves, new)):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
@@ -153,7 +153,7 @@ def one_lesson(cost: float, charged: tuple[float, ...], multiplier: float = 1.0)
         jnp.ones((b, 1, 2)),
         jnp.zeros((b, 1), bool),
     )
-    return state, td3bc.make_update(config, SPEC, None, None)(state, batch, k[0])
+    return state, jax.jit(td3bc.make_update(config, SPEC, None, None))(state, batch, k[0])
 
 
 def test_the_multiplier_hears_of_states_where_nothing_was_charged():
