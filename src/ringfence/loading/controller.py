@@ -38,6 +38,7 @@ from ringfence.world import World
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,) of one environment
 OneCost = np.ndarray | dict[str, np.ndarray]  # (1,), or that by constraint
 
+CALIBRATED = ("margin", "others_acceleration")  # numbers that are read off a World; a certificate brings them along
 UNGUARDED = "A certificate is of a guarded run; give one with guard=, or leave certificate= out."
 
 
@@ -53,9 +54,9 @@ class Controller:
     e.g. `ood`: the World knows nothing there. `policy` is what simulators of whole batches play. Not for several
     threads at once.
 
-    certificate: a file of `ringfence certify`, which must be of this run, World, guard and team. The margin is taken
-    from it. `info["covered"]` then says whether the guard kept its condition where its World knows its way: of other
-    steps the certificate counts how they end, and says no more.
+    certificate: a file of `ringfence certify`, which must be of this run, World, guard and team. The margin and
+    `others_acceleration` are taken from it. `info["covered"]` then says whether the guard kept its condition where its
+    World knows its way: of other steps the certificate counts how they end, and says no more.
 
     `finished(violated)` after an episode watches whether the certificate's bound is kept. `on_alarm` says what is done
     when it is not: report (`info["alarm"]`), stop (refuse to act), widen (half as much margin again), or hand_over (to
@@ -83,7 +84,7 @@ class Controller:
         if promised is not None:
             if options.get("guard", "none") == "none":
                 raise UserError(UNGUARDED)
-            options = {"margin": promised.guard["margin"], **options}
+            options = {name: promised.guard[name] for name in CALIBRATED if name in promised.guard} | options
         self._watch = Watch(promised, on_alarm, fallback)
         self._stamps = Stamps(clock)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
