@@ -85,16 +85,18 @@ def system(task: str, runs: Path, episodes: int, beside: bool, file: Path) -> di
     every = worlds.fit(store, seed=0, causes=False) if beside else None
     if every is not None:
         found["networks on all entries"] = described(every.card)
-    for name, rows in drivers.items():
-        for label, options in rows.items():
-            if f"{name} {label}" in found["rows"]:
-                continue
-            given = options | {"world": every} if "world" in options else options
-            try:
-                found["rows"][f"{name} {label}"] = played(trained[name], given, episodes)
-            except UserError as error:
-                found["rows"][f"{name} {label}"] = {"refused": str(error)}
-            file.write_text(json.dumps(found, indent=1) + "\n")
+    wanted = [(label, name) for name, rows in drivers.items() for label in rows]
+    order = list(ROWS | BESIDE | HORIZONS)
+    for label, name in sorted(wanted, key=lambda row: order.index(row[0])):  # what takes longest comes last
+        if f"{name} {label}" in found["rows"]:
+            continue
+        options = drivers[name][label]
+        given = options | {"world": every} if "world" in options else options
+        try:
+            found["rows"][f"{name} {label}"] = played(trained[name], given, episodes)
+        except UserError as error:
+            found["rows"][f"{name} {label}"] = {"refused": str(error)}
+        file.write_text(json.dumps(found, indent=1) + "\n")
     return found
 
 
