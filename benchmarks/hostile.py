@@ -288,13 +288,12 @@ def of_words(place: Path, times: int) -> Iterator[Case]:
 
 def of_commands(place: Path, times: int) -> Iterator[Case]:
     from ringfence.cli.app import main as command
-    from ringfence.world import save
 
     store = corpus.small_store()
     file = store.save(place / "store.h5")
     (run,) = loop.train("bc", store, changes={"num_updates": 4, "width": 8}, quiet=True, out=place / "runs")
-    world = save(worlds.fit(store, **QUICK_WORLD), place / "w.safetensors")
-    yield from strange.command_lines(command, file, world, run.path, place)
+    words = random.Random(times).sample(strange.WORDS, 15 * times)
+    yield from strange.command_lines(command, file, run.path, place, words)
 
 
 PARTS: dict[str, Callable[[Path, int], Iterator[Case]]] = {

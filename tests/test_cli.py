@@ -164,15 +164,16 @@ def test_the_whole_job(tmp_path, monkeypatch, capsys):
     assert "of 1000 held-out steps" in told
 
 
-def test_the_doctor_works_where_jax_finds_no_device():
-    """The one moment that it is for."""
+@pytest.mark.parametrize("platform", ["tpu", "cuda"])
+def test_the_doctor_works_where_jax_finds_no_device(platform):
+    """The one moment that it is for. Of a platform without a plugin JAX tells nothing."""
     code = "from ringfence.cli.app import main; main(['doctor'])"
-    environment = {**os.environ, "JAX_PLATFORMS": "tpu"}
+    environment = {**os.environ, "JAX_PLATFORMS": platform}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and "Traceback" not in done.stderr
     line = next(line for line in done.stdout.splitlines() if line.startswith("devices"))
     assert "none (" in line and line.endswith(
-        "JAX_PLATFORMS=tpu asks for what is not here; unset it, or set JAX_PLATFORMS=cpu."
+        f"JAX_PLATFORMS={platform} asks for what is not here; unset it, or set JAX_PLATFORMS=cpu."
     )
 
 

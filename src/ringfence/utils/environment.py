@@ -35,6 +35,8 @@ def device_problem() -> str:
         jax.devices()
     except RuntimeError as error:
         return (str(error).splitlines() or [type(error).__name__])[0]
+    except AssertionError:  # JAX's own, where the platform that is asked for has no plugin here
+        return "JAX knows no such platform"
     return ""
 
 
