@@ -28,6 +28,7 @@ PAGE = ROOT / "docs" / "stress.md"
 FIELDS = ("faults", "guard", "told", "episodes", "return", "violation_rate", "violation_upper", "infeasible_rate")
 RUN = "crossing-hasty/bc"
 LESS = {"others_acceleration": 0.7}  # m/s², where the World says 1.0
+LEAST = {"others_acceleration": 0.4}
 FARTHER = {"margin": 1.5, "horizon": 5}  # chosen on 50 validation episodes with three late steps
 MIDDLE = {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5}
 FAULTS: tuple[dict[str, Any], ...] = (
@@ -64,6 +65,7 @@ def trials() -> dict[str, Trial]:
         found[f"{name}/told"] = faults, True, {}
         if faults.keys() & {"delay", "drop"}:
             found[f"{name}/told/less"] = faults, True, LESS
+            found[f"{name}/told/least"] = faults, True, LEAST
     found["delay3/told/farther"] = {"delay": 3}, True, FARTHER
     return found
 
