@@ -203,12 +203,14 @@ def other_simulator() -> str:
 
 def proving() -> str:
     """Systems that chose no setting, from results/proving."""
-    heads = ["system", "verdict", "causes found", "clone", "entries", "shield", "oracle", "naive", "shield", "oracle"]
+    heads = ["system", "episodes", "verdict", "causes found", "clone", "entries", "shield", "oracle", "naive"]
+    heads += ["shield", "oracle"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for file in sorted((RESULTS / "proving").glob("proving-*.json")):
         found = json.loads(file.read_text())
         rows = found["rows"]
-        cells = [f"`{found['task'].removeprefix('proving-')}`", found["verdict"], "; ".join(found["causes"]) or "none"]
+        cells = [f"`{found['task'].removeprefix('proving-')}`", str(found["episodes"]), found["verdict"]]
+        cells.append("; ".join(found["causes"]) or "none")
         beside = "shield learned, networks on all entries"
         for name in ("bc none", f"bc {beside}", "bc shield learned", "bc shield oracle"):
             cells.append(_share_and_return(rows.get(name)))
