@@ -31,6 +31,9 @@ from ringfence import Controller
 controller = Controller(sys.argv[1], guard=sys.argv[2], agents=8)
 observations = np.zeros((8, controller.job.widths[0]), np.float32)
 begun = time.perf_counter()
+if "warm" in sys.argv:
+    controller.warm_up(observations)
+    begun = time.perf_counter()
 controller.act(observations)
 print(time.perf_counter() - begun)
 """
@@ -47,8 +50,9 @@ def main() -> None:
         command = EVALUATE.format(run=run)
         measure(rows, f"ringfence {EVALUATE.format(run=POLICY)}", arguments.repeats, lambda: evaluated(command))
         for guard in ("shield", "full"):
-            name = f"{POLICY}, 8 agents, {guard}: first action of a loaded controller"
-            measure(rows, name, arguments.repeats, lambda guard=guard: acted(run, guard))
+            for how, words in ((), ""), (("warm",), " that has warmed up"):
+                name = f"{POLICY}, 8 agents, {guard}: first action of a loaded controller{words}"
+                measure(rows, name, arguments.repeats, lambda guard=guard, how=how: acted(run, guard, *how))
     record(arguments.out, rows)
 
 
@@ -73,9 +77,9 @@ def evaluated(command: str) -> float:
     return time.perf_counter() - begun
 
 
-def acted(run: Path, guard: str) -> float:
-    """Seconds of the first action, in a process that has loaded the policy."""
-    return float(run_python("-c", ACT, str(run), guard))
+def acted(run: Path, guard: str, *how: str) -> float:
+    """Seconds of the first action, in a process that has loaded the policy, and has warmed up where asked."""
+    return float(run_python("-c", ACT, str(run), guard, *how))
 
 
 def run_python(*words: str) -> str:

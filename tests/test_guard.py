@@ -263,6 +263,22 @@ def test_one_program_acts_in_every_step(small_world, small_store, guard):
     assert types[0] == types[1] == types[2]
 
 
+def test_a_controller_that_has_warmed_up_acts_as_it_would_have(small_world, small_store):
+    """A callable is asked once more, nothing is recorded, and actions are the same."""
+    asked = []
+
+    def proposes(seen, state):
+        asked.append(seen)
+        return np.full((3, 2), 0.3)
+
+    seen, state = small_store.observations[0], small_store.state[0]
+    controllers = [ringfence.guard(proposes, small_world, guard="shield") for _ in range(2)]
+    controllers[0].warm_up(small_store.observations[7], small_store.state[7])
+    assert len(asked) == 1 and controllers[0].last_action is None and not controllers[0].info
+    for _ in range(2):
+        np.testing.assert_array_equal(*(controller.act(seen, state) for controller in controllers))
+
+
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
     barrier = BarrierSource(small_world, "learned", None, False)
     rows = jnp.stack([present, present], 1)[:, None]

@@ -43,9 +43,10 @@ UNGUARDED = "A certificate is of a guarded run; give one with guard=, or leave c
 
 
 class Controller:
-    """A policy at run time: one environment, NumPy in, NumPy out, compiled at its first action.
+    """A policy at run time: one environment, NumPy in, NumPy out.
 
     controller = Controller("runs/…/seed-0", guard="shield", barrier="learned")
+    controller.warm_up(observations, state)        # compiles, which else the first action does
     controller.reset()                             # at the start of every episode
     action = controller.act(observations, state)   # (N, O), (S,) or None -> (N, A)
 
@@ -131,6 +132,13 @@ class Controller:
         """End the log, if there is one."""
         if self.evidence is not None:
             self.evidence.close()
+
+    def warm_up(self, observations: np.ndarray, state: np.ndarray | None = None) -> None:
+        """Compile what acts on such arrays, so that the first action of a control loop is not late. Whatever they hold
+        is forgotten, and nothing is recorded; a callable is asked once."""
+        source = self._source
+        _, step = source.act(self._carry, source.seen(observations, state), None, self._key)
+        jax.block_until_ready(step.action)
 
     def act(
         self,
