@@ -42,7 +42,8 @@ from tests import corpus, strange  # noqa: E402
 from tests.corpus import TASK  # noqa: E402
 from tests.quick import QUICK_WORLD  # noqa: E402
 
-SECONDS = 20  # after which reading hangs
+SECONDS = 20  # of a core, after which reading hangs
+WAITING = 180  # seconds, likewise
 OUT = ROOT / "results" / "hostile.csv"
 HEAD = ("files", "tried", "refused", "read, unchanged", "traceback", "believed though changed", "hang", "left behind")
 HEAD += ("MiB more",)
@@ -62,6 +63,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", default=[""], help="of which the names begin so")
     options = parser.parse_args()
     signal.signal(signal.SIGALRM, late)
+    signal.signal(signal.SIGPROF, late)
     warnings.simplefilter("ignore")
     found = {row["files"]: row for row in _rows.read(OUT)}
     bad = False
@@ -91,7 +93,8 @@ def count(cases: Iterator[Case], place: Path) -> list[int]:
     counts, there = Counter(), None
     for what, read, same in cases:
         there = there or set(place.rglob("*"))
-        signal.alarm(SECONDS)
+        signal.alarm(WAITING)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             kind = "unchanged" if same(read()) else "believed"
             if kind == "believed":
@@ -106,6 +109,7 @@ def count(cases: Iterator[Case], place: Path) -> list[int]:
             print(f"{what}: {type(error).__name__}: {error}", file=sys.stderr)
         finally:
             signal.alarm(0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         counts[kind] += 1
         counts["tried"] += 1
     counts["left"] = len({p for p in set(place.rglob("*")) - there if p.name.endswith(".part") or p.name == "victim"})

@@ -703,3 +703,12 @@ def test_bytes_in_another_order_are_said(tmp_path):
     store = corpus.small_store()
     with pytest.raises(UserError, match="rewards holds bytes in the order of another machine"):
         dataclasses.replace(store, rewards=store.rewards.astype(">f4"))
+
+
+@pytest.mark.parametrize("place", ["/proc/x.html", "a\nb/" + "x" * 300, "x" * 220])
+def test_places_that_take_no_file_are_refused_first(place):
+    """Before a World is fitted for a page that nobody can write."""
+    from ringfence.utils.files import writable
+
+    with pytest.raises(UserError, match="could not be written"):
+        writable(place)

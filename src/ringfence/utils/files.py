@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import glob
 import os
+import tempfile
 import time
 import zipfile
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from filelock import FileLock
 from ringfence.errors import UserError
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
+LONGEST = 200  # bytes of a name: what is written beside it has a longer one
 LOOSE = 100 * 2**20  # bytes that a file may claim beyond four times its size
 
 
@@ -67,7 +69,15 @@ def writable(path: str | os.PathLike) -> Path:
         raise UserError(f"'{path}' could not be written: '{above}' is a file, no folder; choose another place.")
     if not allowed:
         raise UserError(f"'{path}' could not be written: '{above}' may not be written to; choose another place.")
-    return path
+    if any(len(os.fsencode(part)) > LONGEST for part in path.parts):
+        raise UserError(f"'{path}' could not be written (File name too long); choose another name.")
+    try:
+        with tempfile.TemporaryFile(dir=above if above.is_dir() else above.parent):  # rights tell nothing of /proc
+            return path
+    except OSError as error:
+        raise UserError(
+            f"'{path}' could not be written: '{above}' takes no file ({error.strerror}); choose another place."
+        ) from None
 
 
 def regular(path: str | os.PathLike) -> Path:
