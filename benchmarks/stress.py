@@ -67,6 +67,9 @@ def trials() -> dict[str, Trial]:
             found[f"{name}/told/less"] = faults, True, LESS
             found[f"{name}/told/least"] = faults, True, LEAST
     found["delay3/told/farther"] = {"delay": 3}, True, FARTHER
+    found["drop0.6/told/farther"] = {"drop": 0.6}, True, FARTHER | LEAST
+    found["asynchrony0.667/told/farther"] = {"asynchrony": 0.667}, True, FARTHER | {"horizon": 6}
+    found["all/told/farther"] = MIDDLE, True, FARTHER | LESS
     return found
 
 
