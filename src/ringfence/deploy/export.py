@@ -22,7 +22,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,7 @@ class Step:
     outputs: tuple[Entry, ...]
     initial: dict[str, np.ndarray]  # by the inputs' names
     draw: Callable[[Key], list[Array]]  # the noise that `Controller` would draw by a key
-    origins: dict[str, np.ndarray]  # what a file takes from inputs, by their names, before it calls the function
+    origins: dict[str, np.ndarray] = field(default_factory=dict)  # what a file takes from inputs first, by their names
 
     @property
     def avals(self) -> list[jax.ShapeDtypeStruct]:
