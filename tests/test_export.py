@@ -249,7 +249,7 @@ def test_what_cannot_be_exported_is_named(run, tmp_path):
     pytest.importorskip("jax2onnx")
     one, two = (exporting.Entry(name, (3,), "float32") for name in ("observations", "action"))
     there = jax.ShapeDtypeStruct((3,), "float32")
-    odd = exporting.Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [])
+    odd = exporting.Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [], {})
     with pytest.raises(UserError, match="cannot be written as ONNX .*pure_callback.*; write it as StableHLO"):
         exporting.as_onnx(odd)
 

@@ -30,15 +30,18 @@ SHIELD = GuardOptions(correction_steps=10, correction_restarts=1, margin=1.0)
 def false_safe(world: World, logged: Logged) -> float | None:
     """The share of predicted steps that a shield's search calls safe, and that the logs call dangerous: somebody is in
     a place, or as near to something, as hardly any safe step was. None where names tell no places."""
-    known = _known(logged)
-    if world.barrier is None or not known:
+    known = [] if world.barrier is None else _known(logged)
+    if not known:
         return None
     rng = np.random.default_rng(3)
     steps = logged.held_steps
     safe = steps[~logged.unsafe[steps]]
     close = np.intersect1d(safe, np.flatnonzero(logged.close_to_danger()))
-    some = [rng.choice(these, min(STATES // 2, len(these)), replace=False) for these in (close, safe)]
-    present = logged.before(np.concatenate(some))
+    picked = [rng.choice(these, min(STATES // 2, len(these)), replace=False) for these in (close, safe)]
+    begun = np.concatenate(picked)
+    if len(begun) < FEW:
+        return None
+    present = logged.before(begun)
     agents, entries = logged.arrays["actions"].shape[1:]
     wanted = rng.choice((-1.0, 0.0, 1.0), (len(present), agents, entries)).astype(np.float32)
     guard = Guard(BarrierSource(world, "learned", None, False), SHIELD)
