@@ -161,8 +161,9 @@ def _danger(bad: np.ndarray, fine: np.ndarray, usual: float) -> np.ndarray:
     """Probability that being in a cell makes a step unsafe; 0 where it is not clearly dangerous."""
     share = bad / (bad + fine + PRIOR)
     error = np.sqrt(np.maximum(share * (1 - share), 0.0) / (bad + fine + PRIOR))
-    beyond = np.clip((share - error - usual) / (1 - usual), 0.0, 1.0)  # the rest comes of other causes
-    return np.where(beyond > SUFFICIENT, np.clip((share - usual) / (1 - usual), 0.0, 0.999), 0.0)
+    rest = max(1.0 - usual, 1e-9)  # nothing is left where all steps are unsafe
+    beyond = np.clip((share - error - usual) / rest, 0.0, 1.0)  # the rest comes of other causes
+    return np.where(beyond > SUFFICIENT, np.clip((share - usual) / rest, 0.0, 0.999), 0.0)
 
 
 def _worst(steps: Steps, each: np.ndarray, agents: np.ndarray) -> np.ndarray:
