@@ -347,7 +347,7 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
     blank = {"card": small_store.card.updated(task="mine", hazard={"kind": "CostColumn"})}
     blank = dataclasses.replace(small_store, costs=0 * small_store.costs, **blank)
     for name in ("icbf", "fisor", "bc-safe", "ma-td3bc-lag"):
-        with pytest.raises(UserError, match=f"{name} is told no danger"):
+        with pytest.raises(UserError, match=f"{name} has no danger to learn"):
             loop.train(name, blank, out=tmp_path, changes=TINY[name])
     with pytest.raises(UserError, match="planner"):
         evaluate(run, planner="gaurded")

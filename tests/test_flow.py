@@ -181,8 +181,8 @@ def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path, net):
 @pytest.mark.parametrize(
     "changes, said",
     [
-        ({"net": "unet"}, "drivers=2 are told to a plan of the whole team"),
-        ({"observe": "single"}, "drivers=2 are told to a plan of the whole team"),
+        ({"net": "unet"}, "drivers=2 are given to a plan of the whole team"),
+        ({"observe": "single"}, "drivers=2 are given to a plan of the whole team"),
         ({"drivers": 33}, "drivers=33 share 32 windows"),
         ({"net": "unet", "drivers": 0, "distinguish_agents": True}, "distinguish_agents is of the net attention"),
     ],

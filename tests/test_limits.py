@@ -140,7 +140,7 @@ def test_scarce_danger_is_said_and_not_calibrated(unsafe):
     costs = np.zeros((10, 12))
     costs[:, :unsafe] = 1
     world = worlds.fit(EpisodeStore.from_episodes(x, a, a.sum(-1), costs, card={"task": "toy"}), **QUICK_WORLD)
-    assert "to say how well danger is told, or to set a margin" in world.card.barrier.warning
+    assert "to say how well danger is recognised, or to set a margin" in world.card.barrier.warning
     assert "e+0" not in str(world.card)
 
 

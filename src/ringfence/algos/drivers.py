@@ -3,7 +3,7 @@
     r_c ∝ exp(−Σ_t ‖a_t − μ_c(s_t)‖² / 2σ²),   L^E = E Σ_c r_c ‖a_t − μ_c(s_t)‖²   (expectation–maximisation)
 
 At first all clones get equal shares (the balance of Cuturi 2013 and Caron et al. 2020), so that none takes everything;
-later those that nobody needs are left with nothing. A generator that is told the driver learns one policy at a time.
+later those that nobody needs are left with nothing. A generator that is given the driver learns one policy at a time.
 """
 
 from __future__ import annotations

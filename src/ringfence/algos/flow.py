@@ -9,11 +9,11 @@ episode is played as one of them:
          later those that nobody needs are left with nothing
          r_c ∝ exp(−Σ_t ‖a_t − μ_c(s_t)‖² / 2σ²),   L^E = E Σ_c r_c ‖a_t − μ_c(s_t)‖²
     L^Q  who drives, given a state and the return: a categorical q(c | s, y), from which an episode's driver is drawn
-    L^F  a rectified flow from noise to the joint action, told the driver c ~ r (Lipman et al. 2023; Liu et al. 2023)
+    L^F  a rectified flow from noise to the joint action, given the driver c ~ r (Lipman et al. 2023; Liu et al. 2023)
          a_τ = (1 − τ) ε + τ a,   L^F = E ‖a − â(a_τ, τ, s, c, y)‖²
 
 The network answers with the clean action, from which the velocity (â − a_τ)/(1 − τ) follows; one step from noise is the
-driver's mean. That is the behaviour flow of flow Q-learning (Park et al. 2025), for teams and told who drives. The
+driver's mean. That is the behaviour flow of flow Q-learning (Park et al. 2025), for teams and given who drives. The
 return y is optional, dropped with probability p for classifier-free guidance.
 """
 
@@ -64,7 +64,7 @@ class Config:
     sigma: Positive = 0.15  # and when `settled`
     settled: Share = 0.3  # of training: σ falls until then, and drivers are used equally
     condition: Literal["none", "return", "advantage"] = "none"  # what y is
-    condition_dropout: Share = 0.25  # p, share of windows that are not told y
+    condition_dropout: Share = 0.25  # p, share of windows that are not given y
     discount: Share = 0.9  # of what y scores
     width: Width = 384  # units of each hidden layer, of either network
     depth: Depth = 3  # hidden layers
@@ -110,7 +110,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
 def make_windows(
     store: EpisodeStore, config: Config, feature_map: features.FeatureMap, world: World | None
 ) -> WindowData:
-    """Windows, with their scores where the flow is told those."""
+    """Windows, with their scores where the flow is given those."""
     if config.condition == "none":
         return WindowData(store, feature_map)
     return conditions.scored_windows(store, feature_map, world, config.condition, config.horizon, config.discount)

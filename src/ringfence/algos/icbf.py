@@ -259,7 +259,7 @@ def check(config: Config, hazard: BoundHazard) -> None:
         drivers.check(config.drivers, config.batch)
         if config.net == "unet" or config.observe != "all":
             raise UserError(
-                f"drivers={config.drivers} are told to a plan of the whole team by the nets attention and residual; "
+                f"drivers={config.drivers} are given to a plan of the whole team by the nets attention and residual; "
                 "leave observe='all' and choose one of these, or set drivers=0."
             )
     if config.horizon < 2:

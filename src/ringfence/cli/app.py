@@ -337,7 +337,7 @@ def stress(
     for run in found:
         with refusals.of(run):
             result = run_stress(run, faults, **given)
-            mark = " (told)" if compensate else ""
+            mark = " (compensated)" if compensate else ""
             first, guard, *rest = _played(run, result)
             table.add_row(first, shown, f"{guard}{mark}", *rest)
     _say(table, refusals, len(found))
@@ -354,7 +354,7 @@ def certify(
     playing: How = AS_IT_IS,
 ) -> None:
     """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
-    it. The guard is told of late actions, old observations and held actions. docs/stress.md says what is promised.
+    it. The guard knows of late actions, old observations and held actions. docs/stress.md says what is promised.
 
     Args:
         run: a run folder.

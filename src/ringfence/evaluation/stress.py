@@ -42,8 +42,8 @@ def stress(
     """Evaluate a run behind faults, on the same resets as `evaluate`, and add the result to its stress.json.
 
     faults: a `Faults`, or its fields by name. `compensate` tells the guard of the delay, that observations may be old
-    where they are dropped, that actions are held where agents act in turn, and what others can do meanwhile; a guard
-    that is not told does not know. Other options are as in `load`. Without faults the numbers are those of `evaluate`.
+    where they are dropped, that actions are held where agents act in turn, and what others can do meanwhile; by
+    itself a guard knows none of it. Other options are as in `load`. Without faults the numbers are those of `evaluate`.
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     keep_programs()
@@ -66,7 +66,7 @@ def stress(
 
 
 def compensated(run: Run | str, faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a guard that is told of faults."""
+    """Options of a guard that knows of faults."""
     options = {**options, **compensation(faults, options)}
     late = {"delay", "max_age"} & options.keys()
     if not late or "others_acceleration" in options:

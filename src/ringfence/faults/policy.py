@@ -1,8 +1,8 @@
 """A policy behind faults: it observes what arrives, and what it sends is not what is done.
 
 Faults lie between a policy and whatever it acts on, so that every simulator here has them, whether it runs in JAX or
-not. A policy that wants to know is told: `observe_age(carry, age)` how many steps old its observations (B, N) are,
-`observe_sent(carry, action)` what was sent of its action (B, N, A).
+not. A policy may hear of them: by `observe_age(carry, age)` how many steps old its observations (B, N) are,
+by `observe_sent(carry, action)` what was sent of its action (B, N, A).
 """
 
 from __future__ import annotations

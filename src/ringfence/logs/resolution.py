@@ -16,7 +16,7 @@ STEPS = 20_000  # that are looked at, at most
 
 
 def coarse(store: EpisodeStore) -> list[str]:
-    """Warnings of entries whose values are told apart poorly."""
+    """Warnings of entries whose values are poorly resolved."""
     warnings = []
     for what, array, _ in _sources(store):
         flat = array.reshape(-1, array.shape[-1])

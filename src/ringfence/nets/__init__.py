@@ -24,7 +24,7 @@ def build_denoiser(
     drivers: int = 0,
 ):
     """A denoiser F(x (B, H, N, D), k (B,), y (B,), keep (B,)) -> (B, H, N, D) by name. `agents`: their number where
-    attention is to tell them apart; `team`: their number; `drivers`: how many it may be told to plan as."""
+    attention is to tell them apart; `team`: their number; `drivers`: how many it may plan as."""
     if kind == "attention":
         return AgentAttention(key, rows, features, width, depth, carried, agents, drivers)
     if kind == "residual":

@@ -43,7 +43,7 @@ class AgentAttention(eqx.Module):
         drivers: int = 0,
     ):
         """`agents`: their number if they are to be distinguished, as limbs of one body are; 0: they are homogeneous.
-        `drivers`: how many it may be told to plan as."""
+        `drivers`: how many it may plan as."""
         keys = jax.random.split(key, depth + 3)
         self.carried = entries(rows, features, carried)
         flat = len(self.carried)
@@ -55,7 +55,7 @@ class AgentAttention(eqx.Module):
 
     def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
-        those it may be told -> (B, H, N, D)."""
+        those it plans as -> (B, H, N, D)."""
         b, _, n, _ = x.shape
         c = self.condition(k, y, keep, driver)
         token = flattened(x, self.carried) @ self.inlet

@@ -36,7 +36,7 @@ class TeamDenoiser(eqx.Module):
         agents: int,
         drivers: int = 0,
     ):
-        """For teams of `agents`; `drivers`: how many it may be told to plan as."""
+        """For teams of `agents`; `drivers`: how many it may plan as."""
         k1, k2 = jax.random.split(key)
         self.carried = entries(rows, features, carried)
         flat = agents * len(self.carried)
@@ -45,7 +45,7 @@ class TeamDenoiser(eqx.Module):
 
     def __call__(self, x: Array, k: Array, y: Array, keep: Array, driver: Array | None = None) -> Array:
         """x (B, H, N, D) noisy plan, k (B,) diffusion step, y (B,) return score, keep (B,) bool, driver (B,) of
-        those it may be told -> (B, H, N, D)."""
+        those it plans as -> (B, H, N, D)."""
         b, _, n, _ = x.shape
         seen = flattened(x, self.carried).reshape(b, -1)
         clean = self.net(jnp.concatenate([seen, self.condition(k, y, keep, driver)], -1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 TURNS = 0.01  # of the largest velocity: a smaller change tells nothing
-FEW = 20  # changes, below which nothing is told
+FEW = 20  # changes, below which nothing is said
 AGREE = 0.025  # of a share
 USUAL = 0.2  # share of the changes that has to agree
 

@@ -17,12 +17,12 @@ def driver_scores(net: Any, seen: Array, score: Array, keep: Array) -> Array:
 
 
 def asked(seen: Array, score: Array, keep: Array) -> Array:
-    """(B, 2): y and whether it is told."""
+    """(B, 2): y and whether it is given."""
     return jnp.stack([jnp.where(keep, score, 0.0), keep.astype(seen.dtype)], -1)
 
 
 def classifier_free(answer: Callable[[Array, Array], Array], score: Array, scale: float) -> Array:
-    """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y (B,), whether it is told (B,));
+    """Classifier-free guidance: out(∅) + ω (out(y) − out(∅)) of what answers to (y (B,), whether it is given (B,));
     ω = 1 asks once."""
     everyone = jnp.ones(score.shape, bool)
     conditional = answer(score, everyone)

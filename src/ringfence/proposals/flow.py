@@ -153,7 +153,7 @@ class FlowPolicy(eqx.Module):
         return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
-        """What answers to (y, whether it is told), guided by the return that is asked for, if training knew any."""
+        """What answers to (y, whether it is given), guided by the return that is asked for, if training knew any."""
         score = jnp.full(batch, self.options.target_return)
         if not self.conditioned:
             return answer(score, jnp.zeros(batch, bool))

@@ -130,8 +130,8 @@ def _refuse_blank_costs(algorithm: str, task: Task, store: EpisodeStore, cost_so
     everybody where no formula says more."""
     if isinstance(task.hazard, constraints.CostColumn):
         raise UserError(
-            f"{algorithm} is told no danger: the costs of '{task.name}' are 0 everywhere, and its card has no hazard "
-            "with a formula; give EpisodeStore one of them, or train an algorithm that reads none."
+            f"{algorithm} has no danger to learn: the costs of '{task.name}' are 0 everywhere, and its card has no "
+            "hazard with a formula; give EpisodeStore one of them, or train an algorithm that reads none."
         )
     if cost_source in ("labels", "world"):  # a World's barrier learns from the formula then
         return

@@ -1,6 +1,6 @@
 """How often steps are unsafe when somebody is in a cell: what the search for causes counts, and what it gains.
 
-Every episode is in one of FOLDS parts. What is told of a step is counted on the other parts, so that a cause gains
+Every episode is in one of FOLDS parts. What explains a step is counted on the other parts, so that a cause gains
 nothing by steps that it knows.
 """
 
@@ -113,7 +113,7 @@ class Explained:
         return cls(safe, np.logical_or.reduce([nothing > 0, *[one.near for one in chosen]]))
 
     def part(self, some: np.ndarray) -> Explained:
-        """What is told of some of the steps (T,) bool."""
+        """What explains some of the steps (T,) bool."""
         return Explained(self.safe[some], self.near[some])
 
     def left(self, unsafe: np.ndarray) -> np.ndarray:

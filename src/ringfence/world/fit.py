@@ -251,7 +251,7 @@ class _Search:
 
 
 def _causes(search: _Search, moved: str, parts: _Parts) -> Found:
-    """The causes of one constraint's danger; none where it is not told by few entries, or is of a whole body."""
+    """The causes of one constraint's danger; none where few entries do not explain it, or is of a whole body."""
     settings = parts.settings
     logged = search.logged
     plain = settings.causes and settings.loss == "cross-entropy" and not settings.use_transition

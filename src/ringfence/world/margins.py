@@ -51,7 +51,7 @@ def conformal(values: np.ndarray, level: float) -> float:
 
 def calibrated(predicted: np.ndarray, safe: np.ndarray, miscoverage: float) -> float:
     """The conformal margin of predicted scores of entries into danger, where most safe steps have it. Where they have
-    not, because some danger is told by nothing that is logged, the one that parts most of both."""
+    not, because nothing that is logged explains some danger, the one that parts most of both."""
     calibrated = conformal(predicted, 1 - miscoverage)
     if (safe >= calibrated).mean() >= BEARABLE:
         return calibrated
@@ -114,8 +114,8 @@ def in_own_margins(
     blamed = by_each.argmin(-1)
     found = []
     for k, net in enumerate(nets):
-        told = by_each[:, k] < least_margin(net)  # no margin foresees what a cause does not tell when it is there
-        ends = bad[(blamed == k) & told]
+        explained = by_each[:, k] < least_margin(net)  # no margin foresees the rest
+        ends = bad[(blamed == k) & explained]
         found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, features[row[fine] + 1]))
     return tuple(found)
 

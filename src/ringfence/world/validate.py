@@ -217,7 +217,7 @@ def _barrier_scores(
     bad = held[unsafe[held]]
     if len(bad) in (0, len(held)):
         kind = "safe" if len(bad) else "unsafe"
-        warning = f"no held-out step is {kind}, so nothing is known of how well danger is told"
+        warning = f"no held-out step is {kind}, so nothing is known of how well danger is recognised"
         return BarrierScores(warning=warning), UNJUDGED
     steps = rng.choice(held, min(STEPS, len(held)), replace=False)
     steps = np.unique(np.concatenate([steps, rng.choice(bad, min(WINDOWS, len(bad)), replace=False)]))
@@ -227,7 +227,9 @@ def _barrier_scores(
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
     predicted = np.concatenate([np.asarray(_score(barrier, *step)) for step in predicted_ends(dynamics, logged, ends)])
     if count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
-        warning = f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is told, or to set a margin"
+        warning = (
+            f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is recognised, or to set a margin"
+        )
         return BarrierScores(warning=warning), UNJUDGED
     if unit is None:
         unit = max(least, calibrated(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))

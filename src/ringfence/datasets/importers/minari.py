@@ -283,7 +283,7 @@ def _action_space(path: Path, metadata: dict, asked: common.Asked) -> Bounds | N
 
 
 def _of_entries(box: dict, name: str) -> np.ndarray:
-    """A bound of each entry of a Box, which may be told as one number."""
+    """A bound of each entry of a Box, which may be given as one number."""
     bound = np.asarray(box[name], np.float64).ravel()
     return np.repeat(bound, math.prod(box.get("shape", (1,)))) if len(bound) == 1 else bound
 
