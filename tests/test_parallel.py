@@ -174,7 +174,7 @@ class Odd(SimpleSpreadParallel):
         (1, lambda r: dict.fromkeys(r, float("nan")), "not finite"),
         (4, lambda i: dict.fromkeys(i, {"cost": "x"}), "tells the cost 'x'"),
         (4, lambda i: dict.fromkeys(i, {"cost": -1}), "a cost is 0 or positive"),
-        (4, lambda i: dict.fromkeys(i, 3), "pass cost="),
+        (4, lambda i: dict.fromkeys(i, 3), "infos are a dict of each agent"),
         (0, lambda s: dict.fromkeys(s, "far"), "no array of numbers"),
         (3, lambda t: dict.fromkeys(t, False), "has not ended after 20 steps"),
     ],
