@@ -29,6 +29,8 @@ ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
 POOL = "results/pooled/simple_spread-expert-pooled.json"
+PROVING = "results/proving"
+STRESS = "results/stress/crossing.csv"
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,28 @@ def of_a_pool(row: str, verdict: Callable[[dict, dict], bool]) -> Callable[[], t
         return verdict(r, found["data"]), text
 
     return check
+
+
+def of_systems() -> tuple[bool, str]:
+    """The clone's and the naive driver's episodes on the proving ground."""
+    found = [json.loads(file.read_text()) for file in sorted((ROOT / PROVING).glob("proving-*.json"))]
+    rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found}
+    clone = {name: r["bc shield learned"]["violation_rate"] for name, r in rows.items()}
+    bad = [name for name, r in rows.items() if r["naive shield learned"]["violation_rate"] <= 0.02]
+    kept = {n: r["bc shield learned"]["return_mean"] / r["bc shield oracle"]["return_mean"] for n, r in rows.items()}
+    fine = [name for name in rows if clone[name] <= 0.01 and kept[name] >= 0.93]
+    refused = [one["task"] for one in found if one["verdict"] == "unfit"]
+    holds = len(rows) == 16 and len(fine) == 14 and max(clone.values()) < 0.02 and len(bad) == 11 and len(refused) == 1
+    return holds, f"at most 1 % on {len(fine)} of {len(rows)}, {max(clone.values()):.3f} at most; naive {len(bad)}"
+
+
+def of_late_actions() -> tuple[bool, str]:
+    """Episodes with contact of a guard that knows of late actions, and of one that does not."""
+    rows = {(r["faults"], r["guard"], r["told"]): r for r in stored.table(ROOT / STRESS)}
+    known = [float(rows[f"delay{k}", "shield", "True"]["violation_rate"]) for k in (1, 2, 3)]
+    unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
+    holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) < 0.0165
+    return holds, f"{known} of {unknown}"
 
 
 PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 0)
@@ -523,6 +547,19 @@ CLAIMS = (
             "flow, 8 steps, guided by danger",
             lambda row, data: row["cost_safe_start"] == 0.0 and row["paired"]["return_norm_interval"][0] >= 0.0,
         ),
+    ),
+    Claim(
+        "README.md",
+        "On sixteen systems that chose no setting a guarded clone violates in 2 % of its episodes at most",
+        PROVING,
+        of_systems,
+    ),
+    Claim("docs/guard.md", "Of sixteen systems fourteen leave the guarded clone at most 1 %", PROVING, of_systems),
+    Claim(
+        "docs/stress.md",
+        "the guard leaves 0, 0.7 and 1.6 % of the episodes with contact, of 3, 40 and 90 %",
+        STRESS,
+        of_late_actions,
     ),
 )
 
