@@ -102,7 +102,7 @@ def of_systems() -> tuple[bool, str]:
 
 def of_late_actions() -> tuple[bool, str]:
     """Episodes with contact of a guard that knows of late actions, and of one that does not."""
-    rows = {(r["faults"], r["guard"], r["told"]): r for r in stored.table(ROOT / STRESS)}
+    rows = {(r["faults"], r["guard"], r["compensated"]): r for r in stored.table(ROOT / STRESS)}
     known = [float(rows[f"delay{k}", "shield", "True"]["violation_rate"]) for k in (1, 2, 3)]
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
     holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) < 0.0165
@@ -557,7 +557,7 @@ CLAIMS = (
     Claim("docs/guard.md", "Of sixteen systems fourteen leave the guarded clone at most 1 %", PROVING, of_systems),
     Claim(
         "docs/stress.md",
-        "the guard leaves 0, 0.7 and 1.6 % of the episodes with contact, of 3, 40 and 90 %",
+        "leaves 0, 0.7 and 1.6 % of the episodes with contact, of 3, 40 and 90 %",
         STRESS,
         of_late_actions,
     ),

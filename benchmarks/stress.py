@@ -1,7 +1,7 @@
-"""A guarded run behind faults, as the guard is and with what it can be told of them.
+"""A guarded run behind faults, as the guard is and with what it can know of them.
 
 python benchmarks/stress.py                         # writes results/stress/crossing.csv, a row when it is played
-python benchmarks/stress.py --jobs 16 --rows delay3/told drop0.6/told      # some rows, each in a process of its own
+python benchmarks/stress.py --jobs 16 --rows delay3 delay3/compensated     # some rows, each in a process of its own
 python benchmarks/stress.py --list
 python benchmarks/stress.py --table                 # writes the table of docs/stress.md
 
@@ -24,8 +24,9 @@ import _rows
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "results" / "stress" / "crossing.csv"
-PAGE = ROOT / "docs" / "stress.md"
-FIELDS = ("faults", "guard", "told", "episodes", "return", "violation_rate", "violation_upper", "infeasible_rate")
+ROW = ("faults", "guard", "compensated", "episodes")  # what tells rows apart
+RATES = ("violation_rate", "violation_upper", "infeasible_rate")
+FIELDS = (*ROW, "return", *RATES)
 RUN = "crossing-hasty/bc"
 LESS = {"others_acceleration": 0.7}  # m/s², where the World says 1.0
 LEAST = {"others_acceleration": 0.4}
@@ -49,27 +50,27 @@ FAULTS: tuple[dict[str, Any], ...] = (
     {"stop": 0.002},
     MIDDLE,
 )
-TOLD = ("delay", "jitter", "drop", "asynchrony")  # faults that a guard can be told of
+KNOWN = ("delay", "jitter", "drop", "asynchrony")  # faults that `compensate` makes good for
 
-Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether the guard is told, its other options
+Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether they are compensated, the guard's other options
 
 
 def trials() -> dict[str, Trial]:
-    """All rows by name, e.g. `delay3/told`; `all` has several faults at once."""
+    """All rows by name, e.g. `delay3/compensated`; `all` has several faults at once."""
     found: dict[str, Trial] = {}
     for faults in FAULTS:
         name = "all" if faults is MIDDLE else name_of(faults)
         found[name] = faults, False, {}
-        if not faults.keys() & set(TOLD):
+        if not faults.keys() & set(KNOWN):
             continue
-        found[f"{name}/told"] = faults, True, {}
+        found[f"{name}/compensated"] = faults, True, {}
         if faults.keys() & {"delay", "drop"}:
-            found[f"{name}/told/less"] = faults, True, LESS
-            found[f"{name}/told/least"] = faults, True, LEAST
-    found["delay3/told/farther"] = {"delay": 3}, True, FARTHER
-    found["drop0.6/told/farther"] = {"drop": 0.6}, True, FARTHER | LEAST
-    found["asynchrony0.667/told/farther"] = {"asynchrony": 0.667}, True, FARTHER | {"horizon": 6}
-    found["all/told/farther"] = MIDDLE, True, FARTHER | LESS
+            found[f"{name}/compensated/less"] = faults, True, LESS
+            found[f"{name}/compensated/least"] = faults, True, LEAST
+    found["delay3/compensated/farther"] = {"delay": 3}, True, FARTHER
+    found["drop0.6/compensated/farther"] = {"drop": 0.6}, True, FARTHER | LEAST
+    found["asynchrony0.667/compensated/farther"] = {"asynchrony": 0.667}, True, FARTHER | {"horizon": 6}
+    found["all/compensated/farther"] = MIDDLE, True, FARTHER | LESS
     return found
 
 
@@ -118,18 +119,23 @@ def play(run: Any, trial: Trial, episodes: int, out: Path, agents: int | None) -
     from ringfence.errors import UserError
     from ringfence.evaluation.stress import stress
 
-    faults, told, options = trial
-    row: dict[str, Any] = {"faults": name_of(faults), "guard": guard_of(options), "told": told, "episodes": episodes}
-    done = {tuple(r[k] for k in FIELDS[:4]) for r in _rows.read(out)}
-    if tuple(str(row[k]) for k in FIELDS[:4]) in done:
+    faults, compensated, options = trial
+    row: dict[str, Any] = {
+        "faults": name_of(faults),
+        "guard": guard_of(options),
+        "compensated": compensated,
+        "episodes": episodes,
+    }
+    done = {tuple(r[k] for k in ROW) for r in _rows.read(out)}
+    if tuple(str(row[k]) for k in ROW) in done:
         return
     given = {} if agents is None else {"agents": agents}
     try:
-        result = stress(run, faults, episodes=episodes, guard="shield", compensate=told, **options, **given)
+        result = stress(run, faults, episodes=episodes, guard="shield", compensate=compensated, **options, **given)
     except UserError as error:  # more late steps than the World's predictions are known for
         print(f"{row}: {error}", flush=True)
         return
-    row |= {"return": round(result["return_mean"], 3), **{field: round(result[field], 4) for field in FIELDS[5:]}}
+    row |= {"return": round(result["return_mean"], 3), **{rate: round(result[rate], 4) for rate in RATES}}
     print(row, flush=True)
     _rows.append(out, row, FIELDS)
 
@@ -152,30 +158,30 @@ def side_by_side(wanted: Sequence[str], jobs: int, episodes: int, out: Path, age
 
 def write_table(out: Path) -> None:
     """The table of docs/stress.md between its markers."""
+    from readme import put
+
     rows = _rows.read(out)
     plain = {r["episodes"]: float(r["return"]) for r in rows if r["faults"] == "none"}
     order = {name: k for k, name in enumerate(name_of(faults) for faults in FAULTS)}
-    head = "faults | guard | told | episodes | return | of that without faults | episodes with contact (95 % ≤)"
+    head = "faults | guard | compensated | episodes | return | of that without faults | episodes with contact (95 % ≤)"
     lines = [f"| {head} | infeasible steps |", "|---" * 8 + "|"]
-    for r in sorted(rows, key=lambda r: (order[r["faults"]], r["told"] == "True", r["guard"])):
+    for r in sorted(rows, key=lambda r: (order[r["faults"]], r["compensated"] == "True", r["guard"])):
         base = plain.get(r["episodes"], next(iter(plain.values())))
         share, rate, upper, infeasible = (
             100 * float(x)
             for x in (float(r["return"]) / base, r["violation_rate"], r["violation_upper"], r["infeasible_rate"])
         )
         faults = re.sub(r"([a-z])([\d.]+)", r"\1 \2", r["faults"]).replace("+", ", ")
-        told = "yes" if r["told"] == "True" else "no"
         cells = [
             faults,
             r["guard"].replace("_", " "),
-            told,
+            "yes" if r["compensated"] == "True" else "no",
             r["episodes"],
             f"{float(r['return']):.2f}",
             f"{share:.0f} %",
         ]
         lines.append("| " + " | ".join([*cells, f"{rate:.1f} % (≤ {upper:.1f})", f"{infeasible:.0f} %"]) + " |")
-    table = "<!-- stress -->\n" + "\n".join(lines) + "\n<!-- /stress -->"
-    PAGE.write_text(re.sub(r"<!-- stress -->.*?<!-- /stress -->", lambda _: table, PAGE.read_text(), flags=re.S))
+    put("docs/stress.md", "stress", "\n".join(lines))
 
 
 if __name__ == "__main__":

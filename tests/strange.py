@@ -205,14 +205,20 @@ def _short(value: Any) -> str:
 
 
 # --- arrays that become a store ---
-def arrays_of_stores() -> Iterator[Case]:
-    """Every array of every way of making one, of every kind."""
-    rng = np.random.default_rng(0)
-    episodes = {
+def few_episodes(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Four episodes of five steps: what every store holds."""
+    return {
         "observations": rng.normal(size=(4, 6, 2, 3)).astype(np.float32),
         "actions": rng.uniform(-1, 1, (4, 5, 2, 2)).astype(np.float32),
         "rewards": rng.normal(size=(4, 5, 2)).astype(np.float32),
         "costs": (rng.random((4, 5, 2)) < 0.2).astype(np.float32),
+    }
+
+
+def arrays_of_stores() -> Iterator[Case]:
+    """Every array of every way of making one, of every kind."""
+    rng = np.random.default_rng(0)
+    episodes = few_episodes(rng) | {
         "state": rng.normal(size=(4, 6, 3)).astype(np.float32),
         "terminated": np.array([True, False, True, False]),
     }

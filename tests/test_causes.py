@@ -15,7 +15,7 @@ from ringfence.errors import UserError
 from ringfence.guards import searched
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
-from ringfence.world import cause_search, causes, foresight, probes, verdict
+from ringfence.world import cause_search, causes, foresight, margins, probes, verdict
 from ringfence.world.card import BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
@@ -316,6 +316,22 @@ def test_a_guards_search_finds_no_danger_in_a_good_barrier_and_some_in_a_bad_one
     map = fitted.map
     logged = Logged.of(store, map, held_out(store, 0), labels_of(store, map, fitted.card.settings, None))
     assert searched.false_safe(dataclasses.replace(fitted, barrier=blind), logged) > 0.02
+
+
+def test_entries_that_a_cause_does_not_explain_leave_its_margin(fitted):
+    """Of a distance the margin is the same where posts and speeds are dangerous, too, of which it knows nothing."""
+    net = next(net for net in fitted.barrier.causes if net.cause.length and "other" in net.cause.name)
+
+    def length(unsafe) -> float:
+        store = store_of(unsafe=unsafe)
+        labels = labels_of(store, fitted.map, fitted.card.settings, None)
+        logged = Logged.of(store, fitted.map, held_out(store, 0), labels)
+        (own,) = margins.in_own_margins([net], fitted.dynamics, logged, np.random.default_rng(0))
+        return float(LEAST / jnp.exp(own.log_gain) * own.scale)
+
+    of_pairs = length(lambda why: why[..., 0])
+    assert of_pairs < 0.5 * NEAR
+    assert length(lambda why: why.any(-1)) == pytest.approx(of_pairs, rel=0.3)
 
 
 def test_foresight_is_of_what_the_barrier_reads(fitted):

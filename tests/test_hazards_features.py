@@ -244,3 +244,13 @@ def test_places_go_by_the_velocity_that_the_logs_have_them_go_by(late):
     np.testing.assert_allclose(found[:, 2:4], x[10:14, 0, 2:4], atol=1e-5)
     seen = there[10] + np.arange(4)[:, None] * dt * theirs[10] - place[10:14]  # as if it kept its velocity
     np.testing.assert_allclose(found[:, 4:6], seen, atol=1e-5)
+
+
+def test_the_least_of_several_has_the_slope_of_the_first_that_is_least():
+    """Also where two are equal, of which `min` takes half of each, and for arrays of any shape."""
+    x = jnp.array([[3.0, 1.0, 2.0], [5.0, 4.0, 4.0]])
+    least, slope = jax.value_and_grad(lambda x: constraints.lowest(x).sum())(x)
+    assert least == 5.0
+    np.testing.assert_array_equal(slope, [[0, 1, 0], [0, 1, 0]])
+    _, moved = jax.jvp(jax.vmap(constraints.lowest), (x[:, None],), (jnp.arange(6.0).reshape(2, 1, 3),))
+    np.testing.assert_array_equal(moved, [[1.0], [4.0]])

@@ -192,13 +192,7 @@ ARRAYS = {
 @pytest.mark.parametrize("place", ["observations", "actions", "rewards", "costs"])
 def test_arrays_of_strangers(place, kind):
     """They become a store of plain numbers that can be kept, or are refused."""
-    rng = np.random.default_rng(0)
-    given = {
-        "observations": rng.normal(size=(4, 6, 2, 3)).astype(np.float32),
-        "actions": rng.uniform(-1, 1, (4, 5, 2, 2)).astype(np.float32),
-        "rewards": rng.normal(size=(4, 5, 2)).astype(np.float32),
-        "costs": (rng.random((4, 5, 2)) < 0.2).astype(np.float32),
-    }
+    given = strange.few_episodes(np.random.default_rng(0))
     given[place] = ARRAYS[kind](given[place])
 
     def attempt():

@@ -587,6 +587,13 @@ COMMANDS = {
 }
 
 
+GROUPS: dict[str, tuple[dict[str, Any], str]] = {
+    "data": (data_commands.COMMANDS, "Episode stores: make, import, inspect."),
+    "log": (log_commands.COMMANDS, "Look into a log that Controller(log=) wrote."),
+    "bench": (bench_commands.COMMANDS, "Look into a results folder."),
+}
+
+
 def main(arguments: list[str] | None = None) -> None:
     arguments = rewritten(sys.argv[1:] if arguments is None else arguments)
     interrupts.listen()
@@ -594,34 +601,13 @@ def main(arguments: list[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
     try:
-        if arguments[:1] == ["data"]:
-            tyro.extras.subcommand_cli_from_dict(
-                data_commands.COMMANDS,
-                prog="ringfence data",
-                description="Episode stores: make, import, inspect.",
-                args=arguments[1:],
-            )
-        elif arguments[:1] == ["log"]:
-            tyro.extras.subcommand_cli_from_dict(
-                log_commands.COMMANDS,
-                prog="ringfence log",
-                description="Look into a log that Controller(log=) wrote.",
-                args=arguments[1:],
-            )
-        elif arguments[:1] == ["bench"] and arguments[1:2] and arguments[1] in bench_commands.COMMANDS:
-            tyro.extras.subcommand_cli_from_dict(
-                bench_commands.COMMANDS,
-                prog="ringfence bench",
-                description="Look into a results folder.",
-                args=arguments[1:],
-            )
-        else:
-            tyro.extras.subcommand_cli_from_dict(
-                COMMANDS | {"data": lambda: main(["data", "--help"]), "log": lambda: main(["log", "--help"])},
-                prog="ringfence",
-                description="Safe offline multi-agent reinforcement learning.",
-                args=arguments,
-            )
+        group, commands, description = _group_of(arguments)
+        tyro.extras.subcommand_cli_from_dict(
+            commands,
+            prog=" ".join(["ringfence", *group]),
+            description=description,
+            args=arguments[len(group) :],
+        )
     except UserError as error:
         complain(str(error))
         sys.exit(2)
@@ -635,6 +621,18 @@ def main(arguments: list[str] | None = None) -> None:
         what = f"'{error.filename}': {error.strerror}" if error.filename else str(error)
         complain(f"{what}; check that the path is what you mean and that you may use it.")
         sys.exit(2)
+
+
+def _group_of(arguments: list[str]) -> tuple[list[str], dict[str, Any], str]:
+    """(words that name a group of commands, its commands, its description); without such words all commands.
+    `bench` is a command as well, unless one of its group follows."""
+    name = arguments[0] if arguments else ""
+    if name in GROUPS:
+        commands, description = GROUPS[name]
+        if name not in COMMANDS or (len(arguments) > 1 and arguments[1] in commands):
+            return [name], commands, description
+    helps = {"data": lambda: main(["data", "--help"]), "log": lambda: main(["log", "--help"])}
+    return [], COMMANDS | helps, "Safe offline multi-agent reinforcement learning."
 
 
 def _early(algorithm: str, preset: str | None, changes: dict[str, str]) -> None:

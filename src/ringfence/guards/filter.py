@@ -90,7 +90,7 @@ class Guard(eqx.Module):
         self, present: Array, actions: Array, dynamics: Dynamics | None = None, unroll: bool = False
     ) -> tuple[Array, Array]:
         """Rows (B, P, K+1, N, D), the present first, and disagreement (B, P, K, N) along actions (B, P, K, N, A).
-        Unrolled, it is a sixth faster and takes twice as long to compile."""
+        Unrolled, its slope is faster, and it takes longer to compile."""
         model = dynamics or self.world.dynamics
         x = jnp.broadcast_to(present[:, None], (*actions.shape[:2], *present.shape[1:]))
 

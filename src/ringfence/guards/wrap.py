@@ -13,7 +13,14 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.guards.policy import Guarded, build
 from ringfence.problem import constraints, normalise
-from ringfence.problem.homogeneous import PerAgent, local_features, merge_agents, split_agents, team_policy
+from ringfence.problem.homogeneous import (
+    PerAgent,
+    agent_policy,
+    local_features,
+    merge_agents,
+    split_agents,
+    team_policy,
+)
 from ringfence.problem.origins import Origins
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
@@ -156,3 +163,16 @@ def under_guard(
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
     guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
     return Callback(policy, guarded, agents or spec.n_agents)
+
+
+def guarded_of(policy: Any) -> Guarded | None:
+    """The guard of a policy: a team's, of each agent, or of a function; None where there is none."""
+    one = policy.guarded if isinstance(policy, Callback) else agent_policy(policy)
+    return one if isinstance(one, Guarded) else None
+
+
+def with_guarded(policy: Any, guarded: Guarded) -> Any:
+    """The policy under another guard."""
+    if isinstance(policy, Callback):
+        return Callback(policy.function, guarded, policy.agents)
+    return PerAgent(guarded, policy.agents) if isinstance(policy, PerAgent) else guarded

@@ -16,13 +16,13 @@ import numpy as np
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
-from ringfence.guards.wrap import Callback, under_guard
-from ringfence.loading.evidence import Evidence, explaining, guarded_of
+from ringfence.guards.wrap import Callback, guarded_of, under_guard
+from ringfence.loading.evidence import Evidence, explaining
 from ringfence.loading.resolve import load
 from ringfence.loading.stamps import Stamps
 from ringfence.loading.watch import Fallback, Watch, widened
 from ringfence.problem.constraints import Hazard
-from ringfence.problem.homogeneous import PerAgent, agent_policy, team_policy
+from ringfence.problem.homogeneous import PerAgent, team_policy
 from ringfence.proposals.base import act_with, with_cost
 from ringfence.proposals.options import DEFAULT
 from ringfence.training import worlds
@@ -334,12 +334,12 @@ def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _F
 
 def _require(certificate: Certificate, source: _TrainedRun | _Function) -> None:
     """Refuse a certificate of anybody else."""
-    one = agent_policy(source.policy)
-    if isinstance(source, _Function) or not isinstance(one, Guarded):
+    guarded = guarded_of(source.policy)
+    if isinstance(source, _Function) or guarded is None:
         raise UserError(UNGUARDED)
-    guard = one.guard
+    guard = guarded.guard
     options = dataclasses.asdict(guard.options)
-    certificate.require(one.proposal, guard.world, source.agents, options, guard.barrier.source)
+    certificate.require(guarded.proposal, guard.world, source.agents, options, guard.barrier.source)
 
 
 def _batch(seen: Seen) -> Seen:

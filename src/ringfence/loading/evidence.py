@@ -15,10 +15,12 @@ import numpy as np
 import ringfence
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards.policy import Guarded
-from ringfence.guards.wrap import Callback
-from ringfence.problem.homogeneous import PerAgent, agent_policy
+from ringfence.guards.wrap import Callback, guarded_of, with_guarded
+from ringfence.problem.homogeneous import agent_policy
 from ringfence.utils.chained import ChainedLog
+from ringfence.utils.pytrees import digest_of
 
+SEEN = ("observations", "state")
 FEW = 1e-6  # an executed action that differs by less from the requested one is that
 
 
@@ -58,7 +60,7 @@ class Evidence:
             "kind": "step",
             "t": _now(),
             "ms": round(ms, 3),
-            "observed": _digest_of(*seen),
+            "observed": digest_of((name, x) for name, x in zip(SEEN, seen) if x is not None),
             "age": None if age is None else np.asarray(age).tolist(),
             "executed": _numbers(action),
         }
@@ -103,21 +105,12 @@ class Evidence:
         return found
 
 
-def guarded_of(policy: Any) -> Guarded | None:
-    """The guard of a policy, a team's or of each agent."""
-    one = policy.guarded if isinstance(policy, Callback) else agent_policy(policy)
-    return one if isinstance(one, Guarded) else None
-
-
 def explaining(policy: Any) -> Any:
     """The policy, whose guard says what was requested and what was amiss with it."""
     guarded = guarded_of(policy)
     if guarded is None:
         return policy
-    guarded = dataclasses.replace(guarded, explains=True)
-    if isinstance(policy, Callback):
-        return Callback(policy.function, guarded, policy.agents)
-    return PerAgent(guarded, policy.agents) if isinstance(policy, PerAgent) else guarded
+    return with_guarded(policy, dataclasses.replace(guarded, explains=True))
 
 
 def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certificate | None) -> dict[str, Any]:
@@ -145,14 +138,6 @@ def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certi
 def _digest_of_certificate(certificate: Certificate) -> str:
     content = json.dumps(dataclasses.asdict(certificate), sort_keys=True)
     return hashlib.blake2b(content.encode(), digest_size=8).hexdigest()
-
-
-def _digest_of(*arrays: np.ndarray | None) -> str:
-    found = hashlib.blake2b(digest_size=8)
-    for array in arrays:
-        if array is not None:
-            found.update(np.ascontiguousarray(array, np.float32).data)
-    return found.hexdigest()
 
 
 def _numbers(x: np.ndarray) -> Any:

@@ -11,9 +11,7 @@ import numpy as np
 from ringfence.errors import UserError, known
 from ringfence.faults.certificate import Certificate
 from ringfence.faults.monitor import Monitor
-from ringfence.guards.wrap import Callback
-from ringfence.loading.evidence import guarded_of
-from ringfence.problem.homogeneous import PerAgent
+from ringfence.guards.wrap import guarded_of, with_guarded
 from ringfence.utils.given import given_as
 
 ON_ALARM = ("report", "stop", "widen", "hand_over")
@@ -76,7 +74,5 @@ def widened(policy: Any) -> Any:
     guarded = guarded_of(policy)
     assert guarded is not None, "a certificate is of a guard"
     options = dataclasses.replace(guarded.guard.options, margin=WIDER * guarded.guard.options.margin)
-    guarded = dataclasses.replace(guarded, guard=dataclasses.replace(guarded.guard, options=options))
-    if isinstance(policy, Callback):
-        return Callback(policy.function, guarded, policy.agents)
-    return PerAgent(guarded, policy.agents) if isinstance(policy, PerAgent) else guarded
+    guard = dataclasses.replace(guarded.guard, options=options)
+    return with_guarded(policy, dataclasses.replace(guarded, guard=guard))
