@@ -348,6 +348,11 @@ def build(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
     _refuse_far(options, world)
+    if options.others_acceleration and world.map.dt is None:
+        raise UserError(
+            "others_acceleration needs a World of agents that see for themselves and know how long a step takes; leave "
+            "it out."
+        )
     if options.proof:
         if barrier != "learned":
             raise UserError(f"proof is of a barrier that was learned, and barrier='{barrier}'; leave one of them out.")
@@ -370,11 +375,6 @@ def prover_of(world: World, options: GuardOptions) -> Prover:
 def _refuse_far(options: GuardOptions, world: World) -> None:
     """Refuse to roll actions forward for longer than anybody knows how well the World does."""
     error = world.card.prediction_error
-    if options.others_acceleration and world.map.dt is None:
-        raise UserError(
-            "others_acceleration needs a World of agents that see for themselves and know how long a step takes; leave "
-            "it out."
-        )
     known = FARTHEST if error is None else len(error.error_of_change)
     late = options.delay + options.max_age
     if late > known:

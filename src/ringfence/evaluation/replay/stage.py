@@ -30,6 +30,11 @@ def _decided(guarded: Guarded, memory: Any, present: Array, actions: Array, key:
     return guarded.decided(memory, present, actions, key)
 
 
+def _present(world: World, observations: Any, state: Any) -> Array:
+    """(W, N, D) what a World sees."""
+    return world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
+
+
 class _Bad:
     """A bad driver as a policy, under guard or not: what it and the others do is set before every step."""
 
@@ -54,7 +59,7 @@ class _Bad:
         if self.guard is None:
             return carry, PolicyStep(team, {})
         world = self.guard.guard.world
-        present = world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
+        present = _present(world, observations, state)
         return _decided(self.guard, carry, present, held(in_unit(team, world), self.guard.guard.options.horizon), key)
 
 
@@ -102,9 +107,8 @@ class Stage:
             now = self._now(t, place, velocity, heading)
             key, step_key = jax.random.split(key)
             if bad is not None:
-                bad.team = w.actions[:, t].copy()
                 wanted = DRIVERS[str(driver)](now)
-                bad.team[np.arange(w.count), w.driven] = self.kinematics.toward(wanted, velocity, heading)
+                bad.team = self._team(t, self.kinematics.toward(wanted, velocity, heading))
             memory, action, step_info = self._action(actor, memory, seen, step_key)
             if brake:
                 action, step_info["braked"] = braked(now, action, self.kinematics, self.radius)
@@ -151,10 +155,12 @@ class Stage:
         return memory, acted, {n: np.asarray(step.info[n]) for n in TOLD if n in step.info}
 
     def _in_world(self, world: World, t: int, seen: Seen, action: np.ndarray) -> tuple[Array, Array]:
-        """What a World sees (W, N, D), and everybody's actions (W, N, A) in its units: others do as they did."""
+        """What a World sees (W, N, D), and everybody's actions (W, N, A) in its units."""
+        return _present(world, *seen), in_unit(self._team(t, action), world)
+
+    def _team(self, t: int, action: np.ndarray) -> np.ndarray:
+        """(W, N, A) everybody's actions in row t: others do as they did, the driven agents act by (W, A)."""
         w = self.windows
         team = w.actions[:, t].copy()
         team[np.arange(w.count), w.driven] = action
-        observations, state = seen
-        present = world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
-        return present, in_unit(team, world)
+        return team
