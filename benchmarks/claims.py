@@ -554,7 +554,12 @@ CLAIMS = (
         PROVING,
         of_systems,
     ),
-    Claim("docs/guard.md", "Of sixteen systems fourteen leave the guarded clone at most 1 %", PROVING, of_systems),
+    Claim(
+        "docs/proving-ground.md",
+        "Of sixteen systems fourteen leave the guarded clone at most 1 %",
+        PROVING,
+        of_systems,
+    ),
     Claim(
         "docs/stress.md",
         "leaves 0, 0.7 and 1.6 % of the episodes with contact, of 3, 40 and 90 %",

@@ -94,7 +94,7 @@ def main() -> None:
     put("docs/guard.md", "own", table("own-sight", OWN, short))
     put("docs/guard.md", "own-robots", table("own-sight-mujoco", OWN_ROBOTS, long))
     put("docs/guard.md", "barrier", barrier())
-    put("docs/guard.md", "proving", proving())
+    put("docs/proving-ground.md", "proving", proving())
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
