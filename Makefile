@@ -4,6 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
+# Pages whose prose is held to the limits of docs/tools/prose.py.
+PLAIN = commands gpu
+
 .PHONY: demo test versions docs lint clean
 
 $(BIN)/python:
@@ -32,6 +35,7 @@ versions:
 docs: $(VENV)/.docs
 	JAX_PLATFORMS=cpu NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/python docs/tools/check.py site
+	$(BIN)/python docs/tools/prose.py --pages $(PLAIN)
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check src tests benchmarks docs/tools

@@ -123,3 +123,40 @@ def test_a_site_is_looked_at(tmp_path, style, body, wrong):
 
 def test_an_empty_site_is_no_site(tmp_path):
     assert "make docs" in load("check").problems(tmp_path)[0]
+
+
+@pytest.mark.parametrize(
+    ("page", "wrong"),
+    [
+        ("A robot stops. It waits for the others.", None),
+        (f"{'word ' * 21}.", "21.0 words a sentence"),
+        (f"{'A word. ' * 61}", "122 words"),
+        ("It took 1, 2.5, 30 % and −4 steps.", "4 numbers"),
+        ("It took `1` of `2`, [3](4.md) in 5 and 6, as Fu et al. 2020 say of ROS 2.", None),
+        ("Nobody was told.", "line 1 'told'"),
+        ("# Nobody was told\n\n| told |\n|---|\n\n    told\n\n```\ntold\n```\n\n> told\n", None),
+        ("<!-- x -->\nNobody was told.\n<!-- /x -->\n", None),
+        ("* One thing\n* what one\n  agent hears", "line 2 'hears'"),
+        ("Twin critics, as in TD3.", None),
+    ],
+)
+def test_prose_is_measured(tmp_path, page, wrong):
+    (file := tmp_path / "page.md").write_text(page)
+    found = [
+        line.replace("page.md:", "line ").replace(":", "", 1)
+        for line in load("prose").measure(file, tmp_path).failures()
+    ]
+    assert (not found) if wrong is None else any(wrong in line for line in found), found
+
+
+def test_prose_of_a_page_that_fails_fails_the_command(tmp_path, capsys):
+    tools = load("prose")
+    assert {"README", "index", "start"} <= set(tools.pages())
+    assert not set(tools.LEFT_OUT) & set(tools.pages())
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "README.md").write_text("One idea a sentence.")
+    (tmp_path / "docs" / "start.md").write_text("Nobody was told.")
+    tools.pages.__defaults__ = tools.measure.__defaults__ = (tmp_path,)
+    assert tools.main(["--pages", "README"]) == 0
+    assert tools.main([]) == 1
+    assert "1 things to mend" in capsys.readouterr().out
