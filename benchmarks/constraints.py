@@ -1,7 +1,7 @@
 """Two constraints of the yard of examples/yard.py, each with its limit: contact (0 of 80 steps) and speed above 0.8 m/s
 (20 of 80). What a guard makes of them when the logs name them, beside a baseline whose logs tell their maximum alone.
 
-    python benchmarks/constraints.py     # writes results/constraints.csv and docs/guard.md's table; twenty minutes
+    python benchmarks/constraints.py     # writes results/constraints.csv and its table; twenty minutes
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def main() -> None:
         rows.append({k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()})
         print(rows[-1], flush=True)
         write(OUT, rows)
-    put("docs/guard.md", "constraints", table(rows))
+    put("docs/guard-results.md", "constraints", table(rows))
 
 
 def table(rows: list[dict]) -> str:

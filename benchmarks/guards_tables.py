@@ -1,4 +1,4 @@
-"""Writes the tables of docs/guard.md between their markers, from results/ alone.
+"""Writes the tables of guards between their markers in docs/, from results/ alone.
 
 python benchmarks/guards_tables.py
 """
@@ -16,28 +16,25 @@ from ringfence.evaluation.statistics import upper_bound
 from ringfence.utils import stored
 
 RESULTS = Path(__file__).resolve().parent.parent / "results"
-# Columns: their heads, and their rows.
-SPREAD = {
-    "BC": ("bc", "default"),
-    "shield, analytic": ("bc", "default+shield-analytic"),
-    "**shield, learned**": ("bc", "default+shield-learned"),
-    "**full, learned**": ("bc", "default+full-learned"),
-    "MPC from a zero proposal (`mpc`), full, learned": ("mpc", "default+full-learned"),
+Column = tuple[str, Row]  # a suite, and a row of it
+# Columns: their heads, and where their rows are.
+SPREAD: dict[str, Column] = {
+    "BC": ("guards", ("bc", "default")),
+    "shield, analytic": ("guards", ("bc", "default+shield-analytic")),
+    "**shield**": ("guards", ("bc", "default+shield-learned")),
+    "**full**": ("guards", ("bc", "default+full-learned")),
+    "MPC from a zero proposal, full": ("guards", ("mpc", "default+full-learned")),
+    "shield, decentralized": ("own-sight", ("bc", "default+shield-learned-decentralized")),
+    "full, decentralized": ("own-sight", ("bc", "default+full-learned-decentralized")),
 }
-ROBOTS = {
-    "BC": ("bc", "default"),
-    "adapt, analytic": ("bc", "default+adapt-analytic"),
-    "adapt, learned": ("bc", "default+adapt-learned"),
-    "full, analytic": ("bc", "default+full-analytic"),
-    "**full, learned**": ("bc", "default+full-learned"),
-    "`icbf` (low temperature)": ("icbf", "default+low_temperature"),
-    "`icbf`, adapt, analytic": ("icbf", "default+low_temperature+adapt-analytic"),
-    "`icbf`, adapt, learned": ("icbf", "default+low_temperature+adapt-learned"),
-}
-OWN = {
-    "BC": ("bc", "default"),
-    "shield, learned, decentralized": ("bc", "default+shield-learned-decentralized"),
-    "full, learned, decentralized": ("bc", "default+full-learned-decentralized"),
+ROBOTS: dict[str, Column] = {
+    "BC": ("guards-mujoco", ("bc", "default")),
+    "adapt, analytic": ("guards-mujoco", ("bc", "default+adapt-analytic")),
+    "**adapt**": ("guards-mujoco", ("bc", "default+adapt-learned")),
+    "full, analytic": ("guards-mujoco", ("bc", "default+full-analytic")),
+    "**full**": ("guards-mujoco", ("bc", "default+full-learned")),
+    "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
+    "full, decentralized": ("own-sight-mujoco", ("bc", "default+full-learned-decentralized")),
 }
 # Crossing's rows: algorithm and variant, and their words.
 BESIDE = {
@@ -81,19 +78,11 @@ WAYS = BESIDE | {
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
 SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
-OWN_ROBOTS = {
-    "BC": ("bc", "default"),
-    "adapt, learned, decentralized": ("bc", "default+adapt-learned-decentralized"),
-    "full, learned, decentralized": ("bc", "default+full-learned-decentralized"),
-}
 
 
 def main() -> None:
-    put("docs/guard.md", "spread", table("guards", SPREAD, short))
-    put("docs/guard.md", "robots", table("guards-mujoco", ROBOTS, long))
-    put("docs/guard.md", "own", table("own-sight", OWN, short))
-    put("docs/guard.md", "own-robots", table("own-sight-mujoco", OWN_ROBOTS, long))
-    put("docs/guard.md", "barrier", barrier())
+    put("docs/guard-results.md", "spread", table(SPREAD, short))
+    put("docs/guard-results.md", "robots", table(ROBOTS, long))
     put("docs/proving-ground.md", "proving", proving())
     put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
     put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
@@ -102,26 +91,29 @@ def main() -> None:
     put("docs/crossing.md", "other", other_simulator())
 
 
-def table(suite: str, columns: dict[str, Row], cell) -> str:
-    """A row per task, a column per guard; – where nothing was made. Seeds stand in the head where all cells of a column
-    have as many, else in the cell."""
+def table(columns: dict[str, Column], cell) -> str:
+    """A row per task, a column per guard; – where nothing was made, and how many seeds each cell is of."""
+    tasks = tasks_of(next(iter(columns.values()))[0])
     found = {
         (task, words): list(of(suite, task, variant(task, row)).values())
-        for task in tasks_of(suite)
-        for words, row in columns.items()
+        for task in tasks
+        for words, (suite, row) in columns.items()
     }
+    # Seeds stand in the head where all cells of a column have as many, else in the task's name or in the cell.
     seeds = {w: {len(rows) for (_, words), rows in found.items() if words == w and rows} for w in columns}
-    heads = [w + (f" ({max(seeds[w])} seeds)" if len(seeds[w]) == 1 and max(seeds[w]) > 1 else "") for w in columns]
+    heads = [w + (f" [{max(seeds[w])}]" if len(seeds[w]) == 1 else "") for w in columns]
     out = ["| | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
-    for task in tasks_of(suite):
+    for task in tasks:
+        mixed = {w: len(found[task, w]) for w in columns if len(seeds[w]) > 1 and found[task, w]}
+        usual = max(set(mixed.values()), key=list(mixed.values()).count) if len(mixed) > 1 else 0
         cells = []
         for words in columns:
             rows = found[task, words]
-            some = f" ({len(rows)} seeds)" if len(seeds[words]) > 1 and len(rows) > 1 else ""
+            some = f" [{mixed[words]}]" if mixed.get(words, usual) != usual else ""
             cells.append(cell(rows) + some if rows else "–")
         if any(c != "–" for c in cells[1:]):
-            out.append(f"| `{task}` | " + " | ".join(cells) + " |")
-    return "\n".join(out)
+            out.append(f"| `{task}`{f' [{usual}]' * bool(usual)} | " + " | ".join(cells) + " |")
+    return "\n".join([*out, "", "[n]: of n seeds."])
 
 
 def mean(rows: list[dict], key: str) -> float:
@@ -135,7 +127,7 @@ def short(rows: list[dict]) -> str:
 def long(rows: list[dict]) -> str:
     fell = mean(rows, "termination_rate")
     text = f"{mean(rows, 'return_mean'):.0f} / {mean(rows, 'cost_mean'):.1f}"
-    return text + (f" ({100 * fell:.0f} % fall)" if fell else "")
+    return text + (f" ({100 * fell:.0f} %)" if fell else "")
 
 
 def crossing(suite: str, named: dict[str, str]) -> str:
@@ -224,27 +216,6 @@ def _share_and_return(row: dict | None) -> str:
     if row is None or "refused" in row:
         return "–"
     return f"{100 * row['violation_rate']:.0f} %, {row['return_mean']:.2f}"
-
-
-def barrier() -> str:
-    """Ways of fitting a barrier, by what the guard makes of them."""
-    head = ("way", "unsafe steps found", "margin", "return", "cost", "95 % interval", "infeasible")
-    out = []
-    rows = stored.table(RESULTS / "tuning" / "barrier.csv")
-    for task in dict.fromkeys(r["task"] for r in rows):
-        out += [f"`{task}`:", "", "| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-        for r in (r for r in rows if r["task"] == task):
-            way = r["way"] if r["guard"] == "margin" else f"{r['way']}, condition `{r['guard']}`"
-            if "future" in r["guard"]:
-                way = f"{r['way']}, last row judged by V" + r["guard"].removeprefix("future")
-            elif r["guard"] == "3 rows":
-                way = f"{r['way']}, 3 rows"
-            part = [way, f"{100 * float(r['recall']):.1f} %", f"{float(r['margin']):.1f}", f"{float(r['return']):.4g}"]
-            part += [f"{float(r['cost']):.3g}", f"{float(r['cost_low']):.3g} to {float(r['cost_high']):.3g}"]
-            part += [f"{100 * float(r['infeasible_rate'] or 0):.1f} %"]
-            out.append("| " + " | ".join(part) + " |")
-        out.append("")
-    return "\n".join(out).strip()
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """The yard of examples/yard.py, 1000 test episodes: BC, and a naive controller at full speed, alone and under
 guard; danger learned of the team's cost column beside the formula that the logs are not told.
 
-    python benchmarks/yard.py            # writes results/yard.csv and docs/guard.md's table; an hour
+    python benchmarks/yard.py            # writes results/yard.csv and docs/guard-results.md's table; an hour
 
 Rows that are there already are not made again.
 """
@@ -89,7 +89,7 @@ def main() -> None:
         print(rows[-1], flush=True)
         write(rows)
     write(rows)
-    put("docs/guard.md", "yard", table(OUT))
+    put("docs/guard-results.md", "yard", table(OUT))
 
 
 def logs(store: EpisodeStore) -> list:
