@@ -530,7 +530,7 @@ CLAIMS = (
         ),
     ),
     Claim(
-        "docs/method.md",
+        "docs/drivers-results.md",
         "Over five seeds `flow` earns more than the data does",
         POOL,
         of_a_pool(
@@ -542,7 +542,7 @@ CLAIMS = (
         ),
     ),
     Claim(
-        "docs/method.md",
+        "docs/drivers-results.md",
         "Guided by danger `flow` costs nothing from safe starts and earns no less",
         POOL,
         of_a_pool(

@@ -7,7 +7,7 @@ is what `SECONDS` of one core's time allow, measured on its own updates first. R
 played share the run of the row they are about. `nearest` is how far a joint action is from what the nearest of the five
 learners does there without noise (RMSE of an entry, over logged states): small where plans are some learner's,
 whichever, and large where they are nobody's. Rows that the file holds already are not made again; at the end the table
-in docs/method.md is written anew.
+is printed.
 """
 
 import argparse
@@ -24,7 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from _common import command, machine
 from pooled import drivers_of
-from readme import put
 
 import ringfence
 from ringfence.datasets import behaviour, matd3
@@ -47,7 +46,6 @@ SECONDS = 120.0  # of one core, of training
 PROBE = 60  # updates whose second half is timed
 # Nothing of these plans reads a World but value guidance, which is off.
 WORLD = {"dynamics_updates": 100, "num_ensemble": 1, "value_updates": 100, "barrier": False, "causes": False}
-RESULTS = Path(__file__).resolve().parent.parent / "results" / "pooled" / "collapse.json"
 
 
 @dataclass(frozen=True)
@@ -259,8 +257,7 @@ def main() -> None:
             print(name, found["rows"][name], flush=True)
             given.out.parent.mkdir(parents=True, exist_ok=True)
             given.out.write_text(json.dumps(found, indent=1, ensure_ascii=False) + "\n")
-    if given.out.resolve() == RESULTS:
-        put("docs/method.md", "collapse", table(found["rows"]))
+    print(table(found["rows"]))
 
 
 if __name__ == "__main__":

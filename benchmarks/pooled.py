@@ -4,7 +4,7 @@
 
 One file for each task. Rows that a file holds already, of as many seeds (`--seeds`), are not made again; `runs/pooled`
 keeps the runs, so a row whose runs are there is only played. Budgets are small: a laptop makes a row in minutes, and
-each row says its own. At the end the table in docs/method.md is written anew; `--seeds 0` does that alone.
+each row says its own. At the end the table in docs/drivers-results.md is written anew; `--seeds 0` does that alone.
 """
 
 import argparse
@@ -188,7 +188,7 @@ def table() -> str:
                 r = found["rows"][name]
                 interval = r.get("return_norm_interval")  # older rows tell none
                 within = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
-                words = f"`{r['algorithm']}`{name.removeprefix(r['algorithm'])}"
+                words = f"`{r['algorithm']}`{name.removeprefix(r['algorithm'])}".replace("told", "given")
                 cost = f"{r['cost_mean']:.2f} | {r['cost_safe_start']:.2f}"
                 lines.append(f"| {words} | {len(r['seeds'])} | {r['return_norm']:.3f}{within} | {cost} |")
     return "\n".join(lines)
@@ -217,7 +217,7 @@ def main() -> None:
             print(name, which, rows[which], flush=True)
             file.write_text(json.dumps(found, indent=1) + "\n")
     if given.out.resolve() == RESULTS:
-        put("docs/method.md", "pooled", table())
+        put("docs/drivers-results.md", "pooled", table())
 
 
 if __name__ == "__main__":
