@@ -37,43 +37,34 @@ ROBOTS: dict[str, Column] = {
     "full, decentralized": ("own-sight-mujoco", ("bc", "default+full-learned-decentralized")),
 }
 # Crossing's rows: algorithm and variant, and their words.
-BESIDE = {
-    "behaviour data reference": "the logs",
+SHIELDED = "+shield-learned"
+WAYS = {
     "certificates reference": "certificates (true state and brakes)",
-}
-TIERS = BESIDE | {"bc default": "BC", "bc default+shield-learned": "**BC, shield, learned**"}
-WAYS = BESIDE | {
     "bc default": "BC",
     **{
-        f"bc default+shield-learned+horizon{k}+terminal_valueFalse": f"shield, ℓ, {k} row{'s' * (k > 1)}"
+        f"bc default{SHIELDED}+horizon{k}+terminal_valueFalse": f"shield, ℓ, {k} step{'s' * (k > 1)}"
         for k in (1, 3, 7, 15)
     },
-    "bc default+shield-learned+horizon1": "shield, ℓ and V, 1 row",
-    "bc default+shield-learned": "**shield, ℓ and V, 3 rows**",
-    "bc default+shield-analytic+horizon15+terminal_valueFalse": "shield, analytic, 15 rows",
+    f"bc default{SHIELDED}+horizon1": "shield, ℓ and V, 1 step",
+    f"bc default{SHIELDED}": "**shield, ℓ and V, 3 steps**",
+    "bc default+shield-analytic+horizon15+terminal_valueFalse": "shield, analytic, 15 steps",
     "bc default+full-learned": "**full**",
     "bc default+full-learned+margin1.0": "full, a margin of 1",
     "bc default+full-learned+trust_radius2.0+margin1.0": "full, a margin of 1, climbing anywhere",
     "mpc default+full-learned+trust_radius2.0+margin1.0": (
         "MPC from a zero proposal (`mpc`), full, a margin of 1, climbing anywhere"
     ),
+}
+PROPOSALS = {
+    "bc default": "BC",
     "bc-best default": "10 % BC",
-    "bc-best default+shield-learned": "10 % BC, shield",
     "bc-return default": "return-conditioned BC",
-    "bc-return default+shield-learned": "return-conditioned BC, shield",
     "bc-safe default": "BC on episodes without contact",
-    "bc-safe default+shield-learned": "BC on episodes without contact, shield",
-    **{
-        f"{name}{more}": words + (", shield" if more else "")
-        for name, words in (
-            ("ma-td3bc default", "MA-TD3+BC"),
-            ("ma-td3bc-lag default", "MA-TD3+BC, Lagrange"),
-            ("omar default", "OMAR"),
-            ("madiff default", "our MADIFF"),
-            ("icbf split", "`icbf`"),
-        )
-        for more in ("", "+shield-learned")
-    },
+    "ma-td3bc default": "MA-TD3+BC",
+    "ma-td3bc-lag default": "MA-TD3+BC, Lagrange",
+    "omar default": "OMAR",
+    "madiff default": "our MADIFF",
+    "icbf split": "`icbf`",
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
@@ -84,11 +75,12 @@ def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
     put("docs/proving-ground.md", "proving", proving())
-    put("docs/crossing.md", "tiers", crossing("crossing", TIERS))
-    put("docs/crossing.md", "guards", crossing("crossing-guards", WAYS))
-    put("docs/crossing.md", "teams", crossing("crossing-teams", TEAMS))
-    put("docs/crossing.md", "sizes", sizes())
-    put("docs/crossing.md", "other", other_simulator())
+    put("docs/crossing-results.md", "tiers", tiers())
+    put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
+    put("docs/crossing-results.md", "proposals", proposals())
+    put("docs/crossing-results.md", "teams", crossing("crossing-teams", TEAMS))
+    put("docs/crossing-results.md", "sizes", sizes())
+    put("docs/crossing-results.md", "other", other_simulator())
 
 
 def table(columns: dict[str, Column], cell) -> str:
@@ -130,37 +122,59 @@ def long(rows: list[dict]) -> str:
     return text + (f" ({100 * fell:.0f} %)" if fell else "")
 
 
-def crossing(suite: str, named: dict[str, str]) -> str:
-    """A row per task and variant. Seeds share their resets, so the bound is of resets: those in which any seed touched,
-    at most."""
-    head = (
-        "method",
-        "return",
-        "steps with contact",
-        "episodes with contact (bound)",
-        "agents who touch",
-        "infeasible_rate",
-        "n_episodes",
-    )
-    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+def of_crossing(suite: str, task: str, key: str) -> list[dict]:
+    """A row's lines of table.csv, one for each seed."""
     rows = stored.table(RESULTS / suite / "table.csv")
-    for task in dict.fromkeys(r["task"] for r in rows):
-        several = len({r["task"] for r in rows}) > 1
-        for key, words in named.items():
-            found = [r for r in rows if r["task"] == task and f"{r['algorithm']} {r['variant']}" == key]
-            if not found:
-                continue
-            episodes = int(found[0]["episodes"])
-            touched = round(sum(float(r["violation_rate"]) for r in found) * episodes)
-            own = [r for r in found if r["agent_violation_rate"]]
-            part = [f"`{task}`, {words}" if several else words, f"{mean(found, 'return_mean'):.2f}"]
-            part += [f"{mean(found, 'cost_mean'):.3g}", f"{100 * mean(found, 'violation_rate'):.3g} %"]
-            if key.split()[0] != "behaviour" or "policy" in key:
-                part[-1] += f" (≤ {100 * upper_bound(min(touched, episodes), episodes):.3g} %)"
-            part += [f"{100 * mean(own, 'agent_violation_rate'):.2g} %" if own else ""]
-            part += [f"{100 * mean(found, 'infeasible_rate'):.2g} %" if found[0]["infeasible_rate"] else ""]
-            part += [f"{episodes}" + (f", {len(found)} seeds" if len(found) > 1 else "")]
-            out.append("| " + " | ".join(part) + " |")
+    return [r for r in rows if r["task"] == task and f"{r['algorithm']} {r['variant']}" == key]
+
+
+def touching(found: list[dict]) -> str:
+    """The share of episodes with contact, and its bound. Seeds share their resets, so the bound is of resets: those in
+    which any seed touched, at most."""
+    episodes = int(found[0]["episodes"])
+    touched = round(sum(float(r["violation_rate"]) for r in found) * episodes)
+    bound = upper_bound(min(touched, episodes), episodes)
+    return f"{100 * mean(found, 'violation_rate'):.3g} % (≤ {100 * bound:.3g} %)"
+
+
+def unmet(found: list[dict]) -> str:
+    return f"{100 * mean(found, 'infeasible_rate'):.2g} %" if found[0]["infeasible_rate"] else ""
+
+
+def tiers() -> str:
+    """A row per task of Crossing: the logs, a clone, and the clone under its shield."""
+    out = ["| tier | logs | certificates | BC | **BC, shield** | infeasible_rate | n_episodes |", "|---" * 7 + "|"]
+    for task in dict.fromkeys(r["task"] for r in stored.table(RESULTS / "crossing" / "table.csv")):
+        logs, expert, clone, guarded = (
+            of_crossing("crossing", task, key)
+            for key in ("behaviour data reference", "certificates reference", "bc default", f"bc default{SHIELDED}")
+        )
+        cells = [f"{mean(logs, 'return_mean'):.2f} / {100 * mean(logs, 'violation_rate'):.3g} %"]
+        cells += [f"{mean(found, 'return_mean'):.2f} / {touching(found)}" for found in (expert, clone, guarded)]
+        seeds = f", {len(guarded)} seeds" if len(guarded) > 1 else ""
+        cells += [unmet(guarded), f"{guarded[0]['episodes']}{seeds}"]
+        out.append(f"| `{task}` | " + " | ".join(cells) + " |")
+    return "\n".join(out)
+
+
+def crossing(suite: str, named: dict[str, str]) -> str:
+    """A row per variant of one task."""
+    head = ("method", "return", "steps with contact", "episodes with contact (bound)", "infeasible_rate")
+    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    for key, words in named.items():
+        if found := of_crossing(suite, "crossing-hasty", key):
+            part = [words, f"{mean(found, 'return_mean'):.2f}", f"{mean(found, 'cost_mean'):.3g}"]
+            out.append("| " + " | ".join([*part, touching(found), unmet(found)]) + " |")
+    return "\n".join(out)
+
+
+def proposals() -> str:
+    """A row per proposal on Crossing: alone and under a shield."""
+    out = ["| proposal | alone | under a shield |", "|---" * 3 + "|"]
+    for key, words in PROPOSALS.items():
+        both = [of_crossing("crossing-guards", "crossing-hasty", name) for name in (key, key + SHIELDED)]
+        cells = [f"{mean(found, 'return_mean'):.2f} / {touching(found)}" for found in both]
+        out.append(f"| {words} | " + " | ".join(cells) + " |")
     return "\n".join(out)
 
 

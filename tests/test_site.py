@@ -72,7 +72,7 @@ def test_every_task_has_a_page_with_its_results():
         assert f"({name}.md)" in pages["tasks/README.md"]
     pattern = r"^\| `bc` `default\+shield-learned`, 8 agents .*\| 5 \|$"
     (row,) = re.findall(pattern, pages["tasks/crossing-hasty.md"], re.M)
-    assert "| 0.0002 | 0.0002 | 0.02 % |" in row  # docs/crossing.md has the same row
+    assert "| 0.0002 | 0.0002 | 0.02 % |" in row  # docs/crossing-results.md has the same row
     for name in ringfence.__all__:
         assert f"`ringfence.{name}`" in pages["reference/README.md"]
 
