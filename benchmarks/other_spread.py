@@ -2,7 +2,7 @@
 rules than the data's; and logs recorded there, learned and guarded like anybody's own.
 
     pip install mpe2
-    python benchmarks/other_spread.py        # writes results/mpe2.csv and docs/evaluation.md's table; ten minutes
+    python benchmarks/other_spread.py        # writes results/mpe2.csv and docs/guard-results.md's table; ten minutes
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def main() -> None:
             result = ringfence.play(run, Spread, episodes=EPISODES, num_envs=100, **how)
             rows.append(row("bc, learned of logs recorded there", "mpe2", "mpe2", result))
     write(OUT, rows)
-    put("docs/evaluation.md", "mpe2", table(rows))
+    put("docs/guard-results.md", "mpe2", table(rows))
 
 
 def row(policy: str, logs: str, place: str, result: dict) -> dict:

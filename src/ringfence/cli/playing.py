@@ -56,7 +56,7 @@ class Playing:
     replan: int | None = None
     """steps for which a plan is followed."""
     set: Assignments = field(default_factory=list)
-    """any other option of planner or guard, e.g. --set correction_steps=20 value_guidance=10; docs/evaluation.md lists
+    """any other option of planner or guard, e.g. --set correction_steps=20 value_guidance=10; docs/options.md lists
     them."""
 
     def arguments(self) -> dict[str, Any]:

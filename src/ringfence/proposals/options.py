@@ -49,7 +49,7 @@ def plan_defaults(config) -> dict:
 
 DEFAULT = "default"
 
-# Named sets of evaluation-time choices, made on validation resets; docs/evaluation.md.
+# Named sets of evaluation-time choices, made on validation resets; docs/options.md.
 PLANNERS: dict[str, dict] = {
     DEFAULT: {},
     # Value steers the samples.
