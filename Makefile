@@ -5,7 +5,8 @@ BIN := $(VENV)/bin
 INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 # Pages whose prose is held to the limits of docs/tools/prose.py.
-PLAIN = commands gpu
+PLAIN = README index start choose commands errors data data-sets arrays import-tables import-tracks import-bags import-hdf5 import-public \
+	record extending export security ope replay replay-results gpu limits upgrade
 
 .PHONY: demo test versions docs lint clean
 

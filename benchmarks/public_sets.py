@@ -1,6 +1,6 @@
 """Public logs, each imported by one command: what comes of it.
 
-python benchmarks/public_sets.py FOLDER    # results/public_sets.csv and docs/data.md's table; half a minute
+python benchmarks/public_sets.py FOLDER    # results/public_sets.csv and docs/import-tracks.md's table; half a minute
 
 FOLDER holds clones of the repositories in SETS, each under its own name (OpenTraj, SynDrone-Swarm, ...). Sets that are
 not there keep the row that they had.
@@ -90,7 +90,7 @@ def main() -> None:
             print(*found[name].values(), flush=True)
     rows = [found[name] for name in SETS if name in found]
     write(OUT, rows)
-    put("docs/data.md", "public sets", table(rows))
+    put("docs/import-tracks.md", "public sets", table(rows))
 
 
 if __name__ == "__main__":

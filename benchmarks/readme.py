@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 
 import goal
@@ -95,6 +96,7 @@ PUBLISHED = {
 
 def main() -> None:
     put("README.md", "front", front())
+    put("docs/tables.md", "summary", summary())
     groups = grouped("simple_spread")
     put("docs/tables.md", "table", spread(groups))
     put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
@@ -120,8 +122,55 @@ def main() -> None:
     put("docs/performance.md", "performance", "\n".join(lines))
 
 
-# The README's rows: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
-FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
+def front() -> str:
+    """The README's few rows, in words that need no footnote."""
+    lines = ["| who acts | what is known of danger | episodes with a violation | return |", "|---|---|---|---|"]
+    for words, danger, violated, earned in (*_front_crossing(), *_front_proving(), _front_replay()):
+        lines.append(f"| {words} | {danger} | {violated} | {earned} |")
+    return "\n".join(lines)
+
+
+def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
+    rows = grouped("crossing")
+    for words, danger, variant in (
+        ("Eight discs cross a room: a clone of the logs", "–", "default"),
+        ("the same clone under a guard", "a logged cost column", "default+shield-learned"),
+    ):
+        found = rows["crossing-hasty", "bc", variant]
+        violated = f"{100 * mean(found, 'violation_rate'):.3g} % of {sum(int(r['episodes']) for r in found):,}"
+        yield words, danger, violated, f"{mean(found, 'return_mean'):.2f} m of progress"
+
+
+def _front_proving() -> Iterator[tuple[str, str, str, str]]:
+    """The mean over the systems; returns as shares of what the clone alone earns."""
+    systems = [json.loads(file.read_text())["rows"] for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
+    for words, danger, way in (
+        (f"{_counted(len(systems))} other systems: a clone of the logs", "–", "none"),
+        ("the same clones under a guard", "a logged cost column", "shield learned"),
+        ("the same clones under a guard", "the true formula and motion", "shield oracle"),
+    ):
+        rows = [rows[f"bc {way}"] for rows in systems]
+        violated = np.mean([row["violation_rate"] for row in rows])
+        earned = np.mean([row["return_mean"] / own["bc none"]["return_mean"] for row, own in zip(rows, systems)])
+        yield words, danger, f"{100 * violated:.2g} % in the mean", f"{100 * earned:.0f} % of the clone's"
+
+
+def _front_replay() -> tuple[str, str, str, str]:
+    """A recording of pedestrians, all its drivers together."""
+    rows = json.loads((RESULTS / "replay" / "zara02.json").read_text())["rows"]
+    contacts = {way: sum(r["contacts"] for r in rows if r["filter"] == way) for way in ("none", "shield")}
+    windows = sum(r["windows"] for r in rows if r["filter"] == "none")
+    alone, guarded = (100 * contacts[way] / windows for way in ("none", "shield"))
+    words = "Five drivers among filmed pedestrians, who walk as they did"
+    return words, "a cost made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
+
+
+def _counted(number: int) -> str:
+    return {16: "Sixteen"}.get(number, str(number))
+
+
+# Rows of the summary: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
+SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
     "BC": (("simple_spread", "bc", ""), ("mujoco", "bc", ""), ("crossing", "bc", "default")),
     "MA-TD3+BC with a Lagrange multiplier": (
         ("simple_spread", "ma-td3bc-lag", ""),
@@ -152,7 +201,7 @@ FRONT: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
 }
 
 
-def front() -> str:
+def summary() -> str:
     """One line per method: all tiers, all robots and Crossing in a cell each."""
     data = {s: grouped(s) for s in ("simple_spread", "guards", "crossing", "crossing-guards")}
     robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
@@ -160,7 +209,7 @@ def front() -> str:
     logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
     lines = ["| method | Simple Spread | robots | Crossing |", "|---|---|---|---|"]
     lines.append(f"| *the logs* | {_spread_cell(logs)} | | {_crossing_cell(logged)} |")
-    for words, places in FRONT.items():
+    for words, places in SUMMARY.items():
         cells = []
         for place, kind in zip(places, ("spread", "robots", "crossing")):
             if place is None:

@@ -3,9 +3,9 @@
 python benchmarks/replayed.py telemetry.csv --layout syndrone --radius 2 --name a-den    # results/replay/a-den.json
 python benchmarks/replayed.py fcd.xml --layout sumo --radius 2.5 --name town
 
-FILE is a table in one of the layouts of `ringfence data import-table`; docs/replay.md says where to get some. It is
-split by time: the first 70 % to learn by, the rest to replay. A step costs 1 where two centres come closer than the
-radius, and the World is told nothing but that column. Settings are the defaults.
+FILE is a table in one of the layouts of `ringfence data import-table`; docs/replay-results.md says where to get some.
+It is split by time: the first 70 % to learn by, the rest to replay. A step costs 1 where two centres come closer than
+the radius, and the World reads nothing but that column. Settings are the defaults.
 """
 
 from __future__ import annotations

@@ -13,6 +13,13 @@ from tests.quick import QUICK_WORLD
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"num_updates": 4, "width": 16}, "RUNS": 40, "EPISODES": 60, "PLAYED": 2}
+SMALL |= {
+    "PEOPLE": 60,
+    "REPLAY": {"drivers": (), "windows": 6, "baselines": False},
+    "CALIBRATION": 9,
+    "FRESH": 9,
+    "GUARD": {"correction_steps": 1, "horizon": 1},
+}
 SMALL["OPE"] = dict(states=100, transitions=400, updates=20, num_ensemble=2, rollout_episodes=8, rollout_steps=5)
 
 

@@ -4,6 +4,7 @@ committed results; the Python reference, from docstrings; the changelog and the 
 from __future__ import annotations
 
 import csv
+import json
 import os
 import re
 from collections import defaultdict
@@ -18,6 +19,11 @@ from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
+# In the order in which one reads them.
+NOTEBOOKS = [
+    ROOT / "examples" / f"{name}.ipynb"
+    for name in ("your_logs", "danger_without_a_formula", "replay_and_verdict", "certificate_under_delay")
+]
 
 # --- the Python reference: pages of modules that belong together ---
 REFERENCE = {
@@ -91,9 +97,10 @@ VALUES = ("ringfence.algos.", "ringfence.world.fit")
 # Of a simulator's tasks, in words; of another one the first line of its docstring.
 ABOUT: dict[type, str] = {
     SimpleSpread: "Agents cover landmarks without touching one another; physics and rewards of OMAR's data "
-    "([protocol](../evaluation.md#simple-spreads-two-integrators), [data](../data.md#simple-spread)).",
+    "([protocol](../evaluation.md#simple-spreads-two-integrators), [data](../data-sets.md#simple-spread)).",
     SafeMuJoCo: "Agents share the joints of one robot that must not run faster than a limit: safety-gymnasium's Safe "
-    "Multi-Agent MuJoCo ([simulator](../data.md#robots-the-simulator), [data](../data.md#halfcheetah-and-ant)).",
+    "Multi-Agent MuJoCo ([simulator](../data-sets.md#robots-the-simulator), "
+    "[data](../data-sets.md#halfcheetah-and-ant)).",
     Crossing: "Discs with momentum find their way through one another, any number of them; each sees and decides for "
     "itself ([Crossing](../crossing.md)).",
     System: "A system of the proving ground: small, and of a kind that the library was not made for. Costs alone "
@@ -126,11 +133,18 @@ OUTSIDE = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md",
 def on_config(config):
     """The navigation's sections that are made here."""
     nav = {title: pages for entry in config["nav"] for title, pages in entry.items()}
-    nav["Tasks"] += ["tasks/README.md"]
-    nav["Tasks"] += [{group: [f"tasks/{t.name}.md" for t in found]} for group, found in groups().items()]
-    nav["Reference"] += ["reference/README.md", *({title: _place(title)} for title in REFERENCE)]
-    nav["About"] += [{"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}, {"Results": "results.md"}]
+    nav["Tutorials"] += [f"tutorials/{file.stem}.md" for file in NOTEBOOKS]
+    tasks = [{group: [f"tasks/{t.name}.md" for t in found]} for group, found in groups().items()]
+    nav["Reference"] += [{"Tasks": ["tasks/README.md", *tasks]}]
+    nav["Reference"] += [{"Python": ["reference/README.md", *({title: _place(title)} for title in REFERENCE)]}]
+    nav["Reference"] += [{"Changelog": "changelog.md"}, {"Contributing": "contributing.md"}]
+    nav["Reference"] += [{"Results folders": "results.md"}]
     return config
+
+
+def on_page_markdown(markdown, page, config, files):
+    """On the site a notebook is a page."""
+    return re.sub(r"\]\(\.\./examples/(\w+)\.ipynb\)", r"](tutorials/\1.md)", markdown)
 
 
 def on_files(files, config):
@@ -147,7 +161,26 @@ def pages() -> dict[str, str]:
     made = {"tasks/README.md": _tasks(), "reference/README.md": _names()}
     made |= {f"tasks/{task.name}.md": task_page(task) for task in TASKS.values()}
     made |= {_place(title): _modules(title, modules) for title, modules in REFERENCE.items()}
+    made |= {f"tutorials/{file.stem}.md": notebook(file) for file in NOTEBOOKS}
     return made | {place: from_root(ROOT / file) for file, place in OUTSIDE.items()}
+
+
+def notebook(file: Path) -> str:
+    """A notebook as a page: its words, its code, and what that printed and drew when it was run."""
+    parts = []
+    for cell in json.loads(file.read_text())["cells"]:
+        source = "".join(cell["source"])
+        if cell["cell_type"] == "markdown":
+            parts.append(source.replace("](../docs/", "](../"))
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for output in cell["outputs"]:
+            if "text" in output:
+                parts.append(f"```text\n{''.join(output['text']).rstrip()}\n```")
+            if "image/png" in output.get("data", ()):
+                parts.append(f"![](data:image/png;base64,{''.join(output['data']['image/png']).strip()})")
+    parts.append(f"*This page is `examples/{file.name}`, to be run in a clone.*")
+    return "\n\n".join(parts) + "\n"
 
 
 def from_root(file: Path) -> str:

@@ -25,7 +25,7 @@ NUMBERS = 3  # of a paragraph
 # The project's own words, and the field's or plain English for them.
 OURS = {
     r"told": "given, said, reported; or the thing itself",
-    r"strange\w*": "out of distribution",
+    r"strange(?:ness|ly)?": "out of distribution",
     r"sights?": "observation, sensing radius, decentralized",
     r"alike": "homogeneous, equal",
     r"hears?|heard": "observe, receive",
