@@ -1,13 +1,17 @@
-"""Does a certificate keep what it promises? Calibrate and test many times, and count how often fresh episodes violate
+"""Does a certificate keep what it promises? Calibrate and test many times, and count how often other episodes violate
 no more than it allows.
 
-python benchmarks/certificates.py play --jobs 16       # plays each setting under a few margins, a file each, resumable
+python benchmarks/certificates.py play --batches 2     # plays each setting, a file for each batch, resumable
 python benchmarks/certificates.py judge                # writes results/stress/certificates.csv and .json from these
+python benchmarks/certificates.py picture              # docs/images/certificate.png, of certificates.csv
+python benchmarks/certificates.py table                # writes the table of docs/stress.md
 
-Episodes of a margin are played once, so margins are those of a grid: a calibration takes the least of them that is no
-less than its quantile. A repetition draws its calibration and its test
-episodes from what was played, none twice; its bound is compared with all episodes of its margin that it was not tested
-on.
+Margins are those of a grid: a calibration takes the least of them that is no less than its quantile. A larger one is
+played where a batch's quantile asks for it. The episodes of a setting are one pool. A repetition draws its
+calibration and its test episodes from it, none twice, and compares its bound with the rest of the pool. So
+repetitions share their episodes; `disjoint` ones, of consecutive episodes, share none.
+
+Two minutes for a batch of 600 episodes, on one core that has nothing else to do.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -27,25 +32,30 @@ import numpy as np
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "results" / "stress" / "certificates"
 OUT = ROOT / "results" / "stress" / "certificates.csv"
+PICTURE = ROOT / "docs" / "images" / "certificate.png"
 RUN = "crossing-hasty/bc"
 MARGINS = (1.0, 1.5, 2.0, 3.0)
 SETTINGS: dict[str, dict[str, Any]] = {
     "none": {},
-    "delay1": {"delay": 1},
     "delay2": {"delay": 2},
-    "drop0.3": {"drop": 0.3},
-    "asynchrony0.5": {"asynchrony": 0.5},
-    "gain0.8+noise0.005": {"gain": 0.8, "noise": 0.005},
+    "asynchrony0.667": {"asynchrony": 0.667},
+    "all": {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5},
+    "delay3": {"delay": 3},
+    "drop0.6": {"drop": 0.6},
 }
-CALIBRATION, TESTED, QUANTILE, CONFIDENCE = 100, 300, 0.95, 0.95  # of a repetition; the rest of the episodes are fresh
+CALIBRATION, TESTED, QUANTILE, CONFIDENCE = 100, 300, 0.95, 0.95  # of a repetition
+BATCH = 600  # episodes
+FIRST = 10  # batch of resets; `certify` and `eval` play those before
+
+Pool = dict[str, np.ndarray]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("play", "judge"))
+    parser.add_argument("what", choices=("play", "judge", "picture", "table"))
     parser.add_argument("--settings", nargs="*", choices=list(SETTINGS), default=list(SETTINGS))
-    parser.add_argument("--margins", nargs="*", type=float, default=list(MARGINS))
-    parser.add_argument("--episodes", type=int, default=700)
+    parser.add_argument("--batches", type=int, default=2)
+    parser.add_argument("--episodes", type=int, default=BATCH, help="of a batch")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--repetitions", type=int, default=20)
     parser.add_argument("--folder", type=Path, default=FOLDER)
@@ -53,29 +63,53 @@ def main() -> None:
     a = parser.parse_args()
     if a.what == "judge":
         judge(a.folder, a.out, a.repetitions)
-        return
-    waiting = [(s, m) for m in a.margins for s in a.settings if not file_of(a.folder, s, m).exists()]
-    if a.jobs == 1:
-        for setting, margin in waiting:
-            play(setting, margin, a.episodes, a.folder)
-        return
+    elif a.what == "picture":
+        picture(a.out, PICTURE)
+    elif a.what == "table":
+        write_table(a.out)
+    elif a.jobs > 1:
+        side_by_side(a)
+    else:
+        for batch in range(a.batches):
+            for setting in a.settings:
+                play_batch(setting, batch, a.episodes, a.folder)
+
+
+def side_by_side(a: argparse.Namespace) -> None:
+    """Every setting in a process with one core."""
     one_core = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "NPROC": "1", "OPENBLAS_NUM_THREADS": "1"}
-    command = [sys.executable, __file__, "play", "--episodes", str(a.episodes), "--folder", str(a.folder)]
+    same = ["--batches", str(a.batches), "--episodes", str(a.episodes), "--folder", str(a.folder)]
+    waiting = list(a.settings)
     running: list[subprocess.Popen] = []
     while waiting or running:
         while waiting and len(running) < a.jobs:
-            setting, margin = waiting.pop(0)
-            one = [*command, "--settings", setting, "--margins", str(margin)]
+            one = [sys.executable, __file__, "play", *same, "--settings", waiting.pop(0)]
             running.append(subprocess.Popen(one, env={**os.environ, **one_core}))
         running.pop(0).wait()
 
 
-def file_of(folder: Path, setting: str, margin: float) -> Path:
-    return folder / f"{setting}-margin{margin:g}.json"
+def file_of(folder: Path, setting: str, margin: float, batch: int) -> Path:
+    return folder / f"{setting}-margin{margin:g}-{batch}.json"
 
 
-def play(setting: str, margin: float, episodes: int, folder: Path) -> None:
-    """The shortfall of foresight and the cost of each episode, behind the setting's faults."""
+def play_batch(setting: str, batch: int, episodes: int, folder: Path) -> None:
+    """A batch under every margin up to the first that its own quantile does not exceed."""
+    from ringfence.evaluation.certify import conformal
+
+    for margin in MARGINS:
+        file = file_of(folder, setting, margin, batch)
+        if not file.exists():
+            folder.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(played(setting, margin, batch, episodes)) + "\n")
+        found = json.loads(file.read_text())
+        quantile = conformal(np.array(found["shortfall"]), QUANTILE)
+        print(file.name, found["return"], np.mean(found["violated"]), round(quantile, 3), flush=True)
+        if quantile <= margin:
+            return
+
+
+def played(setting: str, margin: float, batch: int, episodes: int) -> dict[str, Any]:
+    """The shortfall of foresight of each episode behind the setting's faults, and whether it violated."""
     from ringfence.deploy import zoo
     from ringfence.evaluation.certify import shortfalls
     from ringfence.evaluation.rollout import rollout
@@ -83,7 +117,9 @@ def play(setting: str, margin: float, episodes: int, folder: Path) -> None:
     from ringfence.faults import Faults, under_faults
     from ringfence.loading.resolve import resolve
     from ringfence.loading.spec import PolicySpec
+    from ringfence.utils.compilation import keep_programs
 
+    keep_programs()
     faults = Faults.of(SETTINGS[setting])
     with tempfile.TemporaryDirectory() as runs:
         run = zoo.pretrained(RUN, runs)
@@ -91,73 +127,165 @@ def play(setting: str, margin: float, episodes: int, folder: Path) -> None:
         resolved = resolve(PolicySpec.of(run, **options))
         task = resolved.job.task
         policy = under_faults(resolved.team, faults, task)
-        played = rollout(policy, task.simulator, episodes, "test", 0, 0, setting, True, 3, foreseen=True)
-        found = {
+        found = rollout(policy, task.simulator, episodes, "test", 0, 0, setting, True, FIRST + batch, foreseen=True)
+        return {
             "setting": setting,
             "margin": margin,
-            "shortfall": [round(float(x), 4) for x in shortfalls(resolved, played)],
-            "violated": [bool(x) for x in played["costs"].sum(1) > 0],
-            "return": round(float(played["rewards"].sum(1).mean()), 3),
+            "shortfall": [round(float(x), 4) for x in shortfalls(resolved, found)],
+            "violated": [int(x) for x in found["costs"].sum(1) > 0],
+            "return": round(float(found["rewards"].sum(1).mean()), 3),
         }
-    folder.mkdir(parents=True, exist_ok=True)
-    file_of(folder, setting, margin).write_text(json.dumps(found) + "\n")
-    print(setting, margin, found["return"], np.mean(found["violated"]), flush=True)
+
+
+def pools_of(folder: Path, setting: str) -> dict[float, Pool]:
+    """What was played of a setting, all batches of a margin as one."""
+    found: dict[float, Pool] = {}
+    for margin in MARGINS:
+        files = sorted(folder.glob(f"{setting}-margin{margin:g}-*.json"))
+        if files:
+            stored = [json.loads(file.read_text()) for file in files]
+            found[margin] = {
+                "shortfall": np.concatenate([one["shortfall"] for one in stored]),
+                "violated": np.concatenate([one["violated"] for one in stored]).astype(bool),
+            }
+    return found
 
 
 def judge(folder: Path, out: Path, repetitions: int) -> None:
     """A row for each repetition of each setting, and how many of them were kept."""
     rows: list[dict[str, Any]] = []
     for setting in SETTINGS:
-        played = {m: file_of(folder, setting, m) for m in MARGINS}
-        pools = {m: json.loads(file.read_text()) for m, file in played.items() if file.exists()}
-        if min(MARGINS) in pools:
-            rows += [repetition(setting, pools, np.random.default_rng(k)) for k in range(repetitions)]
+        pools = pools_of(folder, setting)
+        if not pools:
+            continue
+        whole = len(next(iter(pools.values()))["violated"])
+        for k in range(repetitions):
+            orders = {m: np.random.default_rng(k).permutation(len(pool["violated"])) for m, pool in pools.items()}
+            rows.append({"setting": setting, "disjoint": False, **repetition(pools, orders)})
+        for k in range(whole // (CALIBRATION + TESTED)):
+            first = k * (CALIBRATION + TESTED)
+            orders = {m: np.roll(np.arange(len(pool["violated"])), -first) for m, pool in pools.items()}
+            rows.append({"setting": setting, "disjoint": True, **repetition(pools, orders)})
     if not rows:
         raise SystemExit(f"{folder} holds nothing that was played; run this with `play` first.")
     _rows.write(out, rows)
-    kept = float(np.mean([row["kept"] for row in rows]))
-    told = float(np.mean([not row["vacuous"] for row in rows]))
-    summary = {"repetitions": len(rows), "kept": kept, "not_vacuous": told, "confidence": CONFIDENCE}
+    summary = {"confidence": CONFIDENCE, "drawn": shares(rows, False), "disjoint": shares(rows, True)}
     out.with_suffix(".json").write_text(json.dumps(summary, indent=1) + "\n")
-    print(summary)
+    print(json.dumps(summary, indent=1))
 
 
-def repetition(setting: str, pools: dict[float, dict[str, Any]], rng: np.random.Generator) -> dict[str, Any]:
-    """Calibrated on some episodes, tested on others, and compared with the rest."""
+def shares(rows: list[dict[str, Any]], disjoint: bool) -> dict[str, Any]:
+    """How many repetitions there are, and the shares of them that are kept, and not vacuous."""
+    kind = [row for row in rows if row["disjoint"] == disjoint]
+    if not kind:
+        return {"repetitions": 0}
+    return {
+        "repetitions": len(kind),
+        "kept": round(float(np.mean([row["kept"] for row in kind])), 4),
+        "not_vacuous": round(float(np.mean([not row["vacuous"] for row in kind])), 4),
+        "settings": len({row["setting"] for row in kind}),
+    }
+
+
+def repetition(pools: dict[float, Pool], orders: dict[float, np.ndarray]) -> dict[str, Any]:
+    """Calibrated on the first episodes of an order, tested on the next, and compared with the rest."""
     from ringfence.evaluation.certify import conformal
     from ringfence.evaluation.statistics import upper_bound
 
     margins = sorted(pools)
-    margin, agreed, batches, used = margins[0], False, 0, {m: 0 for m in margins}
-    orders = {m: rng.permutation(len(pools[m]["violated"])) for m in margins}
-    while not agreed and batches < 4:
+    margin, agreed, batches, used = margins[0], False, 0, dict.fromkeys(margins, 0)
+    while not agreed and batches < 4 and used[margin] + CALIBRATION + TESTED <= len(orders[margin]):
         batch = orders[margin][used[margin] : used[margin] + CALIBRATION]
         used[margin] += CALIBRATION
         batches += 1
-        quantile = conformal(np.array(pools[margin]["shortfall"])[batch], QUANTILE)
+        quantile = conformal(pools[margin]["shortfall"][batch], QUANTILE)
         agreed = quantile <= margin
         larger = [m for m in margins if m >= quantile and m > margin]
         if agreed or not (larger or margin < margins[-1]):
             break
         margin = larger[0] if larger else margins[-1]
-    left = orders[margin][used[margin] :]
-    violated = np.array(pools[margin]["violated"])
-    tested = violated[left[:TESTED]]
-    fresh = violated[np.setdiff1d(np.arange(len(violated)), left[:TESTED])]
-    bound = upper_bound(int(tested.sum()), len(tested), CONFIDENCE)
-    rate = float(fresh.mean())
+    order = orders[margin]
+    tested = order[used[margin] : used[margin] + TESTED]
+    violated = pools[margin]["violated"]
+    others = violated[np.setdiff1d(order, tested)]
+    bound = upper_bound(int(violated[tested].sum()), len(tested), CONFIDENCE)
+    rate = float(others.mean())
     return {
-        "setting": setting,
         "margin": margin,
         "calibrated": batches * CALIBRATION,
         "agreed": agreed,
         "bound": round(bound, 4),
         "tested": len(tested),
-        "fresh": len(fresh),
-        "fresh_rate": round(rate, 4),
+        "others": len(others),
+        "others_rate": round(rate, 4),
+        "pool_rate": round(float(violated.mean()), 4),
         "kept": rate <= bound,
         "vacuous": bound > 3 * rate + 0.01,
     }
+
+
+def by_setting(out: Path) -> dict[str, list[dict[str, str]]]:
+    """Rows of the repetitions that were drawn."""
+    found: dict[str, list[dict[str, str]]] = defaultdict(list)
+    for row in _rows.read(out):
+        if row["disjoint"] == "False":
+            found[row["setting"]].append(row)
+    return found
+
+
+def in_words(setting: str) -> str:
+    """A setting as its faults, e.g. `delay 2`."""
+    return ", ".join(f"{name} {value}" for name, value in SETTINGS[setting].items()) or "none"
+
+
+def picture(out: Path, file: Path) -> None:
+    """What certificates allow beside what all episodes of their setting did."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    found = by_setting(out)
+    figure, axis = plt.subplots(figsize=(7.2, 0.55 * len(found) + 1.6), layout="constrained")
+    for y, rows in enumerate(found.values()):
+        bounds = 100 * np.array([float(row["bound"]) for row in rows])
+        rate = 100 * float(rows[0]["pool_rate"])
+        spread = y + 0.22 * np.linspace(-1, 1, len(bounds))
+        axis.barh(y, rate, height=0.62, color="#f2b8a0", label="violated, of all episodes" if y == 0 else None)
+        axis.scatter(bounds, spread, s=18, color="#1f5fa8", zorder=3, label="allowed, a certificate each" * (y == 0))
+    axis.set_yticks(range(len(found)), [in_words(setting).replace(", noise", ",\nnoise") for setting in found])
+    axis.invert_yaxis()
+    axis.set_xlim(left=0)
+    axis.set_xlabel("episodes with a violation, %")
+    axis.legend(loc="lower right", frameon=False)
+    axis.spines[["top", "right"]].set_visible(False)
+    file.parent.mkdir(exist_ok=True)
+    figure.savefig(file, dpi=110)
+    print(file)
+
+
+def write_table(out: Path) -> None:
+    """The table of docs/stress.md between its markers."""
+    from readme import put
+
+    head = "faults | margin | episodes of the setting | violated | bounds | kept | not vacuous"
+    lines = [f"| {head} |", "|---" * 7 + "|"]
+    for setting, rows in by_setting(out).items():
+        bounds = [100 * float(row["bound"]) for row in rows]
+        margins = sorted({float(row["margin"]) for row in rows})
+        kept = sum(row["kept"] == "True" for row in rows)
+        told = sum(row["vacuous"] == "False" for row in rows)
+        cells = [
+            in_words(setting),
+            " to ".join(dict.fromkeys(f"{m:g}" for m in (margins[0], margins[-1]))),
+            str(int(rows[0]["tested"]) + int(rows[0]["others"])),
+            f"{100 * float(rows[0]['pool_rate']):.1f} %",
+            " to ".join(dict.fromkeys(f"{b:.1f}" for b in (min(bounds), max(bounds)))) + " %",
+            f"{kept} of {len(rows)}",
+            f"{told} of {len(rows)}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    put("docs/stress.md", "certificates", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """The grid: cells are made once, survive whatever happens to the runner, and make one honest table."""
 
+import csv
 import dataclasses
 import io
 import json
@@ -29,9 +30,12 @@ from ringfence.bench import (
     paper,
     rows,
     run_local,
+    stressed,
     suites,
     write_csv,
 )
+from ringfence.bench.stressed import Trial
+from ringfence.bench.worker import decode, encode
 from ringfence.cli.app import _runs, main
 from ringfence.datasets import registry
 from ringfence.errors import UserError
@@ -231,6 +235,44 @@ def test_table(made):
     assert len(ours) == 4 and all((made.out / r["run"] / "config.json").exists() for r in ours)
     lines = write_csv(made.out).read_text().splitlines()
     assert len(lines) == 1 + len(found)
+
+
+def test_a_grid_is_played_behind_faults(made, tmp_path, capsys):
+    """Like every evaluation: once, resumed, in a table of its own; a certificate says where it is kept."""
+    out = shutil.copytree(made.out, tmp_path / "stressed")
+    grid.write_json(out / "bench.json", grid.about("stress", made.episodes))
+    trials = (Trial("default", "delay1"), Trial("default", "drop0.3+noise0.02"))
+    cell = dataclasses.replace(made.cells[0], trials=trials)
+    assert decode(json.loads(json.dumps(encode(cell)))) == cell and cell.id == made.cells[0].id
+    assert cell.state(out, made.episodes) == "to do" and cell.missing_trials(out, made.episodes) == [*trials]
+    grid.run_group([cell], out, made.episodes, lambda event, cell: None)
+    assert cell.state(out, made.episodes) == "done" and cell.state(out, made.episodes + 1) == "to do"
+    file = cell.folder(out) / "stress.json"
+    before = file.read_bytes()
+    grid.run_group([cell], out, made.episodes, lambda event, cell: None)
+    assert file.read_bytes() == before
+    main(["bench", "results", str(out)])
+    assert "stress.csv" in capsys.readouterr().out
+    table = list(csv.DictReader((out / "stress.csv").open()))
+    assert [(r["faults"], r["compensated"], r["guard"]) for r in table] == [
+        ("delay1", "False", "none"),
+        ("drop0.3+noise0.02", "False", "none"),
+    ]
+    assert stressed.write_csv(made.out) is None, "of another suite"
+    promise = SimpleNamespace(policy="p", world="w", agents=3, barrier="learned", guard={"margin": 1.0}, bound=0.02)
+    promise.faults = {"delay": 1}
+    played = {"digests": {"policy": "p", "world": "w"}, "agents": 3, "barrier": "learned", "violation_rate": 0.01}
+    played |= {"guard_options": {"margin": 1.0}, "faults": {"delay": 1}}
+    assert stressed.covers(promise, played) == "promised"
+    assert stressed.covers(promise, {**played, "faults": {"delay": 2}}) == "kept"
+    assert stressed.covers(promise, {**played, "faults": {"delay": 3}, "violation_rate": 0.03}) == "broken"
+    for other in ({"agents": 4}, {"guard_options": {"margin": 1.5}}, {"digests": {}}):
+        assert stressed.covers(promise, {**played, **other}) == ""
+    with pytest.raises(UserError, match="is of no guard that was played"):
+        stressed.rows(out, promise)
+    with pytest.raises(SystemExit):
+        main(["bench", "crossing", "--certificate", "cert.json"])
+    assert "read by the suite stress alone" in " ".join(capsys.readouterr().err.split())
 
 
 def test_mixed_protocols_are_refused(made, tmp_path):

@@ -322,6 +322,10 @@ def test_the_command_line_stresses(run, capsys):
     assert all(words in shown for words in ("delay 2", "gain 0.8", "asynchrony 0.5"))
     (name,) = [name for name in json.loads((run.path / "stress.json").read_text()) if "gain" in name]
     assert name == "default behind delay2+gain0.8+asynchrony0.5"
+    assert Faults.parse(name.split()[-1]) == Faults(delay=2, gain=0.8, asynchrony=0.5)
+    assert Faults.parse("none") == Faults() and Faults.parse("noise1e-05") == Faults(noise=1e-5)
+    with pytest.raises(UserError, match="'dealy2' in 'drop0.3.dealy2' is no fault"):
+        Faults.parse("drop0.3+dealy2")
     for wrong, words in (
         (["--compensate"], "compensate is read by nothing without a guard"),
         (["--delay", "100"], "delay=100 steps is no less than an episode"),

@@ -12,6 +12,7 @@ import dataclasses
 import functools
 import hashlib
 import inspect
+import itertools
 import json
 import logging
 import shutil
@@ -24,6 +25,7 @@ from typing import Any
 
 from ringfence import algos
 from ringfence.bench.packed import unpack
+from ringfence.bench.stressed import Trial
 from ringfence.bench.suites import COLLECTIONS, SUITES
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
@@ -66,6 +68,7 @@ class Cell:
     changes: tuple[tuple[str, float], ...] = ()  # to the preset, e.g. (("num_updates", 100),)
     evaluations: tuple[tuple[str, str], ...] = ()  # (variant in results.json, name of its PolicySpec)
     transitions: int | None = None  # of the data set; None: the task's own number
+    trials: tuple[tuple[str, str, bool], ...] = ()  # how it is played behind faults, each a Trial
 
     @property
     def group(self) -> tuple:
@@ -117,9 +120,27 @@ class Cell:
 
         return [e for e in self.evaluations if not there(*e)]
 
+    def missing_trials(self, out: Path, episodes: int) -> list[Trial]:
+        """Evaluations behind faults that the folder does not hold yet."""
+        run = Run(self.folder(out))
+        task = registry.get(self.task)
+        config = dataclasses.asdict(self.config)
+
+        def there(trial: Trial) -> bool:
+            found = trial.result(run, episodes)
+            if found is None or not protocol.of_last_step(found, config):
+                return False
+            return same_options(found, PolicySpec.parse(trial.spec), task, plan_defaults(self.config))
+
+        return [trial for trial in itertools.starmap(Trial, self.trials) if not there(trial)]
+
+    def unfinished(self, out: Path, episodes: int) -> bool:
+        """Whether something of it is to be made."""
+        return bool(self.missing(out, episodes) or self.missing_trials(out, episodes))
+
     def state(self, out: Path, episodes: int) -> str:
         """done, failed or to do."""
-        if not self.missing(out, episodes):
+        if not self.unfinished(out, episodes):
             return "done"
         return "failed" if self.status(out).get("state") == "failed" else "to do"
 
@@ -188,7 +209,7 @@ class Grid:
         """Unfinished cells by group, in the grid's order; failed ones are tried again."""
         left: dict[tuple, list[Cell]] = {}
         for cell in self.cells:
-            if cell.missing(self.out, self.episodes):
+            if cell.unfinished(self.out, self.episodes):
                 left.setdefault(cell.group, []).append(cell)
         return list(left.values())
 
@@ -309,7 +330,8 @@ def make_grid(
                 continue
             played = tuple((e.variant(task, v), v) for v in e.evaluations)
             preset = e.preset_for(task)
-            cells += [Cell(name, e.algorithm, preset, k, changes, played, transitions) for k in range(seeds)]
+            whose = (changes, played, transitions, e.trials)
+            cells += [Cell(name, e.algorithm, preset, k, *whose) for k in range(seeds)]
     if not cells:
         raise UserError(
             f"The suite {suite} plays {', '.join(sorted(only))} on none of {', '.join(names)}; choose other tasks or "
@@ -411,6 +433,8 @@ class _Group:
             # A benchmark measures what an unfit World is worth, too.
             spec = replace(PolicySpec.parse(name, run), anyway=True)
             evaluate_spec(spec, episodes=self.episodes, num_recorded=num_recorded)
+        for trial in cell.missing_trials(self.out, self.episodes):
+            trial.play(run, self.episodes)
         played = time.perf_counter() - self.begun - trained
         _record(cell, self.out, "done", self._took(cell, trained, played))
         self.tell("done", self.left.pop(0))

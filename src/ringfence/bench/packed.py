@@ -23,7 +23,7 @@ from ringfence.utils.files import regular, whole, within
 
 PLACES = ("cells", "reference")
 ARCHIVES = {
-    "runs.tar.xz": ("config.json", "env.json", "status.json", "results.json", "reference.json"),
+    "runs.tar.xz": ("config.json", "env.json", "status.json", "results.json", "stress.json", "reference.json"),
     "curves.tar.xz": ("metrics.jsonl",),
 }
 LARGEST = 2**29  # bytes of an archive, unpacked

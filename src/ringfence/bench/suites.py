@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ringfence import algos
+from ringfence.bench.stressed import Trial
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.envs.proving.suite import TEST
@@ -20,6 +21,7 @@ class Entry:
     preset: str = ""  # empty: the one made for the task where there is one, else the default
     evaluations: tuple[str, ...] = (DEFAULT,)  # how its runs are played, as names of PolicySpec
     tiers: tuple[str, ...] = ()  # empty: all
+    trials: tuple[Trial, ...] = ()  # how its runs are played behind faults
 
     def plays(self, tier: str) -> bool:
         """Whether it is played on tasks of this tier."""
@@ -48,6 +50,7 @@ class Suite:
     tasks: tuple[str, ...]
     entries: tuple[Entry, ...]
     episodes: int = 200  # per run, by default
+    folder: str = ""  # of its results; empty: its name
 
 
 _TIERS = ("hasty", "mixed", "careful", "random")
@@ -57,10 +60,26 @@ _SPREAD = tuple(f"simple_spread-{tier}" for tier in ("expert", "medium", "medium
 _ROBOTS = tuple(t.name for protocol in ("native", "quantile") for t in TASKS.values() if t.protocol == protocol)
 
 # How a proposal is played for its own sake, and under the cheapest guard.
+_STRESSED = tuple(f"proving-{name}" for name in ("discs", "crowd", "drones"))
 _ALONE, _ADAPTED = (DEFAULT, "shield-learned"), (DEFAULT, "adapt-learned")
 _COOL = "low_temperature"
 _ICBF_GUARDS = ("adapt-learned", "adapt-analytic", "full-learned")
 _PROVEN = (DEFAULT, *(f"{guard}-{source}" for source in ("learned", "oracle") for guard in ("shield", "adapt", "full")))
+# Faults at three strengths, and several at once; what a guard can know of is compensated, too.
+_FAULTS = (
+    *("delay1", "delay2", "delay3", "jitter1", "jitter2", "jitter3", "drop0.1", "drop0.3", "drop0.6"),
+    *("asynchrony0.333", "asynchrony0.5", "asynchrony0.667"),
+    *("noise0.005", "noise0.02", "noise0.05", "bias0.005", "bias0.02", "bias0.05"),
+    *("gain0.9", "gain0.8", "gain0.6", "spread0.1", "spread0.2", "spread0.4", "stop0.001", "stop0.002", "stop0.005"),
+    "delay1+drop0.1+noise0.005+gain0.9+asynchrony0.333",
+    "delay2+drop0.3+noise0.005+gain0.8+asynchrony0.5",
+    "delay3+drop0.6+noise0.02+gain0.6+asynchrony0.667",
+)
+_KNOWN = ("delay", "jitter", "drop", "asynchrony")
+_BEHIND = (
+    *(Trial(spec, faults) for spec in _ALONE for faults in _FAULTS),
+    *(Trial("shield-learned", faults, compensated=True) for faults in _FAULTS if faults.startswith(_KNOWN)),
+)
 _RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 
 SUITES = {
@@ -180,6 +199,12 @@ SUITES = {
         tuple(f"proving-{name}" for name in TEST),
         (Entry("bc", evaluations=_PROVEN), Entry("naive", evaluations=_PROVEN)),
         episodes=500,
+    ),
+    # Late, lost and noisy: no guard, one that does not know, and one that does.
+    "stress": Suite(
+        ("crossing-hasty", "simple_spread-expert", "halfcheetah_2x3-medium", *_STRESSED),
+        (Entry("bc", evaluations=_ALONE, trials=_BEHIND),),
+        folder="stress-suite",  # results/stress holds other trials
     ),
     # Every agent guards its own action by its own view, and hears of nobody.
     "own-sight": Suite(

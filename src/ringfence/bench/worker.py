@@ -25,7 +25,7 @@ def encode(cell: Cell) -> dict[str, Any]:
 def decode(message: dict[str, Any]) -> Cell:
     from ringfence.bench.cells import Cell
 
-    pairs = {name: tuple(tuple(pair) for pair in message[name]) for name in ("changes", "evaluations")}
+    pairs = {name: tuple(tuple(pair) for pair in message[name]) for name in ("changes", "evaluations", "trials")}
     return Cell(**{**message, **pairs})
 
 

@@ -12,11 +12,12 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from ringfence.cli.console import complain
-from ringfence.errors import UserError
+from ringfence.errors import UserError, unknown
 from ringfence.utils.escape import terminal
 
 if TYPE_CHECKING:
     from ringfence.bench import Grid
+    from ringfence.faults.certificate import Certificate
 
 out = Console(highlight=False)
 Positional = tyro.conf.Positional
@@ -37,6 +38,7 @@ def bench(
     threads: int = 1,
     memory: float | None = None,
     address: str | None = None,
+    certificate: Path | None = None,
 ) -> None:
     """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
 
@@ -46,10 +48,11 @@ def bench(
     Args:
         suite: simple_spread, mujoco, or paper: the paper's 13 tasks and three methods, from those two suites. Under
             guard: guards, guards-mujoco, crossing, crossing-guards, all four of them as attribution; own-sight,
-            own-sight-mujoco, crossing-teams, spread-teams, proving-ground.
+            own-sight-mujoco, crossing-teams, spread-teams, proving-ground. Behind faults: stress.
         seeds: per algorithm and task.
         episodes: test episodes per run; the suite's number by default.
-        out_dir: folder of results, results/SUITE by default; of paper and attribution, the folder that holds theirs.
+        out_dir: folder of results, results/SUITE by default, of stress results/stress-suite; of paper and
+            attribution, the folder that holds theirs.
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.
         num_updates: of every algorithm, for a quick trial.
@@ -58,6 +61,7 @@ def bench(
         threads: per worker; cores that Ray sets aside per task.
         memory: GiB that a local process may hold before it is stopped.
         address: of the Ray cluster, e.g. auto; without it a local one is started.
+        certificate: of a run of the suite stress, whose table then says behind which faults it is kept.
     """
     from ringfence.bench import pack
 
@@ -65,6 +69,8 @@ def bench(
         raise UserError(
             f"--num-updates {num_updates} makes other rows than the suite's own; give a folder of their own with --out."
         )
+    if certificate is not None:
+        _load_certificate(certificate, suite)
     sizes = {"seeds": seeds, "episodes": episodes, "num_updates": num_updates}
     root, grids = _grids(suite, out_dir, sum(tasks, []), sum(algorithms, []), sizes)
     for grid in grids:  # what is wrong with the last one is said before the first begins
@@ -77,7 +83,7 @@ def bench(
             counts = _run_grid(grid, engine, workers, threads, memory, address)
         finally:
             pack(grid.out)
-        whole = _say_made(grid, counts, ranked=suite != "paper")
+        whole = _say_made(grid, counts, suite != "paper", certificate)
         complete = complete and whole
     if suite == "paper":
         paper_table(root)
@@ -93,22 +99,33 @@ def _grids(
     suite: str, out_dir: Path | None, only_tasks: list[str], only: list[str], sizes: dict[str, Any]
 ) -> tuple[Path, list[Grid]]:
     """(folder that holds the results, the grids of a suite or of a collection of them)."""
-    from ringfence.bench import COLLECTIONS, collected, make_grid, make_grids, paper
+    from ringfence.bench import COLLECTIONS, SUITES, collected, make_grid, make_grids, paper
 
     root = out_dir or Path("results")
     if suite == "paper":
         return root, paper.grids(root, only_tasks, only, **sizes)
     if suite in COLLECTIONS:
         return root, make_grids(collected(suite, only_tasks), root, only, **sizes)
-    root = out_dir or root / suite
+    if suite not in SUITES:
+        raise unknown("suite", suite, SUITES)
+    root = out_dir or root / (SUITES[suite].folder or suite)
     return root, [make_grid(suite, root, only_tasks=only_tasks, only=only, **sizes)]
 
 
-def _say_made(grid: Grid, counts: dict[str, int], ranked: bool) -> bool:
+def _load_certificate(file: Path, suite: str) -> Certificate:
+    """What is read by the suite that plays behind faults alone."""
+    from ringfence.faults.certificate import Certificate
+
+    if suite != "stress":
+        raise UserError(f"--certificate is read by the suite stress alone, and this is {suite}; leave it out.")
+    return Certificate.load(file)
+
+
+def _say_made(grid: Grid, counts: dict[str, int], ranked: bool, certificate: Path | None) -> bool:
     """Print what became of a grid's cells; whether nothing of it is lacking."""
     out.print(", ".join(f"{n} {state}" for state, n in counts.items()))
     if counts["done"] and ranked:
-        results(grid.out)
+        results(grid.out, certificate)
     lacking = grid.references()
     if lacking:
         complain(f"The reference rows of {', '.join(lacking)} could not be made; see above.")
@@ -145,10 +162,18 @@ def status(folder: Positional[Path]) -> None:
     out.print(table)
 
 
-def results(folder: Positional[Path]) -> None:
-    """Rank the methods of every task and write FOLDER/table.csv."""
-    from ringfence.bench import write_csv
+def results(folder: Positional[Path], certificate: Path | None = None) -> None:
+    """Rank the methods of every task and write FOLDER/table.csv; of the suite stress FOLDER/stress.csv, too.
+
+    Args:
+        folder: the --out of `ringfence bench`.
+        certificate: of a run of the suite stress; a column says behind which faults it is kept.
+    """
+    from ringfence.bench import stressed, write_csv
+    from ringfence.bench.cells import read_about
     from ringfence.report import board, standings
+
+    promise = None if certificate is None else _load_certificate(certificate, read_about(folder)["suite"])
 
     for task, rows in standings.standings(board.read(folder)).items():
         table = Table(
@@ -168,6 +193,9 @@ def results(folder: Positional[Path]) -> None:
             )
         out.print(table)
     print(write_csv(folder))
+    behind_faults = stressed.write_csv(folder, promise)
+    if behind_faults is not None:
+        print(behind_faults)
 
 
 def paper_table(folder: Positional[Path] = Path("results")) -> None:

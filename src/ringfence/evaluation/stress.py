@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,15 +13,19 @@ from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.evaluate import Split, about
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.faults import Faults
+from ringfence.faults.certificate import digest
+from ringfence.guards.policy import rows_foreseen
 from ringfence.loading.resolve import resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run, write_json
+from ringfence.utils import schemas
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
+COMPENSATION = ("delay", "max_age", "hold", "others_acceleration")  # options by which a guard knows of faults
 MAX_AGE = 8  # steps up to which a compensating guard makes good for observations that were lost
 
 
@@ -46,34 +49,70 @@ def stress(
     itself a guard knows none of it. Other options are as in `load`. Without faults the numbers are those of `evaluate`.
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
+    options |= {"checkpoint": checkpoint, "planner": planner}
+    return stress_spec(
+        PolicySpec.of(run, **options), faults, episodes=episodes, split=split, compensate=compensate, quiet=quiet
+    )
+
+
+def stress_spec(
+    spec: PolicySpec,
+    faults: Faults,
+    *,
+    episodes: int = 100,
+    split: Split = "test",
+    compensate: bool = False,
+    quiet: bool = True,
+) -> dict[str, Any]:
+    """`stress` of what a spec names."""
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
-    options |= {"checkpoint": checkpoint, "planner": planner}
-    if compensate:
-        options = compensated(run, faults, options)
-    resolved = resolve(PolicySpec.of(run, **options))
+    resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
-    kept = json.loads(file.read_text()) if file.exists() else {}
+    kept = results(resolved.run)
     name = f"{resolved.variant(split)} behind {faults.name}"
     seed = resolved.run.config["seed"]
     result, _ = evaluate_policy(
         resolved.team, resolved.job.task, episodes, split, seed, 0, f"{resolved.job.task.name} {name}", quiet, faults
     )
     result |= {"variant": resolved.variant(split), "step": resolved.step, "faults": dataclasses.asdict(faults)}
-    result |= about(resolved)
+    result |= {"asked": spec.name, "compensated": compensate} | about(resolved)
+    if resolved.guard is not None:
+        result["digests"] = {"policy": digest(resolved.proposal), "world": digest(resolved.guard.world)}
     write_json(file, kept | {name: result})
     return result
 
 
+def results(run: Run) -> dict[str, dict[str, Any]]:
+    """What a run's stress.json holds, by who played and behind which faults; nothing where there is none."""
+    file = run.path / FILE
+    return schemas.read(file, dict[str, dict[str, Any]], "is damaged; delete that file") if file.exists() else {}
+
+
 def compensated(run: Run | str, faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a guard that knows of faults."""
-    options = {**options, **compensation(faults, options)}
-    late = {"delay", "max_age"} & options.keys()
-    if not late or "others_acceleration" in options:
-        return options
-    guard = resolve(PolicySpec.of(run, **options)).guard
+    compensation(faults, options)  # what cannot be is refused in these words first
+    return {**options, **_missing_options(PolicySpec.of(run, **options), faults)}
+
+
+def compensated_spec(spec: PolicySpec, faults: Faults) -> PolicySpec:
+    """The same choices with a guard that knows of faults."""
+    return spec.with_guard_options(**_missing_options(spec, faults))
+
+
+def _missing_options(spec: PolicySpec, faults: Faults) -> dict[str, Any]:
+    """Options of a spec's guard that it lacks to know of faults, for the World that it reads."""
+    given = dict(spec.guard_options)
+    found = compensation(faults, {"guard": spec.guard, **given})
+    if not {"delay", "max_age"} & {*found, *given}:
+        return found
+    guard = resolve(spec).guard
     assert guard is not None, "checked before"
-    return options | {"others_acceleration": own_acceleration(guard.world)}
+    if "max_age" in found:
+        found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", 0), 0))
+    if "others_acceleration" not in given:
+        found["others_acceleration"] = own_acceleration(guard.world)
+    return found
 
 
 def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 from msgspec import Meta
 
-from ringfence.utils.config import NonNegative, Positive, build_config, check_bounds
+from ringfence.errors import UserError
+from ringfence.utils.config import NonNegative, Positive, build_config, check_bounds, fields_of
 
 Delay = Annotated[int, Meta(ge=0, le=1000)]
 Chance = Annotated[float, Meta(ge=0, lt=1, description="lie in [0, 1): at 1 nothing would ever arrive")]
 Share = Annotated[float, Meta(ge=0, lt=1, description="lie in [0, 1): at 1 an action could have no effect")]
+
+NO_FAULTS = "none"  # the name of none
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,19 @@ class Faults:
         """From names and values; unknown names and values of another type are refused."""
         return build_config(cls, given, "the faults")
 
+    @classmethod
+    def parse(cls, name: str) -> Faults:
+        """The faults of that `name`."""
+        if name == NO_FAULTS:
+            return cls()
+        given: dict[str, Any] = {}
+        for part in name.split("+"):
+            found = re.fullmatch(r"([a-z]+)(\d.*)", part)
+            if found is None or found[1] not in fields_of(cls):
+                raise UserError(f"'{part}' in '{name}' is no fault; write one as delay2, several as delay2+drop0.3.")
+            given[found[1]] = found[2]
+        return cls.of(given)
+
     @property
     def given(self) -> dict[str, Any]:
         """Those that there are."""
@@ -46,4 +63,4 @@ class Faults:
     @property
     def name(self) -> str:
         """All of them in one word, e.g. `delay2+drop0.3`; `none` without any."""
-        return "+".join(f"{name}{value}" for name, value in self.given.items()) or "none"
+        return "+".join(f"{name}{value}" for name, value in self.given.items()) or NO_FAULTS

@@ -372,10 +372,15 @@ def prover_of(world: World, options: GuardOptions) -> Prover:
     return Prover(world, options.proof, options.others_acceleration, options.proof_rows, options.proof_residual)
 
 
+def rows_foreseen(world: World) -> int:
+    """Rows for which a World's card tells how well they are predicted."""
+    error = world.card.prediction_error
+    return FARTHEST if error is None else len(error.error_of_change)
+
+
 def _refuse_far(options: GuardOptions, world: World) -> None:
     """Refuse to roll actions forward for longer than anybody knows how well the World does."""
-    error = world.card.prediction_error
-    known = FARTHEST if error is None else len(error.error_of_change)
+    known = rows_foreseen(world)
     late = options.delay + options.max_age
     if late > known:
         names = " and ".join(f"{n}={getattr(options, n)}" for n in ("delay", "max_age") if getattr(options, n))

@@ -134,6 +134,10 @@ class PolicySpec:
         """The same choices for another run."""
         return replace(self, run=Run.of(run))
 
+    def with_guard_options(self, **changes: Any) -> PolicySpec:
+        """The same choices with some of the guard's options changed."""
+        return replace(self, guard_options=_options(GuardOptions, {**dict(self.guard_options), **changes}))
+
     def without_plans(self) -> PolicySpec:
         """The same of a policy that draws no plans, which reads no choice of planners."""
         return replace(self, planner=DEFAULT, plan_options=())
