@@ -1,7 +1,7 @@
 """Return against cost as the limit moves: what is trained anew for every limit, and one model whose guard is told it.
 
     python benchmarks/frontiers.py            # writes results/frontiers.csv; resumable, an hour on one core
-    python benchmarks/frontiers.py --picture  # draws docs/images/frontiers.png from it, and docs/frontiers.md's table
+    python benchmarks/frontiers.py --picture  # draws docs/images/frontiers.png from it
 
 Seed 0, test resets. On robots the limit is a number of steps per episode of 1000, which an adapting guard is told as
 the rate at which its margin settles, half the limit as its default is of 25. Where episodes are short there is no time
@@ -19,7 +19,6 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from _rows import append, read
-from readme import put
 
 from ringfence import algos
 from ringfence.datasets import registry
@@ -57,9 +56,7 @@ def main() -> None:
             for task in a.tasks:
                 (guarded if name in GUARDED else trained)(task, name, a.out)
     if a.out == OUT:
-        rows = read(OUT)
-        draw(rows)
-        put("docs/frontiers.md", "frontiers", table(rows))
+        draw(read(OUT))
 
 
 def trained(name: str, algorithm: str, out: Path) -> None:
@@ -108,15 +105,6 @@ def _play(name: str, method: str, knob: str, value, run, out: Path, **how) -> No
     row |= {"train_seconds": f"{sum(r['seconds'] for r in run.metrics):.0f}"}
     print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
     append(out, row, FIELDS)
-
-
-def table(rows: list[dict]) -> str:
-    """Every point of the picture."""
-    out = ["| task | method | setting | return | cost |", "|---|---|---|---|---|"]
-    for r in sorted(rows, key=lambda r: (list(LIMITS).index(r["task"]), r["method"])):
-        setting = "nothing" if r["knob"] == "none" else f"{r['knob']} {float(r['value']):g}"
-        out.append(f"| `{r['task']}` | {r['method']} | {setting} | {float(r['return']):.4g} | {float(r['cost']):.3g} |")
-    return "\n".join(out)
 
 
 def draw(rows: list[dict]) -> None:

@@ -1,7 +1,7 @@
 """What the robots' rows say of the goal: adaptive `split` is within the limit, earns what the data's safe part earns,
 and costs less than every baseline that earns about as much.
 
-python benchmarks/goal.py    # prints the table that readme.py puts into docs/benchmark.md
+python benchmarks/goal.py
 """
 
 from __future__ import annotations

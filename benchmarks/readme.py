@@ -6,23 +6,19 @@ python benchmarks/readme.py
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-import goal
-import matplotlib
 import numpy as np
 
 from ringfence import algos
 from ringfence.bench import paper, unpack
 from ringfence.datasets import registry
-from ringfence.report import board, export, standings
+from ringfence.report import board, standings
 from ringfence.utils import stored
 from ringfence.utils.config import build_config
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
@@ -52,30 +48,8 @@ ROWS = (
 )
 ROBOTS = ("halfcheetah_2x3", "ant_2x4", "ant_4x2")
 LEVELS = ("good", "medium", "poor")
-ROBOT_ROWS = (
-    ("behaviour data", "reference", "behaviour data"),
-    ("data within the limit", "reference", "its episodes within the limit"),
-    ("do-nothing", "reference", "do nothing"),
-    ("bc", "mujoco", "BC"),
-    ("bc-safe", "mujoco", "BC on the cheapest episodes"),
-    ("ma-td3bc", "mujoco", "MA-TD3+BC"),
-    ("ma-td3bc", "mujoco-long", "MA-TD3+BC, four times the updates"),
-    ("omar", "mujoco", "OMAR"),
-    ("ma-cql", "mujoco", "MA-CQL"),
-    ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
-    ("fisor", "mujoco", "FISOR per agent"),
-    ("madiff", "mujoco", "MADIFF (no barrier)"),
-    ("madiff", "mujoco+low_temperature", "MADIFF, low temperature"),
-    ("madiff", "mujoco+shielded", "MADIFF, shielded"),
-    ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
-    ("icbf", "mujoco-paper", "ICBF-Diffuser `paper`"),
-    ("icbf", "mujoco", "ICBF-Diffuser `split`"),
-    ("icbf", "mujoco+low_temperature", "`split`, low temperature"),
-    ("icbf", "mujoco+shielded", "`split`, shielded"),
-    ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
-)
 BRIEF = (("return_mean", 0), ("cost_mean", 1))
-# Columns of the short table.
+# Columns of the robots' table.
 SHORT = (
     ("behaviour data", "reference", "data"),
     ("data within the limit", "reference", "data within the limit"),
@@ -94,32 +68,37 @@ PUBLISHED = {
 }
 
 
+# Measurements that the page of speeds leaves out: parts of others, and what only a script's reader asks for.
+UNSHOWN = re.compile(
+    r"parameters|milliseconds|compile|mean return|size of|imports|all entries|PyTorch|random actions|"
+    r"per agent|batch=16|batch=1024|N=24|against first|in training|\b6 agents|kill|cells|wall clock|64 wide|by ℓ"
+)
+
+
 def main() -> None:
     put("README.md", "front", front())
     put("docs/tables.md", "summary", summary())
-    groups = grouped("simple_spread")
-    put("docs/tables.md", "table", spread(groups))
-    put("docs/benchmark.md", "table", export.board_markdown(board.read(RESULTS / "simple_spread")).strip())
-    put("docs/benchmark.md", "search", searched(RESULTS / "tuning" / "search.csv", "simple_spread-medium"))
-    put("docs/benchmark.md", "cost", spent(RESULTS / "simple_spread"))
-    draw(groups, ROOT / "docs" / "images" / "return-cost.png")
+    put("docs/tables.md", "table", spread(grouped("simple_spread")))
     measured = grouped("mujoco")
     for protocol, ending in (("native", ""), ("quantile", "-quantile")):
-        put("docs/benchmark.md", f"robots-{protocol}", robots(measured, ending))
         put("docs/tables.md", f"robots-{protocol}", robots_short(measured, ending))
-    robots_searched = searched(RESULTS / "tuning" / "robots.csv", "halfcheetah_2x3-medium-quantile")
-    put("docs/benchmark.md", "robots-search", robots_searched)
-    put("docs/benchmark.md", "robots-cost", spent(RESULTS / "mujoco"))
-    put("docs/benchmark.md", "robots-goal", goal.table())
+    put("docs/benchmark.md", "cost", costs())
     put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
-    speed = []
-    for file in sorted((RESULTS / "performance").glob("*.json")):
-        speed += json.loads(file.read_text())
-    lines = ["| what | measured | processor | command |", "|---|---|---|---|"]
-    for r in speed:
-        processor = r["machine"].split(",")[0].replace("Intel(R) Xeon(R) Processor", "Xeon").replace("AMD ", "")
-        lines.append(f"| {r['name']} | {r['value']:.4g} {r['unit']} | {processor} | `{r['command']}` |")
-    put("docs/performance.md", "performance", "\n".join(lines))
+    put("docs/performance.md", "performance", speeds())
+
+
+def speeds() -> str:
+    """One line per measurement, a median and its 99th percentile in one."""
+    rows = [r for file in sorted((RESULTS / "performance").glob("*.json")) for r in json.loads(file.read_text())]
+    late = {r["name"].removesuffix(", p99"): r["value"] for r in rows if r["name"].endswith(", p99")}
+    lines = ["| what | measured | script in `benchmarks/` |", "|---|---|---|"]
+    for r in rows:
+        name = r["name"].removesuffix(", p50")
+        if UNSHOWN.search(name) or name.endswith(", p99"):
+            continue
+        text = f"{r['value']:.4g} {r['unit']}" + (f" (p99 {late[name]:.3g})" if r["name"].endswith("p50") else "")
+        lines.append(f"| {name} | {text} | `{r['command'].split()[1].removeprefix('benchmarks/')}` |")
+    return "\n".join(lines)
 
 
 def front() -> str:
@@ -284,57 +263,39 @@ def robots_short(groups: dict, ending: str) -> str:
     return "\n".join([*lines, "", f"Methods' cells are of {usual} seed{'s' * (usual > 1)}.{others}"])
 
 
-def robots(groups: dict, ending: str) -> str:
-    """One line per method, one column per task that has results: return (normalised) / cost."""
-    names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
-    names = [name for name in names if any(task == name for task, *_ in groups)]
-    if not names:
-        return "No results yet."
-    lines = ["| | " + " | ".join(names) + " |", "|---|" + "---|" * len(names)]
-    for algorithm, variant, label in ROBOT_ROWS:
-        found = [groups.get((n, algorithm, variant), []) for n in names]
-        if any(found):
-            cells = (cell(rows, "cost_mean", 1) if rows else absent(variant) for rows in found)
-            lines.append(f"| {label} | " + " | ".join(cells) + " |")
+def costs() -> str:
+    """One line per algorithm: the mean seconds of training and playing a cell, from the quickest of its presets to the
+    slowest."""
+    took = {suite: spent(RESULTS / suite) for suite in ("simple_spread", "mujoco")}
+    lines = ["| algorithm | Simple Spread, s | robots, s |", "|---|---:|---:|"]
+    for name in dict.fromkeys(name for found in took.values() for name, _ in found):
+        cells = []
+        for found in took.values():
+            means = sorted({round(np.mean(v)) for (algorithm, _), v in found.items() if algorithm == name})
+            cells.append(" to ".join(f"{m}" for m in dict.fromkeys((means[0], means[-1]))) if means else "–")
+        lines.append(f"| `{name}` | " + " | ".join(cells) + " |")
+    for suite, found in took.items():
+        hours = sum(map(sum, found.values())) / 3600
+        lines.append(f"\n`{suite}`: {sum(map(len, found.values()))} cells, {hours:.1f} hours of one core.")
     return "\n".join(lines)
 
 
-def searched(file: Path, task: str) -> str:
-    """One line per setting tried on the task."""
-    if not file.exists():
-        return "No results yet."
-    lines = ["| algorithm | setting | changes | return | norm. return | cost |", "|---|---|---|---|---|---|"]
-    rows = [r for r in stored.table(file) if r["task"] == task]
-    for r in sorted(rows, key=lambda r: (r["algorithm"], int(r["setting"]))):
-        changes = ", ".join(f"{k} = {v}" for k, v in json.loads(r["changes"]).items()) or "as in the table"
-        name, gain, cost = f"{r['algorithm']} {r['preset']}".strip(), float(r["return"]), float(r["cost"])
-        norm = float(r["return_norm"])
-        lines.append(f"| `{name}` | {r['setting']} | {changes} | {gain:.0f} | {norm:.3f} | {cost:.2f} |")
-    return "\n".join(lines)
-
-
-def spent(folder: Path) -> str:
-    """Seconds of training and playing a cell, by algorithm and preset; all cells together.
-
-    Cells that took over what another had learned from the same data cost their playing alone: lines of their own."""
+def spent(folder: Path) -> dict[tuple[str, str], list[float]]:
+    """Seconds of training and playing each cell, by algorithm and preset; without cells that took over what another had
+    learned from the same data."""
     seconds = defaultdict(list)
     unpack(folder)
     for file in sorted((folder / "cells").glob("*/*/*/status.json")):
         status, name = json.loads(file.read_text()), file.parent.parent.name
         if status["state"] != "done":
             continue
+        algorithm = max((a for a in algos.ALGORITHMS if f"{name}-".startswith(f"{a}-")), key=len)
         if "adopted" in status or (registry.paired(file.parts[-4]) and not _reads_danger(file.parent)):
-            trained, name = status.get("train_seconds", 0.0), f"{name}, trained before"
-        else:  # of a cell that was played again the last attempt trained nothing
-            results = json.loads((file.parent / "results.json").read_text())
-            trained = max([status.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
-        seconds[name].append(trained + status.get("eval_seconds", 0.0))
-    lines = ["| cells | number | mean s | longest s |", "|---|---:|---:|---:|"]
-    lines += [f"| `{k}` | {len(v)} | {np.mean(v):.0f} | {max(v):.0f} |" for k, v in sorted(seconds.items())]
-    total = sum(map(sum, seconds.values())) / 3600
-    cells = sum(map(len, seconds.values()))
-    lines.append(f"\nTogether {cells} cells and {total:.1f} hours of one core, {total / 2:.1f} hours on two.")
-    return "\n".join(lines)
+            continue
+        results = json.loads((file.parent / "results.json").read_text())
+        trained = max([status.get("train_seconds", 0.0), *(r["train_seconds"] for r in results.values())])
+        seconds[algorithm, name].append(trained + status.get("eval_seconds", 0.0))
+    return seconds
 
 
 def _reads_danger(cell: Path) -> bool:
@@ -364,74 +325,15 @@ def spread(groups: dict) -> str:
     return "\n".join(lines)
 
 
-MARKS = {  # colour-blind-safe, and told apart by shape as well
-    "behaviour data": ("s", "#777777"),
-    "BC": ("v", "#999933"),
-    "BC on episodes without a collision": ("1", "#999933"),
-    "MA-TD3+BC": ("<", "#AA3377"),
-    "MA-CQL": ("2", "#AA3377"),
-    "OMAR": (">", "#DDAA33"),
-    "MA-TD3+BC, Lagrange": ("p", "#EE3377"),
-    "FISOR per agent": ("X", "#004488"),
-    "MADIFF (no barrier)": ("^", "#0077BB"),
-    "MADIFF, guarded planner": ("H", "#0077BB"),
-    "ICBF-Diffuser `paper`": ("D", "#CC3311"),
-    "ICBF-Diffuser `split`": ("o", "#33BBEE"),
-    "`split`, best of 8 plans": ("P", "#EE7733"),
-    "**`split`, guarded planner**": ("*", "#009988"),
-    "`long`: `split` for 6000 updates": ("3", "#33BBEE"),
-    "**`long`, guarded planner**": ("4", "#009988"),
-}
-UNDRAWN = ("its episodes within the limit", "do nothing", "random actions")
-
-
-def draw(groups: dict, path: Path) -> None:
-    """Normalised return against avoidable cost, one panel per tier, means over seeds with their spread."""
-    figure, panels = plt.subplots(1, len(TIERS), figsize=(12, 3.8), sharey=True, layout="constrained")
-    for panel, tier in zip(panels, TIERS):
-        for algorithm, variant, name in ROWS:
-            rows = of(groups, tier, algorithm, variant)
-            if not rows or name in UNDRAWN:
-                continue
-            mark, colour = MARKS[name]
-            x = np.array([float(r["cost_safe_start"]) for r in rows])
-            y = np.array([float(r["return_norm"]) for r in rows])
-            panel.errorbar(
-                x.mean(),
-                y.mean(),
-                y.std(ddof=len(y) > 1),
-                x.std(ddof=len(x) > 1),
-                mark,
-                color=colour,
-                ms=14 if mark in "*H" else 9,
-                fillstyle="none" if mark == "H" else "full",  # it lies where the star does
-                label=name.replace("`", "").replace("*", ""),
-                elinewidth=1,
-            )
-        panel.set_xscale("symlog", linthresh=0.01)
-        panel.set_xlim(-0.003, 20)
-        panel.set_title(f"simple_spread-{tier}", fontsize=10)
-        panel.grid(alpha=0.25)
-        panel.set_xlabel("avoidable collision steps per episode")
-    panels[0].set_ylabel("normalised return")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=-(-len(labels) // 3), fontsize=8, frameon=False)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
-    print(path)
-
-
 def mean(rows: list[dict], key: str) -> float:
     return float(np.mean([float(r[key]) for r in rows]))
 
 
 def cell(rows: list[dict], cost: str = "cost_safe_start", digits: int = 3) -> str:
-    """Return ± deviation between seeds (normalised) / cost."""
-    returns = np.array([float(r["return_mean"]) for r in rows])
-    spread = f" ± {returns.std(ddof=1):.0f}" if len(rows) > 1 else ""
+    """Return (normalised) / cost."""
     made = sum(r["variant"] != "reference" for r in rows)
-    spread += f" [{made} seed{'s' * (made > 1)}]" if 0 < made < SEEDS else ""
-    text = f"{returns.mean():.0f}{spread} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
+    seeds = f" [{made}]" if 0 < made < SEEDS else ""
+    text = f"{mean(rows, 'return_mean'):.0f}{seeds} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
     return text + fallen(rows)
 
 
@@ -444,7 +346,7 @@ def fallen(rows: list[dict]) -> str:
     """How many episodes ended before the time limit, where any did: an early end costs little."""
     ended = [float(r["termination_rate"]) for r in rows if r.get("termination_rate")]
     share = 100 * float(np.mean(ended)) if ended else 0.0
-    return f", {max(share, 1):.0f} % fell" if share else ""
+    return f" ({max(share, 1):.0f} % fell)" if share else ""
 
 
 def put(file: str, name: str, text: str) -> None:

@@ -1,7 +1,7 @@
 """Whether actor-critics on robots earn less than was published for want of updates: one run, looked at as it goes on.
 
     python benchmarks/updates.py            # writes results/tuning/updates.csv; an hour on one core
-    python benchmarks/updates.py --table    # only docs/benchmark.md's table from it
+    python benchmarks/updates.py --table    # only prints its rows as a table
 
 Rates are constant, so a run looked at after 10 000 updates is the run that ends there. Seed 100, which trains no row,
 20 validation resets. *Value* is what the critics say of the policy's own actions in logged states; *heard* the
@@ -16,7 +16,6 @@ import tempfile
 from pathlib import Path
 
 from _rows import append, read
-from readme import put
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
@@ -43,14 +42,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--of", nargs="+", default=[f"{a}:{t}" for a, t in RUNS], help="ALGORITHM:TASK")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--table", action="store_true", help="only write the document")
+    parser.add_argument("--table", action="store_true", help="only print the rows as a table")
     a = parser.parse_args()
     for algorithm, name in (tuple(x.split(":")) for x in a.of if not a.table):
         there = {int(r["updates"]) for r in read(a.out) if (r["algorithm"], r["task"]) == (algorithm, name)}
         if there < set(RUNS[algorithm, name]):
             measure(algorithm, name, there, a.out)
-    if a.out == OUT:
-        put("docs/benchmark.md", "updates", table(read(OUT)))
+    print(table(read(a.out)))
 
 
 def measure(algorithm: str, name: str, there: set[int], out: Path) -> None:
