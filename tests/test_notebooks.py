@@ -16,6 +16,7 @@ SMALL = {"WORLD": QUICK_WORLD, "POLICY": {"num_updates": 4, "width": 16}, "RUNS"
 SMALL |= {
     "PEOPLE": 60,
     "REPLAY": {"drivers": (), "windows": 6, "baselines": False},
+    "ROWS": {"delay, known to the guard": {"faults": {"delay": 2}, "compensate": True}},
     "CALIBRATION": 9,
     "FRESH": 9,
     "GUARD": {"correction_steps": 1, "horizon": 1},
