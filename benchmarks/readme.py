@@ -101,6 +101,9 @@ def speeds() -> str:
     return "\n".join(lines)
 
 
+NO_GUARD = "no guard"
+
+
 def front() -> str:
     """The README's few rows, in words that need no footnote."""
     lines = ["| who acts | what is known of danger | episodes with a violation | return |", "|---|---|---|---|"]
@@ -112,7 +115,7 @@ def front() -> str:
 def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
     rows = grouped("crossing")
     for words, danger, variant in (
-        ("Eight discs cross a room: a clone of the logs", "–", "default"),
+        ("Eight discs cross a room: a clone of the logs", NO_GUARD, "default"),
         ("the same clone under a guard", "a logged cost column", "default+shield-learned"),
     ):
         found = rows["crossing-hasty", "bc", variant]
@@ -124,7 +127,7 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     """The mean over the systems; returns as shares of what the clone alone earns."""
     systems = [json.loads(file.read_text())["rows"] for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
     for words, danger, way in (
-        (f"{_counted(len(systems))} other systems: a clone of the logs", "–", "none"),
+        (f"{_counted(len(systems))} other systems: a clone of the logs", NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),
         ("the same clones under a guard", "the true formula and motion", "shield oracle"),
     ):
@@ -140,8 +143,8 @@ def _front_replay() -> tuple[str, str, str, str]:
     contacts = {way: sum(r["contacts"] for r in rows if r["filter"] == way) for way in ("none", "shield")}
     windows = sum(r["windows"] for r in rows if r["filter"] == "none")
     alone, guarded = (100 * contacts[way] / windows for way in ("none", "shield"))
-    words = "Five drivers among filmed pedestrians, who walk as they did"
-    return words, "a cost made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
+    words = "Five drivers, each put among pedestrians as they were filmed"
+    return words, "a cost column made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
 
 
 def _counted(number: int) -> str:
