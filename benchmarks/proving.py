@@ -1,12 +1,13 @@
-"""The proving ground in one seed and few episodes: is danger learned from a cost column alone, and kept?
+"""The proving ground in one seed: is danger learned from a cost column alone, and kept?
 
-    python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 100] [--beside]
+    python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 60] [--rows "bc none" ...]
 
 For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
-of a clone and of the naive driver: alone, under `shield` by what was learned, and by the oracle, which knows dynamics
-and distances. With `--beside` also what differs in one thing: networks on all entries in the place of causes
-(`causes=False`), and other horizons. Rows that a file holds already are not played again. Other tasks have the rows
-that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench proving-ground` plays all with 500 episodes.
+of a clone and of the naive driver: alone, under guards by what was learned, and by the oracle, which knows dynamics
+and distances. `--rows` names some of them (`ROWS`, `BESIDE` and `HORIZONS` below, of `bc` or `naive`); by default all
+of `ROWS` are played. Rows of the same World that a file holds already, of as many episodes or more, are not played
+again. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench proving-ground`
+plays everything with 500 episodes.
 """
 
 import argparse
@@ -34,14 +35,23 @@ ROWS = {
     "shield oracle": {"guard": "shield", "barrier": "oracle"},
 }
 # What differs in one thing; the World of `all` is fitted without a search for causes.
-BESIDE = {"shield learned, networks on all entries": LEARNED | {"world": "all"}}
+ALL = "shield learned, networks on all entries"
+BESIDE = {
+    "adapt learned": LEARNED | {"guard": "adapt"},
+    "full learned": LEARNED | {"guard": "full"},
+    ALL: LEARNED | {"world": "all"},
+}
 HORIZONS = {f"shield learned, {rows} rows": LEARNED | {"horizon": rows} for rows in (3, 15, 30)}
+OPTIONS = ROWS | BESIDE | HORIZONS
+NAMES = [f"{driver} {row}" for row in OPTIONS for driver in ("bc", "naive")]  # in the order in which they are played
+OF_NO_WORLD = ("none", "shield oracle")  # rows that read none
+USUAL = [f"{driver} {row}" for row in ROWS for driver in ("bc", "naive")]
 
 
 def played(run, options: dict, episodes: int) -> dict:
     begun = time.perf_counter()
     found = evaluate(run, episodes=episodes, **options)
-    kept = {name: found[name] for name in COLUMNS if name in found}
+    kept = {"episodes": episodes} | {name: found[name] for name in COLUMNS if name in found}
     return kept | {"seconds": round(time.perf_counter() - begun, 1)}
 
 
@@ -59,19 +69,16 @@ def described(card) -> dict:
     }
 
 
-def system(task: str, runs: Path, episodes: int, beside: bool, file: Path) -> dict:
+def system(task: str, runs: Path, episodes: int, names: list[str], file: Path) -> dict:
     begun = time.perf_counter()
     store, _ = make(TASKS[task])
-    drivers = {"bc": ROWS | (BESIDE | HORIZONS if beside else {})}
-    if isinstance(TASKS[task].env, System):
-        drivers["naive"] = ROWS | (BESIDE if beside else {})
+    drivers = ["bc", "naive"] if isinstance(TASKS[task].env, System) else ["bc"]
     trained = {name: ringfence.train(name, store, out=str(runs), quiet=True)[0] for name in drivers}
     fitted = time.perf_counter()
     card = worlds.fit(store, seed=0).card
     seconds = {"made and trained": fitted - begun, "fitted": time.perf_counter() - fitted}
     found = {
         "task": task,
-        "episodes": episodes,
         "logs": {
             "return_mean": float(store.returns.mean()),
             "violation_rate": float((store.episode_costs > 0).mean()),
@@ -80,47 +87,47 @@ def system(task: str, runs: Path, episodes: int, beside: bool, file: Path) -> di
         **described(card),
         "seconds": {name: round(value, 1) for name, value in seconds.items()},
         "machine": machine(),
-        "rows": rows_of(file, card, episodes),
+        "rows": rows_of(file, card),
     }
-    every = worlds.fit(store, seed=0, causes=False) if beside else None
-    if every is not None:
+    every = None
+    if any(name.endswith(ALL) for name in names):
+        every = worlds.fit(store, seed=0, causes=False)
         found["networks on all entries"] = described(every.card)
-    wanted = [(label, name) for name, rows in drivers.items() for label in rows]
-    order = list(ROWS | BESIDE | HORIZONS)
-    for label, name in sorted(wanted, key=lambda row: order.index(row[0])):  # what takes longest comes last
-        if f"{name} {label}" in found["rows"]:
+    for name in names:
+        driver, _, row = name.partition(" ")
+        if driver not in drivers or found["rows"].get(name, {}).get("episodes", 0) >= episodes:
             continue
-        options = drivers[name][label]
+        options = OPTIONS[row]
         given = options | {"world": every} if "world" in options else options
         try:
-            found["rows"][f"{name} {label}"] = played(trained[name], given, episodes)
+            found["rows"][name] = played(trained[driver], given, episodes)
         except UserError as error:
-            found["rows"][f"{name} {label}"] = {"refused": str(error)}
+            found["rows"][name] = {"episodes": episodes, "refused": str(error)}
         file.write_text(json.dumps(found, indent=1) + "\n")
     return found
 
 
-def rows_of(file: Path, card, episodes: int) -> dict:
-    """What a file holds of the same World and as many episodes."""
+def rows_of(file: Path, card) -> dict:
+    """What a file holds: of the same World, or of none."""
     if not file.exists():
         return {}
     kept = json.loads(file.read_text())
-    told = json.loads(json.dumps(described(card)))
-    same = kept.get("episodes") == episodes and all(kept.get(name) == value for name, value in told.items())
-    return kept["rows"] if same else {}
+    now = json.loads(json.dumps(described(card)))
+    same = all(kept.get(name) == value for name, value in now.items())
+    return {name: row for name, row in kept["rows"].items() if same or name.partition(" ")[2] in OF_NO_WORLD}
 
 
 def main() -> None:
-    reader = argparse.ArgumentParser(description=__doc__)
+    reader = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     reader.add_argument("out", type=Path)
     reader.add_argument("--tasks", nargs="*", default=[f"proving-{name}" for name in TEST], choices=sorted(TASKS))
-    reader.add_argument("--episodes", type=int, default=100)
-    reader.add_argument("--beside", action="store_true")
+    reader.add_argument("--episodes", type=int, default=60)
+    reader.add_argument("--rows", nargs="*", default=USUAL, choices=NAMES)
     reader.add_argument("--runs", type=Path, default=Path("runs"))
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     for task in given.tasks:
-        found = system(task, given.runs, given.episodes, given.beside, given.out / f"{task}.json")
+        found = system(task, given.runs, given.episodes, given.rows, given.out / f"{task}.json")
         print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
         for label, row in found["rows"].items():
             print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})

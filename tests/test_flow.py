@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.algos import drivers
+from ringfence.algos import drivers, flow
 from ringfence.errors import UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
@@ -257,6 +257,24 @@ def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
     np.testing.assert_allclose(free.mean() - drawn(0.5, x).mean(), 0.5 * lacking, atol=1e-4)
     np.testing.assert_array_equal(drawn(1.0, x - 2.0), free)
     np.testing.assert_allclose(drawn(1.0, x, steps=4).max(), -0.5, atol=0.05)
+
+
+def test_flow_learns_to_keep_the_margin(two_drifts, tmp_path, monkeypatch):
+    """With λ the drivers' means end where danger keeps its margin, though half of the logs go beyond; a World is read
+    while training alone."""
+    costs = np.zeros(two_drifts.rewards.shape[:1], np.float32)
+    costs[::7] = 1.0
+    paid = dataclasses.replace(two_drifts, costs=costs)
+    line = Line(None)
+    known = {"dynamics": line, "barrier": line, "ood_threshold": line.ood_threshold}
+    monkeypatch.setattr(flow, "from_world", lambda world, config: known if flow.follows(config) else {})
+    changes = SMALL | {"barrier_weight": 3.0, "num_updates": 200}
+    run = loop.train("flow", paid, out=tmp_path, changes=changes, world=QUICK_WORLD, quiet=True)[0]
+    policy = load(run, sampling_steps=1, temperature=0.0)[1]
+    x = jnp.zeros((8, 2, 1))
+    for driver in range(2):
+        ends = x + policy.draw(x, jnp.full(8, driver), jax.random.key(0))
+        assert ends.max() < -0.3, "the drivers push by 0.7, up or down"
 
 
 def test_guidance_reads_the_world_that_is_given(two_drifts, run, tmp_path):

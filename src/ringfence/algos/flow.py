@@ -12,6 +12,9 @@ episode is played as one of them:
     L^F  a rectified flow from noise to the joint action, given the driver c ~ r (Lipman et al. 2023; Liu et al. 2023)
          a_τ = (1 − τ) ε + τ a,   L^F = E ‖a − â(a_τ, τ, s, c, y)‖²
 
+    L^C  once drivers are found, the actions drawn keep a World's danger at its margin, weighed by λ (`barrier_weight`):
+         L^C = λ E Σ_i [1 − min(ℓ_i(s, ŝ'), V_i(ŝ'))]_+ in calibrated margins, ŝ' = f_φ(s, â)
+
 The network answers with the clean action, from which the velocity (â − a_τ)/(1 − τ) follows; one step from noise is the
 driver's mean. That is the behaviour flow of flow Q-learning (Park et al. 2025), for teams and given who drives. The
 return y is optional, dropped with probability p for classifier-free guidance.
@@ -35,7 +38,7 @@ from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions
 from ringfence.proposals.drivers import driver_scores
-from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action
+from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action, short_of_margin
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import (
     AtLeastOne,
@@ -66,6 +69,7 @@ class Config:
     condition: Literal["none", "return", "advantage"] = "none"  # what y is
     condition_dropout: Share = 0.25  # p, share of windows that are not given y
     discount: Share = 0.9  # of what y scores
+    barrier_weight: NonNegative = 0.0  # λ of danger, as a World knows it; 0: no World is read
     width: Width = 384  # units of each hidden layer, of either network
     depth: Depth = 3  # hidden layers
     num_updates: Count = 10_000  # updates
@@ -99,7 +103,27 @@ def init(
         }
         return fresh(_optimiser(config), params, "ema")
 
-    return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
+    state = jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
+    return state | ({"world": from_world(world, config)} if follows(config) and world is not None else {})
+
+
+def follows(config: Config) -> bool:
+    """Whether the flow keeps away from what a World calls dangerous."""
+    return config.barrier_weight > 0
+
+
+def from_world(world: World, config: Config) -> PyTree:
+    """What actions do and what is dangerous, where the flow keeps away from it."""
+    if not follows(config):
+        return {}
+    return {"dynamics": world.dynamics, "barrier": world.barrier, "ood_threshold": world.ood_threshold}
+
+
+def world_settings(config: Config) -> dict | None:
+    """The World that training reads: for an advantage its values, for its danger all of it."""
+    if follows(config):
+        return {"view": config.view, "discount": config.discount}
+    return conditions.world_settings(config)
 
 
 def check(config: Config, hazard: BoundHazard) -> None:
@@ -121,9 +145,9 @@ def search(config: Config) -> drivers.Search:
 
 
 def make_loss(config: Config):
-    """loss(params, normaliser, batch, step, key) -> (L^E + L^F + L^Q, metrics)."""
+    """loss(params, normaliser, batch, step, key, world) -> (L^E + L^F + L^Q + λ L^C, metrics)."""
 
-    def loss(params: PyTree, normaliser, batch: Batch, step: Array, key: Key) -> tuple[Array, Metrics]:
+    def loss(params: PyTree, normaliser, batch: Batch, step: Array, key: Key, world: PyTree) -> tuple[Array, Metrics]:
         k_driver, k_noise, k_time, k_keep = jax.random.split(key, 4)
         windows, steps = batch.actions.shape[:2]
         there = drivers.steps_there(batch)
@@ -144,7 +168,16 @@ def make_loss(config: Config):
         guess = driver_scores(params["prior"], seen, score, jnp.repeat(kept, steps))
         prior_loss = drivers.surprise(guess, shares, there)
         metrics = {"loss/clones": clone_loss, "loss/flow": flow_loss, "loss/prior": prior_loss}
-        return clone_loss + flow_loss + prior_loss, metrics | {"drivers/sure": shares.max(-1).mean()}
+        metrics["drivers/sure"] = shares.max(-1).mean()
+        total = clone_loss + flow_loss + prior_loss
+        if follows(config):
+            present = batch.features[:, :-1].reshape(windows * steps, *batch.features.shape[2:])
+            taken = clean.reshape(windows * steps, *batch.actions.shape[2:])
+            short = -short_of_margin(**world, present=present, action=taken) * there.reshape(-1)
+            metrics["loss/danger"] = short.sum() / jnp.maximum(there.sum(), 1)
+            settled = step >= config.settled * config.num_updates
+            total = total + config.barrier_weight * settled * metrics["loss/danger"]
+        return total, metrics
 
     return loss
 
@@ -155,7 +188,8 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         normaliser = state["frozen"]["normaliser"]
-        grads, metrics = jax.grad(loss, has_aux=True)(state["params"], normaliser, batch, state["step"], key)
+        world = state.get("world")
+        grads, metrics = jax.grad(loss, has_aux=True)(state["params"], normaliser, batch, state["step"], key, world)
         params, moments, norms = opt.update(grads, state["opt"], state["params"])
         ema = average(state["ema"], params, config.ema, state["step"])
         return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, metrics | norms
@@ -189,8 +223,8 @@ FLOW = Algorithm(
     ac.no_diagnosis,
     make_policy,
     {"default": {}, "return": {"condition": "return"}},
-    cost_source=lambda config: "nothing",
+    cost_source=lambda config: "world" if follows(config) else "nothing",
     make_windows=make_windows,
-    world_settings=conditions.world_settings,
-    from_world=lambda world, config: {},
+    world_settings=world_settings,
+    from_world=from_world,
 )

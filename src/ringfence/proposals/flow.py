@@ -27,6 +27,8 @@ from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_sc
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
+from ringfence.world.barrier import Barrier, MinBarrier
+from ringfence.world.dynamics import Dynamics
 
 WAVES = 4  # sines and cosines of τ
 MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
@@ -44,6 +46,17 @@ def clean_action(net: Any, seen: Array, action: Array, tau: Array, driver: Array
     """â (B, N·A) of a noised action (B, N·A) at τ (B,): `seen` (B, N·D) standardised, `driver` (B, C) one of C, `score`
     (B,) the condition y where `keep` (B,) says so."""
     return net(jnp.concatenate([seen, action, time_entries(tau), driver, asked(seen, score, keep)], -1))
+
+
+def short_of_margin(
+    dynamics: Dynamics, barrier: Barrier | MinBarrier, ood_threshold: Array, present: Array, action: Array
+) -> Array:
+    """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. As guards do, it
+    trusts less where the ensemble disagrees."""
+    after, spread = dynamics.step(present, action)
+    score = jnp.minimum(barrier.apart(present, after), barrier.ahead_apart(after))
+    doubt = jnp.maximum(spread / ood_threshold - 1.0, 0.0)
+    return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
 
 class FlowPolicy(eqx.Module):
@@ -143,14 +156,10 @@ class FlowPolicy(eqx.Module):
         return action - self.options.barrier_guidance * (short / size)[:, None] * slope
 
     def _missing(self, present: Array, action: Array) -> Array:
-        """(B,) what the next states lack of the margin, in all: 0 or negative. As guards do, it trusts less where the
-        ensemble disagrees."""
+        """(B,) what the next states lack of the margin, in all: 0 or negative."""
         world = self.world
         assert world is not None and world.barrier is not None, "checked by guided_by"
-        after, spread = world.dynamics.step(present, action)
-        score = jnp.minimum(world.barrier.apart(present, after), world.barrier.ahead_apart(after))
-        doubt = jnp.maximum(spread / world.ood_threshold - 1.0, 0.0)
-        return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
+        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, present, action)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
         """What answers to (y, whether it is given), guided by the return that is asked for, if training knew any."""

@@ -22,12 +22,14 @@ from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gai
 from ringfence.world.causes import Cause, Edge, Found, candidates, narrowed, only_of, wider
 from ringfence.world.cells import CELLS, Cells
 
-VERSION = 10  # of the search: what was found by another is looked for again
+VERSION = 11  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
 SURE = 3.0  # standard errors, over episodes, by which a gain has to exceed nothing
 NEEDED = 2.0  # standard errors, by which one that is kept beside all others has to
+PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one that is no mixture of others
+ENOUGH = 0.98  # share of unsafe steps that causes tell, from which on they are not looked for in another way
 AROUND = 3.0  # cells to either side that an edge is looked for in
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
@@ -46,12 +48,45 @@ def find(
     """The causes of danger in steps that led to features x (T, N, D), `unsafe` (T,) of the team or (T, N) bool of each
     agent, of these episodes (T,); with the cells of each cause."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
-    chosen = _pruned(steps, _grown(steps, names))
+    chosen = _best_grown(steps, names)
     if not chosen:
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
     edges = [refined(steps, one.cells.edge, one.cause, _without(steps, chosen, one)) for one in chosen]
     return replace(_summary(steps, chosen), edges=tuple(edges)), [one.cells for one in chosen]
+
+
+def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
+    """The causes that tell most, of those of all agents first, and of pure ones of anybody.
+
+    What is true of some agents alone looks like a blurred cause of all: far from the next one in a row of agents, whom
+    each has among other entries. A blurred cause is taken first since it tells most, and hides the true ones.
+    """
+    chosen = _pruned(steps, _grown(steps, names))
+    if steps.x.shape[1] == 1 or (chosen and _summary(steps, chosen).explained > ENOUGH):
+        return chosen
+    pure = _pruned(steps, _grown_of_pure(steps, names))
+    more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, pure).safe)
+    less = gain(steps, Explained.by(steps, pure), Explained.by(steps, chosen).safe)[0]
+    return pure if more - less > SURE * error else chosen
+
+
+def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
+    """Causes of all agents and of some alone, of which nearly all steps that they call unsafe are: those of one entry
+    first, then lengths, then all others."""
+    pool = list(candidates(names))
+    alone = [one for cause in pool for one in only_of(cause, steps.x.shape[1])]
+    chosen: list[Counted] = []
+    for fits in (lambda cause: cause.width == 1 and not cause.length, lambda cause: cause.width == 1, lambda _: True):
+        chosen = _added(steps, chosen, [cause for cause in (*pool, *alone) if fits(cause)], PURE)
+    chosen = _pruned(steps, chosen)
+    return [_widened(steps, one, _without(steps, chosen, one), names) for one in chosen]
+
+
+def _purity(steps: Steps, one: Counted) -> float:
+    """Share of the steps that a cause calls unsafe, and that are."""
+    called = one.called.sum()
+    return float((one.called & steps.unsafe).sum() / called) if called else 0.0
 
 
 def _grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
@@ -77,13 +112,13 @@ def _simplified(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> l
     return chosen
 
 
-def _added(steps: Steps, chosen: list[Counted], pool: Sequence[Cause]) -> list[Counted]:
-    """These causes and more of the pool, while they tell something."""
+def _added(steps: Steps, chosen: list[Counted], pool: Sequence[Cause], pure: float = 0.0) -> list[Counted]:
+    """These causes and more of the pool, while they tell something; at least as pure as that."""
     chosen = list(chosen)
     least = LEAST_GAIN * -likelihood(steps, np.zeros(steps.unsafe.shape)).sum() / len(steps.x)
     while len(chosen) < MOST:
         explained = Explained.by(steps, chosen)
-        best = _simplest(steps, pool, explained)
+        best = _simplest(steps, pool, explained, pure)
         if best is None or best.gain < least:
             break
         if best.gain < SURE * best.error and not _tells_nearly_all(steps, best, explained):
@@ -122,7 +157,7 @@ def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Exp
     """The cause of a single agent as one of all for whom it holds likewise, one after the other."""
     things = best.cause.things
     length = best.cause.length
-    others = [cause for cause in pool if cause.things == things and cause.length == length]
+    others = [cause for cause in pool if cause.who and cause.things == things and cause.length == length]
     for other in sorted(others, key=lambda cause: -counted(steps, cause, explained).gain):
         who = best.cause.who
         if other.who[0] in who:
@@ -142,15 +177,20 @@ def _widened(steps: Steps, one: Counted, explained: Explained, names: Sequence[s
     return best
 
 
-def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained) -> Counted | None:
-    """The simplest cause of those that tell about as much as any."""
-    gains = [counted(steps, cause, explained).gain for cause in pool]
+def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained, pure: float = 0.0) -> Counted | None:
+    """The simplest cause of those that tell about as much as any; at least as pure as that."""
+    gains = [_gain_if(steps, counted(steps, cause, explained), pure) for cause in pool]
     least = (1 - SIMPLER) * max(gains, default=0.0)
     enough = [(cause, gain) for cause, gain in zip(pool, gains) if gain > 0 and gain >= least]
     if not enough:
         return None
-    best, _ = min(enough, key=lambda one: (one[0].width, not one[0].length, -one[1]))
+    best, _ = min(enough, key=lambda one: (one[0].width, not one[0].length, bool(one[0].who), -one[1]))
     return counted(steps, best, explained)
+
+
+def _gain_if(steps: Steps, one: Counted, pure: float) -> float:
+    """What a cause gains; nothing where it is less pure than that."""
+    return 0.0 if pure and _purity(steps, one) < pure else one.gain
 
 
 def _best_wider(steps: Steps, best: Counted, explained: Explained, names: Sequence[str]) -> Counted | None:
