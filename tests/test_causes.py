@@ -116,6 +116,26 @@ def test_what_holds_for_some_agents_alone_is_found(logged):
     assert (each[:, ~held] == FAR).all() and (each[:, held] < FAR).all()
 
 
+def test_a_blurred_cause_of_all_does_not_hide_those_of_some(monkeypatch):
+    """Agents in a row, each too far from the next: by entries without names, which hold others in the team's order, the
+    distance to two others tells some of it of everybody, and the one to its own neighbours all of it."""
+    n, episodes, steps = 5, 300, 40
+    rng = np.random.default_rng(0)
+    place = np.cumsum(rng.normal(0, 0.06, (episodes, steps, n)), 1) + rng.normal(0, 0.3, (episodes, 1, n))
+    others = np.array([[j for j in range(n) if j != i] for i in range(n)])
+    x = (place[..., others] - place[..., None]).reshape(-1, n, n - 1).astype(np.float32)
+    unsafe = (np.abs(np.diff(place, axis=-1)) > 1.0).any(-1).reshape(-1)
+    about = (x, unsafe, np.repeat(np.arange(episodes), steps), [f"obs{d}" for d in range(n - 1)])
+    found, _ = cause_search.find(*about)
+    assert found.explained > 0.97 and found.false_alarms < 0.01
+    assert {c.name.split(" of ")[0] for c in found.causes} == {f"obs{d}" for d in range(n - 1)}
+    assert all({agent for agent, _ in c.who} <= {int(c.name[3]), int(c.name[3]) + 1} for c in found.causes)
+    for edge in found.edges:
+        np.testing.assert_allclose(edge.bounds, (-1.0, 1.0), atol=0.05)
+    monkeypatch.setattr(cause_search, "ENOUGH", 0.0)
+    assert cause_search.find(*about)[0].false_alarms > 0.01, "without it"
+
+
 def cells_of(pattern, length=True, visits=100.0):
     """Cells of one number from 0 to 1, as dangerous as the pattern says; None: never visited."""
     known = np.array([v is not None for v in pattern])

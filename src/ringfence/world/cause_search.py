@@ -80,7 +80,19 @@ def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
     for fits in (lambda cause: cause.width == 1 and not cause.length, lambda cause: cause.width == 1, lambda _: True):
         chosen = _added(steps, chosen, [cause for cause in (*pool, *alone) if fits(cause)], PURE)
     chosen = _pruned(steps, chosen)
+    for k, one in enumerate(chosen):
+        chosen[k] = _of_fewer(steps, one, _without(steps, chosen, one))
     return [_widened(steps, one, _without(steps, chosen, one), names) for one in chosen]
+
+
+def _of_fewer(steps: Steps, one: Counted, explained: Explained) -> Counted:
+    """The cause without agents who tell nothing beside the others: they were taken for what was found later."""
+    best = counted(steps, one.cause, explained)
+    for who in one.cause.who:
+        rest = tuple(other for other in best.cause.who if other != who)
+        if rest and (fewer := counted(steps, narrowed(best.cause, rest), explained)).gain >= best.gain:
+            best = fewer
+    return best
 
 
 def _purity(steps: Steps, one: Counted) -> float:
