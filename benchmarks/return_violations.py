@@ -1,6 +1,6 @@
 """Draws return against violations for every method, alone and under its guards, from results/ alone.
 
-    python benchmarks/return_violations.py    # docs/images/return-violations.png
+python benchmarks/return_violations.py    # docs/images/return-violations.png
 """
 
 from __future__ import annotations

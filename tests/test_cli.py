@@ -113,6 +113,17 @@ def test_it_is_said_which_of_several_runs_was_refused(monkeypatch, capsys, tmp_p
     assert f"error: '{tmp_path}/b' is damaged." in told
 
 
+@pytest.mark.parametrize("share, said", [(0.22, True), (0.01, False), (None, False)])
+def test_it_is_said_where_a_guard_often_finds_nothing(monkeypatch, capsys, tmp_path, share, said):
+    names = "return_mean cost_mean cost_safe_start violation_rate violation_upper return_norm cost_norm"
+    result = dict.fromkeys([*names.split(), "termination_rate"], 0.0) | {"variant": "shield", "task": "", "agents": 2}
+    result |= {} if share is None else {"infeasible_rate": share}
+    monkeypatch.setattr("ringfence.evaluation.evaluate.evaluate", lambda run, **_: result)
+    (tmp_path / "config.json").write_text("{}")
+    main(["eval", str(tmp_path)])
+    assert ("in 22 % of the steps the guard found no action that keeps its margin" in capsys.readouterr().out) == said
+
+
 def test_every_set_counts(monkeypatch):
     heard = []
     monkeypatch.setattr("ringfence.training.loop.train", lambda *_, changes, **__: heard.append(changes) or [])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from ringfence.training.runs import Run
 
 out = Console(highlight=False)
+OFTEN = 0.05  # share of steps without an action that keeps the margin, from which on it is said
 Positional = tyro.conf.Positional
 # --tasks a b and --tasks a --tasks b mean the same.
 Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]
@@ -190,14 +192,27 @@ def evaluate(
         "cost norm",
     )
     table = Table(*names, "ended early")
+    doubts: list[str] = []
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
             result = run_evaluation(run, **given)
             table.add_row(*_evaluated(run, result))
+            doubts += _doubt(result)
             if video:
                 print(_film(run, result["variant"]))
-    _say(table, refusals, len(found))
+    _say(table, refusals, len(found), doubts)
+
+
+def _doubt(result: dict[str, Any]) -> list[str]:
+    """What a guard could not do, where that was often; it has no column."""
+    share = result.get("infeasible_rate", 0.0)
+    if not share > OFTEN:
+        return []
+    return [
+        f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps its margin; it "
+        "took the best one, and nothing speaks for that."
+    ]
 
 
 def _evaluated(run: Run, result: dict[str, Any]) -> list[Text | str]:
@@ -381,10 +396,12 @@ def certify(
     print(made.save(file))
 
 
-def _say(table: Table, refusals: Refusals, runs: int) -> None:
-    """What was measured, and what runs were refused for; the process ends where any was."""
+def _say(table: Table, refusals: Refusals, runs: int, doubts: Sequence[str] = ()) -> None:
+    """What was measured, how far it is in doubt, and what runs were refused for; the process ends where any was."""
     if table.row_count:
         out.print(table)
+    for doubt in doubts:
+        out.print(terminal(doubt), soft_wrap=True)
     for message, refused in refusals.runs.items():
         unsaid = [str(run.path) for run in refused if str(run.path) not in message]
         whose = ", ".join(unsaid) + ": " if unsaid else ""
