@@ -18,31 +18,30 @@ from ringfence.bench import make_grid, unpack
 from ringfence.bench.suites import COLLECTIONS
 from ringfence.datasets import registry
 
-# Proposals that the page shows: their words, what they see, and their row without a guard. `ringfence bench results
+# Proposals that the page shows: their words, and their row without a guard. `ringfence bench results
 # results/guards` prints all others, too.
-PROPOSALS: dict[str, tuple[str, Row]] = {
-    "logs": ("", ("behaviour data", "reference")),
-    "do nothing": ("", ("do-nothing", "reference")),
-    "BC": ("own", ("bc", "default")),
-    "10 % BC": ("own", ("bc-best", "default")),
-    "BC on episodes without cost": ("own", ("bc-safe", "default")),
-    "return-conditioned BC": ("all", ("bc-return", "default")),
-    "MA-TD3+BC": ("own", ("ma-td3bc", "default")),
-    "MA-TD3+BC, Lagrange": ("own", ("ma-td3bc-lag", "default")),
-    "OMAR": ("own", ("omar", "default")),
-    "our MADIFF": ("all", ("madiff", "default")),
-    "our MADIFF, four times the updates": ("all", ("madiff", "long")),
-    "ICBF as printed, λ = 0.1": ("all", ("icbf", "paper")),
-    "ICBF, ours, λ = 3": ("all", ("icbf", "split")),
-    "its ablation λ = 0": ("all", ("icbf", "split-0")),
-    "MPC from a zero proposal (`mpc`)": ("all", ("mpc", "default")),
+PROPOSALS: dict[str, Row] = {
+    "logs": ("behaviour data", "reference"),
+    "do nothing": ("do-nothing", "reference"),
+    "BC": ("bc", "default"),
+    "10 % BC": ("bc-best", "default"),
+    "BC on episodes without cost": ("bc-safe", "default"),
+    "return-conditioned BC": ("bc-return", "default"),
+    "MA-TD3+BC": ("ma-td3bc", "default"),
+    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "default"),
+    "OMAR": ("omar", "default"),
+    "our MADIFF": ("madiff", "default"),
+    "our MADIFF, four times the updates": ("madiff", "long"),
+    "ICBF as printed, λ = 0.1": ("icbf", "paper"),
+    "ICBF, ours, λ = 3": ("icbf", "split"),
+    "its ablation λ = 0": ("icbf", "split-0"),
 }
-GUARDS = {
-    "none": "",
-    "select": "+select-learned",
-    "shield": "+shield-learned",
-    "shield, analytic": "+shield-analytic",
-    "full": "+full-learned",
+# The same under other guards.
+OTHERS: dict[str, Row] = {
+    "ICBF, ours, `select`": ("icbf", "split+select-learned"),
+    "BC, `full`": ("bc", "default+full-learned"),
+    "ICBF, ours, `full`": ("icbf", "split+full-learned"),
+    "MPC from a zero proposal (`mpc`), `full`": ("mpc", "default+full-learned"),
 }
 
 
@@ -54,6 +53,7 @@ class Question:
     row: Row
     paired: Row
     keys: tuple[str, ...] = ("return", "cost_safe_start")
+    shown: bool = True  # on the page
 
 
 SHIELD, FULL = "+shield-learned", "+full-learned"
@@ -72,7 +72,12 @@ QUESTIONS = (
     Question("the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0")),
     Question("the barrier in training, under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
     *(
-        Question(f"the printed losses, λ = {weight}, not MADIFF", ("icbf", f"paper{name}"), ("madiff", "default"))
+        Question(
+            f"the printed losses, λ = {weight}, not MADIFF",
+            ("icbf", f"paper{name}"),
+            ("madiff", "default"),
+            shown=weight in ("0.1", "10"),
+        )
         for weight, name in (("0.1", ""), ("1", "-1"), ("3", "-3"), ("10", "-10"))
     ),
     Question(
@@ -84,8 +89,9 @@ QUESTIONS = (
         "diffusion (MADIFF), not return-conditioned BC, under a shield",
         ("madiff", f"default{SHIELD}"),
         ("bc-return", f"default{SHIELD}"),
+        shown=False,
     ),
-    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default")),
+    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default"), shown=False),
     Question(
         "four times MADIFF's updates, under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")
     ),
@@ -95,7 +101,7 @@ QUESTIONS = (
         ("bc-return", f"default{SHIELD}"),
     ),
     Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
-    Question("centralized, not decentralized BC", ("bc", "joint"), ("bc", "default")),
+    Question("centralized, not decentralized BC", ("bc", "joint"), ("bc", "default"), shown=False),
     Question("centralized, not decentralized MADIFF, one plan for all", ("madiff", "default"), ("madiff", "own")),
     Question(
         "centralized, not decentralized MADIFF, one plan for all, under a shield",
@@ -123,16 +129,18 @@ OF_ROBOTS = (
         ("icbf", f"default{STEADY}"),
         ("madiff", f"default{STEADY}"),
         ROBOT_KEYS,
+        shown=False,
     ),
     Question(
         "diffusion (MADIFF), not return-conditioned BC",
         ("madiff", f"default{STEADY}"),
         ("bc-return", f"default{ADAPT}"),
         ROBOT_KEYS,
+        shown=False,
     ),
     Question("return-conditioned BC, not BC", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
     *(
-        Question(f"{words}, not BC", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS)
+        Question(f"{words}, not BC", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS, shown=False)
         for words, name in (("10 % BC", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))
     ),
     *(
@@ -141,6 +149,7 @@ OF_ROBOTS = (
             ("bc", f"default{FULL}"),
             ("mpc", f"default{FULL}{reach}"),
             ROBOT_KEYS,
+            shown=reach != "",
         )
         for where, reach in (("near rest", ""), ("climbed anywhere", "+trust_radius2.0"))
     ),
@@ -164,22 +173,23 @@ def cell(suite: str, task: str, row: Row, keys: tuple[str, str], digits: tuple[i
 
 
 def crossed(suite: str) -> str:
-    """A line per proposal and guard, a column per task: normalised return / cost of resets that start safely."""
+    """A line per proposal, a column per task: normalised return / cost of resets that start safely → return under a
+    shield, whose cost the page gives."""
     names, lines = tasks_of(suite), []
-    for words, (sees, (algorithm, plain)) in PROPOSALS.items():
-        for guard, ending in GUARDS.items():
-            row, cells = (algorithm, plain + ending), []
-            for task in names:
-                text, seeds = cell(suite, task, row, ("return_norm", "cost_safe_start"), (2, 3))
-                cells.append((text, seeds if plain != "reference" else 0))
-            if any(text != "–" for text, _ in cells):
-                lines.append(([words, sees, guard if plain != "reference" else ""], cells))
+    for words, row in (PROPOSALS | OTHERS).items():
+        cells = []
+        for task in names:
+            text, seeds = cell(suite, task, row, ("return_norm", "cost_safe_start"), (2, 2))
+            guarded = mean(suite, task, variant(task, (row[0], row[1] + SHIELD)), "return_norm")
+            text += f" → {guarded:z.2f}" if guarded is not None else ""
+            cells.append((text, seeds if row[1] != "reference" else 0))
+        lines.append((words, cells))
     usual = [Counter(cells[i][1] for _, cells in lines if cells[i][1]).most_common(1)[0][0] for i in range(len(names))]
     heads = [f"{name.partition('-')[2]} [{seeds}]" for name, seeds in zip(names, usual)]
-    out = ["| " + " | ".join(["proposal", "sees", "guard", *heads]) + " |", "|---" * (3 + len(names)) + "|"]
-    for about, cells in lines:
+    out = ["| proposal | " + " | ".join(heads) + " |", "|---" * (1 + len(names)) + "|"]
+    for words, cells in lines:
         marked = [text + (f" [{n}]" if n and n != seeds else "") for (text, n), seeds in zip(cells, usual)]
-        out.append("| " + " | ".join([*about, *marked]) + " |")
+        out.append("| " + " | ".join([words, *marked]) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])
 
 
@@ -233,7 +243,7 @@ def questions(suite: str) -> str:
     out = ["| what differs | of | " + " | ".join(n.partition("-")[2] for n in names) + " |"]
     out.append("|---" * (2 + len(names)) + "|")
     for q, key, ds in answers(suite):
-        if not ds or (key != "return" and not any(d.holds for d in ds)):
+        if not q.shown or not ds or (key != "return" and not any(d.holds for d in ds)):
             continue
         by_task = {d.task: d for d in ds}
         cells = [shown(by_task[n], key) if n in by_task else "–" for n in names]
@@ -246,7 +256,7 @@ def counted(suite: str) -> str:
     What differs nowhere is left out."""
     out = ["| what differs | of | tasks | seeds | more on | less on |", "|---" * 6 + "|"]
     for q, key, ds in answers(suite, OF_ROBOTS):
-        if not ds or not any(d.holds for d in ds):
+        if not q.shown or not ds or not any(d.holds for d in ds):
             continue
         sides = [[f"`{d.task}` {d.mean:+.3g}" for d in ds if d.holds and d.mean * sign > 0] for sign in (1, -1)]
         listed = [f": {', '.join(side)}" if len(side) <= 3 else "" for side in sides]

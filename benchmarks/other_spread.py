@@ -77,15 +77,13 @@ def row(policy: str, logs: str, place: str, result: dict) -> dict:
 
 
 def table(rows: list[dict]) -> str:
-    lines = [
-        "| policy | played in | guard | return | steps with contact | episodes with contact |",
-        "|---|---|---|---|---|---|",
-    ]
-    for r in rows:
-        lines.append(
-            f"| {r['policy']} | {r['place']} | {r['guard']} | {float(r['return']):.1f} | {float(r['cost']):.2f} | "
-            f"{100 * float(r['violation_rate']):.1f} % |"
-        )
+    """A line per policy and simulator: alone and under a shield."""
+    lines = ["| policy | played in | alone | shield |", "|---|---|---|---|"]
+    for policy, place in dict.fromkeys((r["policy"], r["place"]) for r in rows):
+        both = [r for r in rows if (r["policy"], r["place"]) == (policy, place)]
+        numbers = [[float(r[key]) for key in ("return", "cost", "violation_rate")] for r in both]
+        cells = (f"{earned:.1f} / {cost:.2f} / {100 * rate:.0f} %" for earned, cost, rate in numbers)
+        lines.append(f"| {policy.replace('learned of', 'from')} | {place} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

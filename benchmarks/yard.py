@@ -106,15 +106,15 @@ def write(rows: list[list]) -> None:
 
 
 def table(file: Path) -> str:
-    lines = ["| method | guard | return | episodes with contact (bound) | n_episodes |", "|---|---|---|---|---|"]
-    ways = {"": "", "terminal_value=False": ", 3 rows without V", "horizon=7": ", 7 rows"}
-    ways |= {"horizon=10": ", 10 rows"}
-    ways |= {"horizon=3 terminal_value=True": ", 3 rows"}
+    lines = ["| method | guard | return | episodes with contact (bound) |", "|---|---|---|---|"]
+    ways = {"": "", "terminal_value=False": ", 3 steps without V", "horizon=7": ", 7 steps"}
+    ways |= {"horizon=10": ", 10 steps"}
+    ways |= {"horizon=3 terminal_value=True": ", 3 steps"}
     for r in stored.table(file):
         guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['barrier']}{ways[r['options']]}"
         bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
         touched = f"{100 * float(r['contact']):.3g} %{bound}"
-        lines.append(f"| {r['method']} | {guard} | {float(r['return']):.2f} | {touched} | {r['episodes']} |")
+        lines.append(f"| {r['method']} | {guard} | {float(r['return']):.2f} | {touched} |")
     return "\n".join(lines)
 
 
