@@ -29,16 +29,16 @@ class Pilot:
 
     def __init__(self, file: str, seed: int = 0):
         self.session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-        self.told = json.loads(self.session.get_modelmeta().custom_metadata_map["ringfence"])
+        self.facts = json.loads(self.session.get_modelmeta().custom_metadata_map["ringfence"])
         self.rng = np.random.default_rng(seed)
         self.info: dict[str, float] = {}
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode."""
-        inputs = {x["name"]: x for x in self.told["inputs"]}
+        inputs = {x["name"]: x for x in self.facts["inputs"]}
         fill = lambda x, value: np.broadcast_to(np.asarray(value, x["dtype"]), x["shape"]).copy()  # noqa: E731
-        self.memory = {name: fill(inputs[name], value) for name, value in self.told["initial"].items()}
+        self.memory = {name: fill(inputs[name], value) for name, value in self.facts["initial"].items()}
 
     def act(self, observations, state=None, cost: float | np.ndarray = np.nan) -> np.ndarray:
         """(N, A) from (N, O), (S,) and what the last step cost, in all or of each named constraint, where anybody knows."""
@@ -46,9 +46,9 @@ class Pilot:
         draw = lambda x: self.rng.standard_normal(x["shape"])  # noqa: E731
         feed = {
             x["name"]: np.asarray(given[x["name"]] if x["name"] in given else draw(x), x["dtype"])
-            for x in self.told["inputs"]
+            for x in self.facts["inputs"]
         }
-        names = [x["name"] for x in self.told["outputs"]]
+        names = [x["name"] for x in self.facts["outputs"]]
         out = dict(zip(names, self.session.run(names, feed)))
         self.memory = {f"memory.{k[5:]}": v for k, v in out.items() if k.startswith("next.")}
         self.info = {k[5:]: v.item() for k, v in out.items() if k.startswith("info.")}
@@ -79,10 +79,10 @@ def observed(names: list[str], place: np.ndarray, speed: np.ndarray, goal: np.nd
         others = [j for j in range(n) if j != i]
         row = []
         for name in names:
-            told = re.fullmatch(r"(own|goal|other)(\d*)\.(d?)(v?)([xy])", name)
-            if told is None:
+            found = re.fullmatch(r"(own|goal|other)(\d*)\.(d?)(v?)([xy])", name)
+            if found is None:
                 raise SystemExit(f"The policy reads '{name}', which odometry does not tell; compute it in observed().")
-            who, number, apart, fast, axis = told.groups()
+            who, number, apart, fast, axis = found.groups()
             axis, table = "xy".index(axis), speed if fast else place
             there = goal[i, axis] if who == "goal" else table[others[int(number)] if who == "other" else i, axis]
             row.append(there - table[i, axis] if apart else there)
@@ -119,7 +119,7 @@ def main(file: str, robots: list[str]) -> None:
 
         def step(self) -> None:
             if np.isfinite([self.place, self.speed, self.goal]).all():
-                seen = observed(self.pilot.told["names"]["observations"], self.place, self.speed, self.goal)
+                seen = observed(self.pilot.facts["names"]["observations"], self.place, self.speed, self.goal)
                 begun, actions = time.perf_counter(), self.pilot.act(seen)
                 ms = 1e3 * (time.perf_counter() - begun)
                 known = {"observed": seen.tolist(), "executed": actions.tolist(), "info": self.pilot.info}
@@ -129,9 +129,9 @@ def main(file: str, robots: list[str]) -> None:
                     sender.publish(self.command(action))
 
         def command(self, action: np.ndarray) -> Twist:
-            told = Twist()
-            told.linear.x, told.linear.y = map(float, action[:2])
-            return told
+            command = Twist()
+            command.linear.x, command.linear.y = map(float, action[:2])
+            return command
 
     rclpy.init()
     rclpy.spin(Team())

@@ -65,7 +65,7 @@ def move(p: np.ndarray, v: np.ndarray, g: np.ndarray, action: np.ndarray):
 
 
 class Yard(ParallelEnv):
-    """The yard behind PettingZoo's API; it tells the cost of contact, to all alike."""
+    """The yard behind PettingZoo's API; every agent gets the cost of contact."""
 
     metadata = {"name": "yard"}
 
@@ -83,7 +83,7 @@ class Yard(ParallelEnv):
     def reset(self, seed=None, options=None):
         self.now, self.t = begin(np.random.default_rng(seed), 1), 0
         self.agents = list(self.possible_agents)
-        return self._told(seen(*self.now)[0]), {a: {} for a in self.agents}
+        return self._by_agent(seen(*self.now)[0]), {a: {} for a in self.agents}
 
     def step(self, actions):
         p, v, g = self.now
@@ -91,11 +91,11 @@ class Yard(ParallelEnv):
         self.now, self.t = (p, v, g), self.t + 1
         over = self.t >= STEPS
         self.agents = [] if over else self.agents
-        told = self._told
-        ends = told([False] * N), told([over] * N)
-        return told(seen(p, v, g)[0]), told(reward[0].tolist()), *ends, told([{"cost": float(cost[0])}] * N)
+        each = self._by_agent
+        ends = each([False] * N), each([over] * N)
+        return each(seen(p, v, g)[0]), each(reward[0].tolist()), *ends, each([{"cost": float(cost[0])}] * N)
 
-    def _told(self, rows):
+    def _by_agent(self, rows):
         return dict(zip(self.possible_agents, rows))
 
 
@@ -152,9 +152,9 @@ def main(episodes: int = 200) -> None:
     run = ringfence.train("bc", store)[0]
     for guard in ("none", "shield", "full"):
         how = {} if guard == "none" else {"guard": guard, "world": world}
-        told = ringfence.play(run, Yard, episodes=episodes, num_envs=100, **how)
-        bad = 100 * told["violation_rate"]
-        print(f"cloning, guard {guard:7} return {told['return_mean']:.2f}, {bad:.1f} % of episodes with contact")
+        result = ringfence.play(run, Yard, episodes=episodes, num_envs=100, **how)
+        bad = 100 * result["violation_rate"]
+        print(f"cloning, guard {guard:7} return {result['return_mean']:.2f}, {bad:.1f} % of episodes with contact")
 
 
 if __name__ == "__main__":
