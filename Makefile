@@ -6,7 +6,8 @@ INSTALL = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 # Pages whose prose is held to the limits of docs/tools/prose.py.
 PLAIN = README index start choose commands errors data data-sets arrays import-tables import-tracks import-bags import-hdf5 import-public \
-	record extending export security ope replay replay-results gpu limits upgrade
+	record extending export security ope replay replay-results gpu limits upgrade guard guard-results method drivers-results attribution \
+	evaluation options crossing crossing-results benchmark tables ablations frontiers performance code
 
 .PHONY: demo test versions docs lint clean
 
