@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import json
 import re
 import tomllib
 from pathlib import Path
@@ -77,6 +78,17 @@ def test_every_task_has_a_page_with_its_results():
         assert f"`ringfence.{name}`" in pages["reference/README.md"]
 
 
+def test_every_notebook_is_a_page_with_what_it_printed():
+    tools = load("pages")
+    made = tools.pages()
+    assert sorted(tools.NOTEBOOKS) == sorted((ROOT / "examples").glob("*.ipynb"))
+    page = made["tutorials/replay_and_verdict.md"]
+    assert page.startswith("# Replay and verdict\n") and "](../replay.md)" in page
+    assert "```text\nWorld of 'square'" in page and "](data:image/png;base64,iVBOR" in page
+    linked = tools.on_page_markdown("see [it](../examples/replay_and_verdict.ipynb)", None, None, None)
+    assert linked == "see [it](tutorials/replay_and_verdict.md)"
+
+
 def test_pages_of_the_root_lead_into_the_site():
     tools = load("pages")
     made = tools.pages()
@@ -147,6 +159,13 @@ def test_prose_is_measured(tmp_path, page, wrong):
         for line in load("prose").measure(file, tmp_path).failures()
     ]
     assert (not found) if wrong is None else any(wrong in line for line in found), found
+
+
+def test_prose_of_a_notebook_is_its_cells_of_words(tmp_path):
+    cells = [{"cell_type": "code", "source": ["told = 1"]}, {"cell_type": "markdown", "source": ["Nobody ", "hears."]}]
+    (file := tmp_path / "some.ipynb").write_text(json.dumps({"cells": cells}))
+    (found,) = load("prose").measure(file, tmp_path).failures()
+    assert found.startswith("some.ipynb:1: 'hears'")
 
 
 def test_prose_of_a_page_that_fails_fails_the_command(tmp_path, capsys):

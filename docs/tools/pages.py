@@ -177,8 +177,8 @@ def notebook(file: Path) -> str:
         for output in cell["outputs"]:
             if "text" in output:
                 parts.append(f"```text\n{''.join(output['text']).rstrip()}\n```")
-            if "image/png" in output.get("data", ()):
-                parts.append(f"![](data:image/png;base64,{''.join(output['data']['image/png']).strip()})")
+            if drawn := output.get("data", {}).get("image/png"):
+                parts.append(f"![What the lines above draw](data:image/png;base64,{''.join(drawn).strip()})")
     parts.append(f"*This page is `examples/{file.name}`, to be run in a clone.*")
     return "\n\n".join(parts) + "\n"
 

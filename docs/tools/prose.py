@@ -1,4 +1,4 @@
-"""Measure the prose of README.md and docs/: `python docs/tools/prose.py`.
+"""Measure the prose of README.md, docs/ and the notebooks: `python docs/tools/prose.py`.
 
 Prose is what is left of a page without headings, tables, code, quoted messages and generated blocks. A list's item is a
 paragraph of its own. A page fails where its sentences are too long in the mean, a paragraph is too long or holds too
@@ -11,6 +11,7 @@ many numbers, or a word stands that only this project uses.
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 from pathlib import Path
@@ -161,18 +162,24 @@ class Measured(NamedTuple):
         numbers = max((p.numbers for p in self.paragraphs), default=0)
         verdict = "FAILS" if self.failures() else "long sentences" if self.mean > GOAL else ""
         measured = f"{self.words:7d}{self.mean:10.1f}{longest:9d}{numbers:9d}{len(self.private):9d}"
-        return f"{self.name:26s}{measured}  {verdict}".rstrip()
+        return f"{self.name:42s}{measured}  {verdict}".rstrip()
 
 
 def pages(root: Path = ROOT) -> dict[str, Path]:
     """By the name that `--pages` takes."""
     found = {"README": root / "README.md"}
     found |= {"index" if f.stem == "README" else f.stem: f for f in sorted((root / "docs").glob("*.md"))}
+    found |= {f.stem: f for f in sorted((root / "examples").glob("*.ipynb"))}
     return {name: file for name, file in found.items() if name not in LEFT_OUT}
 
 
 def measure(file: Path, root: Path = ROOT) -> Measured:
-    return Measured(str(file.relative_to(root)), paragraphs(file.read_text()))
+    """Of a notebook the cells of words are the page."""
+    text = file.read_text()
+    if file.suffix == ".ipynb":
+        words = ("".join(c["source"]) for c in json.loads(text)["cells"] if c["cell_type"] == "markdown")
+        text = "\n\n".join(words)
+    return Measured(str(file.relative_to(root)), paragraphs(text))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -180,11 +187,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--pages", nargs="+", choices=list(pages()), metavar="PAGE", help="some alone, with reasons")
     chosen = parser.parse_args(arguments).pages
     measured = [measure(file) for name, file in pages().items() if not chosen or name in chosen]
-    print(f"{'page':26s}{'words':>7s}{'a sentence':>10s}{'longest':>9s}{'numbers':>9s}{'private':>9s}")
+    print(f"{'page':42s}{'words':>7s}{'a sentence':>10s}{'longest':>9s}{'numbers':>9s}{'private':>9s}")
     print("\n".join(page.row() for page in measured))
     words = sum(page.words for page in measured)
     sentences = sum(p.sentences for page in measured for p in page.paragraphs)
-    print(f"{'together':26s}{words:7d}{words / max(sentences, 1):10.1f}")
+    print(f"{'together':42s}{words:7d}{words / max(sentences, 1):10.1f}")
     wrong = [line for page in measured for line in page.failures()]
     if chosen:
         print(*wrong, sep="\n")
