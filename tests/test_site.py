@@ -62,8 +62,18 @@ def test_the_citation_is_of_this_version():
     assert f"## {ringfence.__version__}\n" in (ROOT / "CHANGELOG.md").read_text()
 
 
-def test_every_task_has_a_page_with_its_results():
-    pages = load("pages").pages()
+@pytest.fixture(scope="module")
+def tools():
+    return load("pages")
+
+
+@pytest.fixture(scope="module")
+def made(tools):
+    return tools.pages()
+
+
+def test_every_task_has_a_page_with_its_results(made):
+    pages = made
     for name, task in TASKS.items():
         page = pages[f"tasks/{name}.md"]
         assert f"# {name}\n" in page and f"ringfence data make {name}" in page
@@ -78,9 +88,14 @@ def test_every_task_has_a_page_with_its_results():
         assert f"`ringfence.{name}`" in pages["reference/README.md"]
 
 
-def test_every_notebook_is_a_page_with_what_it_printed():
-    tools = load("pages")
-    made = tools.pages()
+def test_every_command_says_its_options(made):
+    page = made["options-of-commands.md"]
+    for command in ("eval", "certify", "data import-table", "log verify", "bench status"):
+        assert f"## ringfence {command}\n\n```text\nusage: ringfence {command} " in page
+    assert "--compensate" in page and "\x1b" not in page
+
+
+def test_every_notebook_is_a_page_with_what_it_printed(tools, made):
     assert sorted(tools.NOTEBOOKS) == sorted((ROOT / "examples").glob("*.ipynb"))
     page = made["tutorials/replay_and_verdict.md"]
     assert page.startswith("# Replay and verdict\n") and "](../replay.md)" in page
@@ -89,9 +104,7 @@ def test_every_notebook_is_a_page_with_what_it_printed():
     assert linked == "see [it](tutorials/replay_and_verdict.md)"
 
 
-def test_pages_of_the_root_lead_into_the_site():
-    tools = load("pages")
-    made = tools.pages()
+def test_pages_of_the_root_lead_into_the_site(tools, made):
     for place in tools.OUTSIDE.values():
         targets = re.findall(r"\]\(([^)#\s]+)", made[place])
         assert targets

@@ -3,14 +3,18 @@ committed results; the Python reference, from docstrings; the changelog and the 
 
 from __future__ import annotations
 
+import contextlib
 import csv
+import io
 import json
 import os
 import re
 from collections import defaultdict
 from pathlib import Path
+from unittest import mock
 
 import ringfence
+from ringfence.cli import app
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, System
@@ -134,6 +138,7 @@ def on_config(config):
     """The navigation's sections that are made here."""
     nav = {title: pages for entry in config["nav"] for title, pages in entry.items()}
     nav["Tutorials"] += [f"tutorials/{file.stem}.md" for file in NOTEBOOKS]
+    nav["Reference"].insert(1, {"Options of every command": "options-of-commands.md"})
     tasks = [{group: [f"tasks/{t.name}.md" for t in found]} for group, found in groups().items()]
     nav["Reference"] += [{"Tasks": ["tasks/README.md", *tasks]}]
     nav["Reference"] += [{"Python": ["reference/README.md", *({title: _place(title)} for title in REFERENCE)]}]
@@ -162,7 +167,26 @@ def pages() -> dict[str, str]:
     made |= {f"tasks/{task.name}.md": task_page(task) for task in TASKS.values()}
     made |= {_place(title): _modules(title, modules) for title, modules in REFERENCE.items()}
     made |= {f"tutorials/{file.stem}.md": notebook(file) for file in NOTEBOOKS}
+    made["options-of-commands.md"] = options_of_commands()
     return made | {place: from_root(ROOT / file) for file, place in OUTSIDE.items()}
+
+
+def options_of_commands() -> str:
+    """What every command prints of itself."""
+    commands = [[name] for name in app.COMMANDS]
+    commands += [[group, name] for group, (found, _) in app.GROUPS.items() for name in found]
+    parts = [
+        "# Options of every command",
+        "As `ringfence COMMAND --help` prints them; [commands](commands.md) has examples.",
+    ]
+    for words in commands:
+        printed = io.StringIO()
+        wide = mock.patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1"})
+        with wide, contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            app.main([*words, "--help"])
+        lines = "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
+        parts += [f"## ringfence {' '.join(words)}", f"```text\n{lines}\n```"]
+    return "\n\n".join(parts) + "\n"
 
 
 def notebook(file: Path) -> str:
