@@ -9,6 +9,7 @@ import io
 import json
 import os
 import re
+import textwrap
 from collections import defaultdict
 from pathlib import Path
 from unittest import mock
@@ -23,6 +24,7 @@ from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
+WIDTH = 86  # letters of a line of code that a page shows
 # In the order in which one reads them.
 NOTEBOOKS = [
     ROOT / "examples" / f"{name}.ipynb"
@@ -181,11 +183,12 @@ def options_of_commands() -> str:
     ]
     for words in commands:
         printed = io.StringIO()
-        wide = mock.patch.dict(os.environ, {"COLUMNS": "100", "NO_COLOR": "1"})
+        wide = mock.patch.dict(os.environ, {"COLUMNS": str(WIDTH), "NO_COLOR": "1"})
         with wide, contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
             app.main([*words, "--help"])
-        lines = "\n".join(line.rstrip() for line in printed.getvalue().strip().splitlines())
-        parts += [f"## ringfence {' '.join(words)}", f"```text\n{lines}\n```"]
+        lines = [line.rstrip() for line in printed.getvalue().strip().splitlines()]
+        lines = [line if line.startswith(" ") else textwrap.fill(line, WIDTH) for line in lines]
+        parts += [f"## ringfence {' '.join(words)}", "\n".join(["```text", *lines, "```"])]
     return "\n\n".join(parts) + "\n"
 
 
