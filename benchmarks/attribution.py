@@ -198,8 +198,6 @@ ROBOTS: dict[str, Row] = {
     "BC": ("bc", f"default{ADAPT}"),
     "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
     "MA-TD3+BC": ("ma-td3bc", f"default{ADAPT}"),
-    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", f"default{ADAPT}"),
-    "OMAR": ("omar", f"default{ADAPT}"),
     "our MADIFF": ("madiff", f"default{STEADY}"),
     "ICBF": ("icbf", f"default{STEADY}"),
     "BC, `full`": ("bc", f"default{FULL}"),

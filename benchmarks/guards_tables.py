@@ -158,11 +158,11 @@ def tiers() -> str:
 
 def crossing(suite: str, named: dict[str, str]) -> str:
     """A row per variant of one task."""
-    head = ("method", "return", "steps with contact", "episodes with contact (bound)", "infeasible_rate")
+    head = ("method", "return", "episodes with contact (bound)", "infeasible_rate")
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for key, words in named.items():
         if found := of_crossing(suite, "crossing-hasty", key):
-            part = [words, f"{mean(found, 'return_mean'):.2f}", f"{mean(found, 'cost_mean'):.3g}"]
+            part = [words, f"{mean(found, 'return_mean'):.2f}"]
             out.append("| " + " | ".join([*part, touching(found), unmet(found)]) + " |")
     return "\n".join(out)
 
@@ -196,13 +196,13 @@ def sizes() -> str:
 def other_simulator() -> str:
     """Rows of benchmarks/other_simulator.py."""
     rows = stored.table(RESULTS / "other_simulator.csv")
-    head = ("learned from", "agents", "guard", "return", "steps with contact", "episodes with contact", "n_episodes")
+    head = ("learned from", "agents", "guard", "return", "episodes with contact")
     out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
     for r in rows:
-        part = [r[k] for k in ("learned from", "agents", "guard", "return", "steps with contact")]
+        part = [r[k] for k in ("learned from", "agents", "guard", "return")]
         part.append(f"{100 * float(r['episodes with contact']):.3g} %")
         part[-1] += f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
-        out.append("| " + " | ".join([*part, r["episodes"]]) + " |")
+        out.append("| " + " | ".join(part) + " |")
     return "\n".join(out)
 
 

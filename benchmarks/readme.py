@@ -48,7 +48,6 @@ BRIEF = (("return_mean", 0), ("cost_mean", 1))
 # Columns of the robots' table.
 SHORT = (
     ("behaviour data", "reference", "data"),
-    ("data within the limit", "reference", "data within the limit"),
     ("bc", "mujoco", "BC"),
     ("ma-td3bc", "mujoco", "MA-TD3+BC"),
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
@@ -66,7 +65,7 @@ PUBLISHED = {
 UNSHOWN = re.compile(
     r"parameters|milliseconds|compile|mean return|size of|imports|all entries|PyTorch|random actions|"
     r"per agent|training update|ant_4x2|grid|overhead|two cores|batch=16|batch=1024|N=24|against first|in training|"
-    r"\b6 agents|kill|cells|wall clock|64 wide|by ℓ"
+    r"\b6 agents|kill|cells|given actions|wall clock|64 wide|by ℓ"
 )
 
 
@@ -253,7 +252,7 @@ def robots_short(groups: dict, ending: str) -> str:
         cells = []
         for algorithm, variant, _ in SHORT:
             rows = found[name, algorithm, variant]
-            numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else absent(variant)
+            numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else "–"
             unusual = rows and variant != "reference" and len(rows) != usual
             cells.append(numbers + fallen(rows) + f" [{len(rows)}]" * bool(unusual))
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
@@ -335,16 +334,11 @@ def cell(rows: list[dict], cost: str = "cost_safe_start", digits: int = 3) -> st
     return text + fallen(rows)
 
 
-def absent(variant: str) -> str:
-    """Where there is no row: no logged episode is of that kind, or nothing was played yet."""
-    return "none" if variant == "reference" else "–"
-
-
 def fallen(rows: list[dict]) -> str:
     """How many episodes ended before the time limit, where any did: an early end costs little."""
     ended = [float(r["termination_rate"]) for r in rows if r.get("termination_rate")]
     share = 100 * float(np.mean(ended)) if ended else 0.0
-    return f" ({max(share, 1):.0f} % fell)" if share else ""
+    return f" ({max(share, 1):.0f} %)" if share else ""
 
 
 def put(file: str, name: str, text: str) -> None:
