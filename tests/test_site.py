@@ -100,8 +100,12 @@ def test_every_notebook_is_a_page_with_what_it_printed(tools, made):
     page = made["tutorials/replay_and_verdict.md"]
     assert page.startswith("# Replay and verdict\n") and "](../replay.md)" in page
     assert "```text\nWorld of 'square'" in page and "](data:image/png;base64,iVBOR" in page
-    linked = tools.on_page_markdown("see [it](../examples/replay_and_verdict.ipynb)", None, None, None)
-    assert linked == "see [it](tutorials/replay_and_verdict.md)"
+    for link, there in (
+        ("../examples/replay_and_verdict.ipynb", "tutorials/replay_and_verdict.md"),
+        ("../CONTRIBUTING.md#a-simulator", "contributing.md#a-simulator"),
+        ("../CHANGELOG.md", "changelog.md"),
+    ):
+        assert tools.on_page_markdown(f"see [it]({link})", None, None, None) == f"see [it]({there})"
 
 
 def test_pages_of_the_root_lead_into_the_site(tools, made):

@@ -150,8 +150,11 @@ def on_config(config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """On the site a notebook is a page."""
-    return re.sub(r"\]\(\.\./examples/(\w+)\.ipynb\)", r"](tutorials/\1.md)", markdown)
+    """On the site a notebook is a page, and so are some files of the root."""
+    markdown = re.sub(r"\]\(\.\./examples/(\w+)\.ipynb\)", r"](tutorials/\1.md)", markdown)
+    for file, place in OUTSIDE.items():
+        markdown = re.sub(rf"\]\(\.\./{re.escape(file)}(#[\w-]+)?\)", rf"]({place}\1)", markdown)
+    return markdown
 
 
 def on_files(files, config):
