@@ -69,8 +69,11 @@ def test_the_first_page_fits_a_screen():
     assert len((ROOT / "README.md").read_bytes()) <= 5000
 
 
-# Of the pages whose blocks `python` are run as they stand; sketches, which need something of the reader's, are `py`.
-@pytest.mark.parametrize("page", ["arrays", "import-tables", "record", "data-sets", "extending", "start"])
+# Blocks `python` are run as they stand; sketches, which need something of the reader's, are `py`.
+RUN = [f.stem for f in sorted((ROOT / "docs").glob("*.md")) if "```python" in f.read_text()]
+
+
+@pytest.mark.parametrize("page", RUN)
 def test_code_of_a_page_runs(page, tmp_path, monkeypatch, capsys):
     """In examples/, block after block; the World, the policy and the logs are small."""
     fit, train = ringfence.fit, ringfence.train
