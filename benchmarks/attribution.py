@@ -197,11 +197,9 @@ def crossed(suite: str) -> str:
 ROBOTS: dict[str, Row] = {
     "BC": ("bc", f"default{ADAPT}"),
     "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
-    "MA-TD3+BC": ("ma-td3bc", f"default{ADAPT}"),
     "our MADIFF": ("madiff", f"default{STEADY}"),
     "ICBF": ("icbf", f"default{STEADY}"),
     "BC, `full`": ("bc", f"default{FULL}"),
-    "ICBF, `full`": ("icbf", f"default+low_temperature{FULL}"),
     "MPC, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }
 

@@ -565,15 +565,19 @@ CLAIMS = (
 
 
 def main() -> None:
-    lines, wrong = ["| page | claim | rests on | found |", "|---|---|---|---|"], 0
-    for claim in CLAIMS:
+    lines, wrong, page = ["| claim | rests on | found |", "|---|---|---|"], 0, ""
+    for claim in sorted(CLAIMS, key=lambda claim: claim.page):
         text = re.sub(r"\s+", " ", (ROOT / claim.page).read_text())
         holds, found = claim.check()
         if claim.words not in text:
             holds, found = False, "the sentence is not there"
         wrong += not holds
         print(f"{'ok   ' if holds else 'WRONG'} {claim.page}: {claim.words}: {found}")
-        lines.append(f"| {claim.page} | {claim.words} | {claim.file} | {'' if holds else '**wrong**: '}{found} |")
+        if claim.page != page:
+            page = claim.page
+            lines.append(f"| **{page}** | | |")
+        file = claim.file.removeprefix("results/").removesuffix("/table.csv")
+        lines.append(f"| {claim.words} | {file} | {'' if holds else '**wrong**: '}{found} |")
     put("docs/claims.md", "claims", "\n".join(lines))
     sys.exit(f"{wrong} claims do not hold" if wrong else 0)
 

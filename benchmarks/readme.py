@@ -49,7 +49,6 @@ BRIEF = (("return_mean", 0), ("cost_mean", 1))
 SHORT = (
     ("behaviour data", "reference", "data"),
     ("bc", "mujoco", "BC"),
-    ("ma-td3bc", "mujoco", "MA-TD3+BC"),
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
     ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
     ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
