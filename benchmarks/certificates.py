@@ -220,7 +220,7 @@ def repetition(pools: dict[float, Pool], orders: dict[float, np.ndarray]) -> dic
         "others_rate": round(rate, 4),
         "pool_rate": round(float(violated.mean()), 4),
         "kept": rate <= bound,
-        "vacuous": bound > 3 * rate + 0.01,
+        "vacuous": bound > 3 * float(violated.mean()) + 0.01,
     }
 
 
@@ -257,7 +257,7 @@ def picture(out: Path, file: Path) -> None:
     axis.invert_yaxis()
     axis.set_xlim(left=0)
     axis.set_xlabel("episodes with a violation, %")
-    axis.legend(loc="lower right", frameon=False)
+    figure.legend(loc="outside upper right", ncols=2, frameon=False)
     axis.spines[["top", "right"]].set_visible(False)
     file.parent.mkdir(exist_ok=True)
     figure.savefig(file, dpi=110)

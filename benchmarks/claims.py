@@ -105,7 +105,7 @@ def of_late_actions() -> tuple[bool, str]:
     rows = {(r["faults"], r["guard"], r["compensated"]): r for r in stored.table(ROOT / STRESS)}
     known = [float(rows[f"delay{k}", "shield", "True"]["violation_rate"]) for k in (1, 2, 3)]
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
-    holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) < 0.0165
+    holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and max(unknown) >= 0.9
     return holds, f"{known} of {unknown}"
 
 
@@ -557,7 +557,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/stress.md",
-        "leaves 0, 0.7 and 1.6 % of the episodes with contact, of 3, 40 and 90 %",
+        "leaves contact in at most 2 % of the episodes. One that does not know leaves it in up to 90 %",
         STRESS,
         of_late_actions,
     ),

@@ -1,6 +1,6 @@
 """How seldom the monitor of a certificate raises a false alarm, and how soon a true one.
 
-python benchmarks/monitor.py          # writes results/stress/monitor.csv and the table of docs/stress.md; a minute
+python benchmarks/monitor.py          # writes results/stress/monitor.csv and the table of docs/stress.md
 
 Episodes violate or not, independently and with a given probability; no simulator is asked. Promises and rates are
 those of results/stress/crossing.csv (benchmarks/stress.py): a guard's upper bound as it was tested, and the rate that
@@ -58,8 +58,8 @@ def case(what: str, promised: float, rate: float) -> dict[str, Any]:
     rng = np.random.default_rng(0)
     first = np.array([first_alarm(Monitor(promised), rng.random(EPISODES) < rate) for _ in range(STREAMS)])
     raised = first <= EPISODES
-    row = {"episodes": what, "rate": rate, "streams": STREAMS, "length": EPISODES, "alarms": round(raised.mean(), 4)}
-    row |= {"median": "", "nine tenths": ""}
+    row = {"episodes": what, "rate": rate, "streams": STREAMS, "length": EPISODES}
+    row |= {"alarms": round(float(raised.mean()), 4), "median": "", "nine tenths": ""}
     if raised.mean() >= 0.9:
         row |= {"median": int(np.median(first)), "nine tenths": int(np.quantile(first, 0.9))}
     print(row, flush=True)
@@ -78,7 +78,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = ["| guard knows | promised | episodes | violating | streams with an alarm | median episodes to it |"]
     lines.append("|---" * 6 + "|")
     for r in rows:
-        cells = [r["guard knows"], f"{100 * r['promised']:.2f} %", r["episodes"], f"{100 * r['rate']:.1f} %"]
+        cells = [r["guard knows"], f"{100 * r['promised']:.2f} %", r["episodes"], f"{100 * r['rate']:.2f} %"]
         lines.append(f"| {' | '.join(cells)} | {100 * r['alarms']:.1f} % | {r['median'] or '–'} |")
     return "\n".join(lines)
 
