@@ -20,11 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from ringfence.guards.barrier import AHEAD, BarrierSource
+from ringfence.guards.barrier import BarrierSource
 from ringfence.guards.correction import TOLERANCE, Corrector
 from ringfence.guards.options import GuardOptions
 from ringfence.nets.mlp import MLP
-from ringfence.problem import normalise
 from ringfence.problem.constraints import lowest
 from ringfence.problem.features import others_offsets
 from ringfence.types import Array, Key
@@ -76,10 +75,7 @@ class Guard(eqx.Module):
             plan = self.shielded(present, plan, margin, unseen)
         ahead, spread = self.predict(present, plan[:, None])
         scores = self.barrier.along(self.nearer(ahead, unseen), spread)[:, 0]
-        clear = self.clear(ahead, spread, margin, unseen)
-        if self.options.responsibility != "all":
-            clear = self.shared(present, ahead, spread, margin, unseen)
-        missing = self.missing(present, clear[:, 0], margin)
+        missing = self.missing(present, self.clear(ahead, spread, margin, unseen)[:, 0], margin)
         return Decision(
             plan=plan,
             chosen=chosen,
@@ -145,23 +141,6 @@ class Guard(eqx.Module):
     def clear(self, rows: Array, spread: Array, margin: Array, unseen: Array | None = None) -> Array:
         """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst."""
         return lowest(self.barrier.along(self.nearer(rows, unseen), spread) - _over(margin, 2))
-
-    def shared(self, present: Array, rows: Array, spread: Array, margin: Array, unseen: Array | None) -> Array:
-        """(B, P, K, N) by how much predicted rows pass the margins, and what is left to the other of each pair: a share
-        of what both would have if neither did anything."""
-        spec = self.world.spec
-        low, high = (jnp.asarray(bound, jnp.float32) for bound in (spec.action_low, spec.action_high))
-        nothing = normalise.to_unit(jnp.clip(0.0, low, high), spec.action_low, spec.action_high)
-        shape = (len(present), 1, rows.shape[2] - 1, *present.shape[1:2], spec.action_dim)
-        idle, _ = self.predict(present, jnp.broadcast_to(nothing, shape))
-        kept = margin[..., 0].reshape(len(margin), 1, 1, -1, 1)
-        of_idle = self.barrier.parts(self.nearer(idle, unseen)) - kept
-        of_plan = self.barrier.parts(self.nearer(rows, unseen)) - kept
-        names = self.barrier.part_names
-        share = np.array([0.5 * (thing.startswith("other") or what == AHEAD) for what, thing in names], np.float32)
-        least = 0.0 if self.options.responsibility == "reserve" else -1e3
-        found = lowest(of_plan - share * jnp.clip(of_idle, least, 1e3))
-        return found - jnp.maximum(spread / self.world.ood_threshold - 1.0, 0.0)
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
         """(B, K, N) how much predicted rows, clear of the margins by so much (B, K, N), fall short of the condition: 0
@@ -258,11 +237,7 @@ def _missing_along(guard: Guard, given: tuple[Array, Array | None], plans: Array
     """(B, S, K, N) what is missing along plans (B, S, K, N, A), as `Guard.missing` tells it; `given` are the present
     and for how long others were not seen."""
     present, unseen = given
-    rows, spread = guard.predict(present, guard.held(plans))
-    if guard.options.responsibility == "all":
-        clear = guard.clear(rows, spread, margin, unseen)
-    else:
-        clear = guard.shared(present, rows, spread, margin, unseen)
+    clear = guard.clear(*guard.predict(present, guard.held(plans)), margin, unseen)
     return jax.vmap(lambda clear: guard.missing(present, clear, margin), 1, 1)(clear)
 
 

@@ -48,9 +48,6 @@ class GuardOptions:
     hold: Held = 1  # steps for which an action is held: agents that act every so many steps
     # m/s² that others may accelerate by while nobody sees them: late and old observations have them nearer by so much
     others_acceleration: NonNegative = 0.0
-    # what an agent leaves of a pair's condition to the other: nothing; half of what idle agents would have, above the
-    # margin or below it; half of what is above it
-    responsibility: Literal["all", "half", "reserve"] = "all"
     proof: NonNegative = 0.0  # what every entry may be off by, while plans are still proved; 0: nothing is proved
     proof_rows: Samples = 10  # rows of the way out that is proved
     proof_residual: NonNegative = 0.0  # by which a predicted row of the own velocity may be off, in its own unit
