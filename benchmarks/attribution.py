@@ -25,7 +25,6 @@ PROPOSALS: dict[str, Row] = {
     "do nothing": ("do-nothing", "reference"),
     "BC": ("bc", "default"),
     "10 % BC": ("bc-best", "default"),
-    "BC on episodes without cost": ("bc-safe", "default"),
     "return-conditioned BC": ("bc-return", "default"),
     "MA-TD3+BC": ("ma-td3bc", "default"),
     "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "default"),
@@ -34,7 +33,6 @@ PROPOSALS: dict[str, Row] = {
     "our MADIFF, four times the updates": ("madiff", "long"),
     "ICBF as printed, λ = 0.1": ("icbf", "paper"),
     "ICBF, ours, λ = 3": ("icbf", "split"),
-    "its ablation λ = 0": ("icbf", "split-0"),
 }
 # The same under other guards.
 OTHERS: dict[str, Row] = {

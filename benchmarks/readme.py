@@ -85,13 +85,14 @@ def speeds() -> str:
     """One line per measurement, a median and its 99th percentile in one."""
     rows = [r for file in sorted((RESULTS / "performance").glob("*.json")) for r in json.loads(file.read_text())]
     late = {r["name"].removesuffix(", p99"): r["value"] for r in rows if r["name"].endswith(", p99")}
-    lines = ["| what | measured | script in `benchmarks/` |", "|---|---|---|"]
+    lines = ["| what | measured |", "|---|---|"]
     for r in rows:
         name = r["name"].removesuffix(", p50")
         if UNSHOWN.search(name) or name.endswith(", p99"):
             continue
         text = f"{r['value']:.4g} {r['unit']}" + (f" (p99 {late[name]:.3g})" if r["name"].endswith("p50") else "")
-        lines.append(f"| {name} | {text} | `{r['command'].split()[1].removeprefix('benchmarks/')}` |")
+        name = name.replace("one joint action", "an action").replace("a loaded controller", "a controller")
+        lines.append(f"| {name} | {text} |")
     return "\n".join(lines)
 
 
