@@ -160,10 +160,9 @@ def two_drifts(two_drivers):
 PLANS = dict(num_updates=300, batch=32, width=32, depth=2, horizon=5, diffusion_steps=20, inverse_width=32, ema=0.95)
 
 
-@pytest.mark.parametrize("net", ["attention", "residual"])
-def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path, net):
+def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path):
     """Told the drivers, a planner goes one way through an episode, and both ways occur; guards get plans of both."""
-    changes = PLANS | {"net": net, "drivers": 2}
+    changes = PLANS | {"net": "residual", "drivers": 2}
     run = loop.train("madiff", two_drifts, out=tmp_path, changes=changes, world=QUICK_WORLD, quiet=True)[0]
     assert run.metrics[-1]["drivers/sure"] > 0.95
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
