@@ -6,6 +6,7 @@ python benchmarks/guards_tables.py
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -208,19 +209,14 @@ def other_simulator() -> str:
 
 def proving() -> str:
     """Systems that chose no setting, from results/proving."""
-    heads = ["system", "episodes", "verdict", "causes found", "clone", "entries", "shield", "oracle", "naive"]
-    heads += ["shield", "oracle"]
+    ways = ("none", "shield learned", "shield oracle")
+    heads = ["system", "verdict", "causes found", "clone", "shield", "oracle", "naive", "shield", "oracle"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for file in sorted((RESULTS / "proving").glob("proving-*.json")):
         found = json.loads(file.read_text())
-        rows = found["rows"]
-        cells = [f"`{found['task'].removeprefix('proving-')}`", str(found["episodes"]), found["verdict"]]
-        cells.append("; ".join(found["causes"]) or "none")
-        beside = "shield learned, networks on all entries"
-        for name in ("bc none", f"bc {beside}", "bc shield learned", "bc shield oracle"):
-            cells.append(_share_and_return(rows.get(name)))
-        for name in ("naive none", "naive shield learned", "naive shield oracle"):
-            cells.append(_share_and_return(rows.get(name)))
+        causes = dict.fromkeys(re.sub(" of agent.*", " of some", cause) for cause in found["causes"])
+        cells = [f"`{found['task'].removeprefix('proving-')}`", found["verdict"], "; ".join(causes) or "none"]
+        cells += [_share_and_return(found["rows"].get(f"{driver} {way}")) for driver in ("bc", "naive") for way in ways]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
@@ -228,7 +224,8 @@ def proving() -> str:
 def _share_and_return(row: dict | None) -> str:
     if row is None or "refused" in row:
         return "–"
-    return f"{100 * row['violation_rate']:.0f} %, {row['return_mean']:.2f}"
+    share = 100 * row["violation_rate"]
+    return f"{share:.1f} %, {row['return_mean']:.2f}" if 0 < share < 1 else f"{share:.0f} %, {row['return_mean']:.2f}"
 
 
 if __name__ == "__main__":
