@@ -37,6 +37,7 @@ ROWS = {
 # What differs in one thing; the World of `all` is fitted without a search for causes.
 ALL = "shield learned, networks on all entries"
 BESIDE = {
+    "shield learned, within the logs": LEARNED | {"within_logs": True},
     "adapt learned": LEARNED | {"guard": "adapt"},
     "full learned": LEARNED | {"guard": "full"},
     ALL: LEARNED | {"world": "all"},

@@ -12,7 +12,7 @@ import pytest
 from ringfence import EpisodeStore, fit, guard
 from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
-from ringfence.guards import searched
+from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
 from ringfence.world import cause_search, causes, foresight, margins, probes, verdict
@@ -223,6 +223,39 @@ def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
     assert again.card == card
     x = again.map(jnp.asarray(walks(5)[0]), None)
     np.testing.assert_array_equal(again.barrier.of_steps(x, x), fitted.barrier.of_steps(x, x))
+
+
+def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
+    """On demand: beyond the logs may be a wall that nobody touched."""
+    ranges = fitted.card.data.ranges
+    names = ["own.x", "own.y", "own.v", *[one.name for one in causes.offsets(NAMES)]]
+    assert sorted(ranges) == sorted(names), "entries of goals and others have none"
+    seen = shown.Shown.by(fitted)
+    row = np.zeros((N, len(NAMES)), np.float32)
+    row[:, :2] = 1.0  # no post is there
+    row[:, [5, 6, 7, 8]] = 2.0  # others are far
+    row[:, 2] = 0.5
+    most = ranges["own.x"][1]
+    along = np.stack([row] * 5)
+    along[:, 0, 0] = most + np.array([-1.0, 0.0, 0.05, 0.2, 5.0])
+    score = np.asarray(seen.score(jnp.asarray(along)))[:, 0]
+    assert score[0] > 10 and 1.0 < score[1] < 1.2 and (np.diff(score) < 0).all() and score[-1] > 0
+    touching = row.copy()
+    touching[1, 5:7] = 0.0
+    assert np.asarray(seen.score(jnp.asarray(touching)))[1] < 1.0, "nobody was so near"
+
+    narrow = msgspec.structs.replace(fitted.card.data, ranges=ranges | {"own.x": (ranges["own.x"][0], 1.2)})
+    world = dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=narrow))
+    out = np.zeros((N, 2), np.float32)
+    out[0, 0] = 0.5
+    ends = {}
+    for asked in (False, True):
+        pilot = guard(lambda seen, state: out, world, guard="shield", within_logs=asked)
+        ends[asked] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
+    assert ends[True] < 1.23 < 1.25 < ends[False]
+    older = dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=Data("walks", {})))
+    with pytest.raises(UserError, match="within_logs needs a World that says what its logs have shown.*; fit it again"):
+        guard(lambda seen, state: out, older, guard="shield", within_logs=True)
 
 
 def test_answers_are_drawn_on_the_page_of_a_fit(fitted, tmp_path):

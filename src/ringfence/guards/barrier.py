@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
+from ringfence.guards.shown import Shown
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
 from ringfence.utils import renamed
@@ -14,6 +15,7 @@ from ringfence.world.barrier import Barrier, MinBarrier
 
 BARRIERS = ("learned", "analytic", "both")
 AHEAD = "what will be dangerous after the last row"
+BEYOND = "what the logs have not shown"
 __getattr__ = renamed.names_of(__name__)
 
 
@@ -29,6 +31,7 @@ class BarrierSource(eqx.Module):
     source: str = eqx.field(static=True)  # one of BARRIERS
     hazard: BoundHazard | None = eqx.field(static=True)  # bound to the World's view
     terminal_value: bool = eqx.field(static=True)  # the last row is judged by what will be dangerous, too
+    shown: Shown | None = None  # what the logs have shown, where rows are to stay within it
 
     def __check_init__(self):
         if self.source not in BARRIERS:
@@ -58,20 +61,20 @@ class BarrierSource(eqx.Module):
         logs name several); spread (..., K, N)."""
         after = rows[..., 1:, :, :]
         if self.source == "analytic":
-            return self._analytic(after)
+            return self._within(self._analytic(after), after)
         barrier = self._barrier
         score = barrier.apart(rows[..., :-1, :, :], after)
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
         score = score - jnp.maximum(spread / self.world.ood_threshold - 1.0, 0.0)[..., None]
-        return self._with_analytic(score, after)
+        return self._within(self._with_analytic(score, after), after)
 
     def now(self, before: Array, present: Array) -> Array:
         """(..., N, C) scores of the step that led from one state (..., N, D) to the present."""
         if self.source == "analytic":
-            return self._analytic(present)
-        return self._with_analytic(self._barrier.apart(before, present), present)
+            return self._within(self._analytic(present), present)
+        return self._within(self._with_analytic(self._barrier.apart(before, present), present), present)
 
     def parts(self, rows: Array) -> Array:
         """(..., K, N, M) what the scores of predicted rows (..., K+1, N, D) are the least of, without what is taken off
@@ -86,6 +89,8 @@ class BarrierSource(eqx.Module):
             found.append(jnp.where(last, ahead, jnp.inf)[..., None])
         if self.source != "learned":
             found.append(self._analytic(after))
+        if self.shown is not None:
+            found.append(self.shown.score(after)[..., None])
         return jnp.concatenate(found, -1)
 
     @property
@@ -99,6 +104,8 @@ class BarrierSource(eqx.Module):
         if self.source != "learned":
             assert self.hazard is not None, "checked when it was made"
             found.append((f"{type(self.hazard.hazard).__name__} by formula", ""))
+        if self.shown is not None:
+            found.append((BEYOND, ""))
         return tuple(found)
 
     @property
@@ -110,6 +117,10 @@ class BarrierSource(eqx.Module):
     def _barrier(self) -> Barrier | MinBarrier:
         assert self.world.barrier is not None, "checked when it was made"
         return self.world.barrier
+
+    def _within(self, score: Array, x: Array) -> Array:
+        """Scores (..., N, C), no larger than those of staying within what the logs have shown."""
+        return score if self.shown is None else jnp.minimum(score, self.shown.score(x)[..., None])
 
     def _with_analytic(self, score: Array, x: Array) -> Array:
         return score if self.source == "learned" else jnp.minimum(score, self._analytic(x))

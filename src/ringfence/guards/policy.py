@@ -19,6 +19,7 @@ from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions, in_steps
 from ringfence.guards.proof import Prover
 from ringfence.guards.reasons import reasons
+from ringfence.guards.shown import Shown
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
 from ringfence.proposals.base import held, in_bounds_of
@@ -358,7 +359,8 @@ def build(
             raise UserError(f"proof is of a barrier that was learned, and barrier='{barrier}'; leave one of them out.")
         prover_of(world, options)
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
-    return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value), options))
+    shown = Shown.by(world) if options.within_logs else None
+    return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value, shown), options))
 
 
 def _refuse_two_horizons(changes: Mapping[str, Any]) -> None:

@@ -39,6 +39,7 @@ class Data(Part, frozen=True):
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
     observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
     state_origins: list[float] | None = None
+    ranges: dict[str, tuple[float, float]] | None = None  # least and most that the logs show of own entries and lengths
 
 
 class HeldOut(Part, frozen=True):

@@ -35,7 +35,7 @@ from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, margins, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
-from ringfence.world.causes import Found
+from ringfence.world.causes import Found, offsets
 from ringfence.world.cells import Cells
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World
@@ -143,7 +143,7 @@ def _fitted(
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
-        data=_data(store, logged.several),
+        data=_data(store, logged),
         settings=settings,
         seed=parts.seed,
         shape=_shape_in_words(barrier),
@@ -165,8 +165,9 @@ def _fitted(
     return dataclasses.replace(world, card=card)
 
 
-def _data(store: EpisodeStore, several: bool) -> Data:
+def _data(store: EpisodeStore, logged: Logged) -> Data:
     """What the card says of the logs."""
+    several = logged.several
     return Data(
         task=store.card.task,
         content=store.card.content or store.content,
@@ -179,7 +180,21 @@ def _data(store: EpisodeStore, several: bool) -> Data:
         unsafe_costs={name: _unsafe_cost(store, name) for name in store.limits} if several else None,
         observation_origins=store.card.observation_origins,
         state_origins=store.card.state_origins,
+        ranges=_ranges(logged),
     )
+
+
+def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
+    """What the logs show of every entry of an agent itself, or of all where names tell no things, and of how far
+    things are away."""
+    names = logged.map.names
+    x = np.asarray(logged.arrays["features"])
+    own = [d for d, name in enumerate(names) if name.startswith("own.")]
+    found = {names[d]: (float(x[..., d].min()), float(x[..., d].max())) for d in own or range(len(names))}
+    for cause in offsets(names):
+        length = cause.of(x)
+        found[cause.name] = (float(length.min()), float(length.max()))
+    return found
 
 
 def _unsafe_cost(store: EpisodeStore, name: str) -> float:

@@ -40,7 +40,7 @@ from ringfence.world.margins import (
 from ringfence.world.model import World
 from ringfence.world.values import Values
 
-VERSION = 15  # of the validation: cached cards of another are made again
+VERSION = 16  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 STEPS = 60_000  # held-out steps that are scored
 SCORED = 20_000  # of them at once

@@ -1,0 +1,56 @@
+"""What the logs have shown: one's own entries within their range, and nobody nearer than anybody came.
+
+A guard that turns away from a danger that it knows may drive into one that never happened: a wall that no log touches,
+an empty battery. Nothing that is logged says how far beyond the logs it is safe, so a guard may be asked to stay within
+them (`within_logs`). This is the support constraint of offline learning, on predicted rows.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ringfence.errors import UserError
+from ringfence.types import Array
+from ringfence.world import World, causes
+
+STEEP = 100.0  # margins for the whole range: one is a hundredth of it
+SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
+
+
+class Shown(eqx.Module):
+    """Ranges that the logs have shown."""
+
+    low: tuple[float, ...] = eqx.field(static=True)  # of entries
+    high: tuple[float, ...] = eqx.field(static=True)
+    entries: tuple[int, ...] = eqx.field(static=True)
+    nearest: tuple[tuple[causes.Cause, float, float], ...] = eqx.field(static=True)  # least length, and range of it
+
+    @classmethod
+    def by(cls, world: World) -> Shown:
+        """What the logs of a World have shown, as its card says."""
+        ranges = world.card.data.ranges
+        if not ranges:
+            raise UserError(
+                "within_logs needs a World that says what its logs have shown, and this one is of an earlier version; "
+                "fit it again."
+            )
+        names = list(world.map.names)
+        known = [name for name in names if name in ranges and ranges[name][1] > ranges[name][0]]
+        low, high = (tuple(ranges[name][k] for name in known) for k in range(2))
+        lengths = [one for one in causes.offsets(names) if one.name in ranges]
+        nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
+        return cls(low, high, tuple(names.index(name) for name in known), nearest)
+
+    def score(self, x: Array) -> Array:
+        """(..., N) of features (..., N, D), in margins: 1 at the end of what was shown, more inside, and never below 0,
+        so that danger that is known counts for more."""
+        low, high = np.array(self.low), np.array(self.high)
+        read = x[..., np.array(self.entries, int)]
+        inside = [jnp.minimum(read - low, high - read) / (high - low)]
+        for cause, least, width in self.nearest:
+            offset = x[..., np.array(cause.things)]
+            inside.append((jnp.sqrt((offset**2).sum(-1) + 1e-9) - least) / max(width, 1e-6))
+        steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
+        return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0)))
