@@ -100,7 +100,12 @@ QUESTIONS = (
     ),
     Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
     Question("centralized, not decentralized BC", ("bc", "joint"), ("bc", "default"), shown=False),
-    Question("centralized, not decentralized MADIFF, one plan for all", ("madiff", "default"), ("madiff", "own")),
+    Question(
+        "centralized, not decentralized MADIFF, one plan for all",
+        ("madiff", "default"),
+        ("madiff", "own"),
+        shown=False,
+    ),
     Question(
         "centralized, not decentralized MADIFF, one plan for all, under a shield",
         ("madiff", f"default{SHIELD}"),
@@ -136,7 +141,13 @@ OF_ROBOTS = (
         ROBOT_KEYS,
         shown=False,
     ),
-    Question("return-conditioned BC, not BC", ("bc-return", f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
+    Question(
+        "return-conditioned BC, not BC",
+        ("bc-return", f"default{ADAPT}"),
+        ("bc", f"default{ADAPT}"),
+        ROBOT_KEYS,
+        shown=False,
+    ),
     *(
         Question(f"{words}, not BC", (name, f"default{ADAPT}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS, shown=False)
         for words, name in (("10 % BC", "bc-best"), ("MA-TD3+BC", "ma-td3bc"), ("OMAR", "omar"))

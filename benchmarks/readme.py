@@ -65,8 +65,8 @@ UNSHOWN = re.compile(
     r"parameters|milliseconds|compile|mean return|size of|imports|all entries|PyTorch|random actions|"
     r"per agent|training update|ant_4x2|grid|overhead|two cores|batch=16|batch=1024|N=24|against first|in training|"
     r"\b6 agents|kill|cells|given actions|wall clock|64 wide|by ℓ|collect|good, peak|"
-    r"none, one joint|none, \d|full, 64|shield, 64|mpe2|warmed up, first|first action of a loaded controller,|full: first|"
-    r"3 agents, batch|simulated|guard select|ant_2x4|halfcheetah_2x3-medium: fitting"
+    r"none, one joint|none, \d|full, 64|shield, 64|mpe2|warmed up, first|first action of a loaded controller,|"
+    r"full: first|3 agents, batch|simulated|guard select|ant_2x4|halfcheetah_2x3-medium: fitting"
 )
 
 
