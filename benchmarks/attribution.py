@@ -202,13 +202,13 @@ def crossed(suite: str) -> str:
     return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])
 
 
-# Robots' proposals under `adapt`, danger learned, and by climbing under `full`: their words and rows.
+# Robots' proposals under `adapt`, danger learned, and the one that only climbs: their words and rows. Cloning under
+# `full` stands in docs/guard-results.md.
 ROBOTS: dict[str, Row] = {
     "BC": ("bc", f"default{ADAPT}"),
     "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
     "our MADIFF": ("madiff", f"default{STEADY}"),
     "ICBF": ("icbf", f"default{STEADY}"),
-    "BC, `full`": ("bc", f"default{FULL}"),
     "MPC, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }
 

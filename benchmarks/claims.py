@@ -53,7 +53,7 @@ def tested(row, paired, key: str, verdict: Callable[[list], bool]) -> Callable[[
     def check():
         found = next(ds for q, k, ds in answers("guards") if q == asked(row, paired) and k == key)
         differences = ", ".join(f"{d.mean:+.3g}{'' if d.holds else ' (chance)'}" for d in found)
-        return len(found) == 4 and verdict(found), f"{key} {differences}; Wilcoxon over resets, Holm"
+        return len(found) == 4 and verdict(found), f"{key} {differences}"
 
     return check
 
