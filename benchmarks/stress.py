@@ -167,8 +167,8 @@ def write_table(out: Path) -> None:
     plain = {r["episodes"]: float(r["return"]) for r in rows if r["faults"] == "none"}
     names = list(dict.fromkeys(name_of(faults) for faults, _, _ in trials().values()))
     order = {name: k for k, name in enumerate(names)}
-    head = "faults | guard | compensated | episodes | return | of that without faults | episodes with contact (95 % ≤)"
-    lines = [f"| {head} | infeasible steps |", "|---" * 8 + "|"]
+    head = "faults | guard | episodes | return | of that without faults, % | episodes with contact, % (95 % ≤)"
+    lines = [f"| {head} | infeasible steps, % |", "|---" * 7 + "|"]
     for r in sorted(rows, key=lambda r: (order[r["faults"]], r["compensated"] == "True", r["guard"])):
         base = plain.get(r["episodes"], next(iter(plain.values())))
         share, rate, upper, infeasible = (
@@ -176,15 +176,15 @@ def write_table(out: Path) -> None:
             for x in (float(r["return"]) / base, r["violation_rate"], r["violation_upper"], r["infeasible_rate"])
         )
         faults = re.sub(r"([a-z])([\d.]+)", r"\1 \2", r["faults"]).replace("+", ", ")
+        guard = r["guard"].replace("shield", "compensated", 1) if r["compensated"] == "True" else r["guard"]
         cells = [
             faults,
-            r["guard"].replace("_", " "),
-            "yes" if r["compensated"] == "True" else "no",
+            guard.replace("_", " "),
             r["episodes"],
             f"{float(r['return']):.2f}",
-            f"{share:.0f} %",
+            f"{share:.0f}",
         ]
-        lines.append("| " + " | ".join([*cells, f"{rate:.1f} % (≤ {upper:.1f})", f"{infeasible:.0f} %"]) + " |")
+        lines.append("| " + " | ".join([*cells, f"{rate:.1f} (≤ {upper:.1f})", f"{infeasible:.0f}"]) + " |")
     put("docs/stress.md", "stress", "\n".join(lines))
 
 
