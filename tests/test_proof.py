@@ -174,7 +174,14 @@ def test_causes_are_bounded_too():
 def test_where_a_plan_is_not_proved_the_last_one_that_was_goes_on(guarded, present):
     """And the record says so: proved by a plan of now, or of before while its rows last."""
     world = guarded.guard.world
-    options = {"proof": 0.02, "proof_rows": 4, "correction_steps": 1, "correction_restarts": 0, "horizon": 1}
+    options = {
+        "proof": 0.02,
+        "proof_backup": True,
+        "proof_rows": 4,
+        "correction_steps": 1,
+        "correction_restarts": 0,
+        "horizon": 1,
+    }
     policy = build(Nothing(), world, None, "shield", "learned", terminal_value=False, **options)
     prover = Prover(world, 0.02, 0.0, 4)
     far, near = jnp.array([2.5, 0.0, 0.0, 0.0, 1.0]), jnp.array([0.15, 0.0, 0.0, 0.0, 1.0])  # dx, dy, dvx, dvy, seen
