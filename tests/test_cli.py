@@ -8,9 +8,11 @@ import sys
 from dataclasses import replace
 
 import pytest
+from rich.table import Table
 
 from ringfence.cli import demo
 from ringfence.cli.app import main
+from ringfence.cli.console import console
 from ringfence.errors import UserError
 from ringfence.evaluation import rollout
 from ringfence.guards import GUARDS
@@ -122,6 +124,13 @@ def test_it_is_said_where_a_guard_often_finds_nothing(monkeypatch, capsys, tmp_p
     (tmp_path / "config.json").write_text("{}")
     main(["eval", str(tmp_path)])
     assert ("in 22 % of the steps the guard found no action that keeps its margin" in capsys.readouterr().out) == said
+
+
+def test_cells_are_whole_where_no_terminal_reads_them(capsys):
+    table = Table("run", "guard")
+    table.add_row("runs/" + "x" * 300, "shield")
+    console().print(table)
+    assert "x" * 300 in capsys.readouterr().out
 
 
 def test_every_set_counts(monkeypatch):

@@ -247,7 +247,7 @@ def test_it_keeps_pettingzoos_api(logs, tmp_path):
     assert env.render().shape == (480, 480, 3) and seen["agent_0"].shape == (env.core.observation_dim,)
     run = loop.train("bc", logs, out=tmp_path, changes={"num_updates": 4, "width": 16}, quiet=True)[0]
     assert play(run, lambda: CrossingParallel(n_agents=3), episodes=1, agents=3)["episodes"] == 1
-    with pytest.raises(UserError, match="has 3 agents, the run was trained with 8; pass agents=3"):
+    with pytest.raises(UserError, match="has 3 agents, the run was trained with 8; pass agents=3 .--agents 3"):
         play(run, lambda: CrossingParallel(n_agents=3), episodes=1)
 
 

@@ -111,6 +111,11 @@ def test_actions_that_are_none_are_refused(actions, world, store):
         ringfence.guard(lambda o, s: actions, world).act(store.observations[0])
 
 
+def test_a_function_of_one_argument_is_refused_at_once(world):
+    with pytest.raises(UserError, match=r"policy takes \(observations, state\); give it a second argument"):
+        ringfence.guard(lambda observations: observations, world)
+
+
 def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):
     controller = controllers["run"]()
     step = controller._source._act

@@ -131,9 +131,13 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
         step = SimpleSpreadParallel.step(self, actions)
         return tuple({k: v for k, v in part.items() if k != "agent_1"} for part in step)
 
+    def wide(self):
+        return dict.fromkeys(self.possible_agents, np.zeros(SimpleSpread().observation_dim))
+
     cases = (
         (lambda: object(), "without possible_agents; give a PettingZoo ParallelEnv"),
-        (lambda: SimpleSpreadParallel(n_agents=2), "has 2 agents, the run was trained with 3"),
+        (lambda: made(_observations=wide)(n_agents=2), "has 2 agents, the run was trained with 3.$"),
+        (lambda: SimpleSpreadParallel(n_agents=2), r"shape \(2, \d+\), this run takes \(3, 18\)"),  # said first
         (made(_observations=lambda self: dict.fromkeys(self.possible_agents, np.zeros(5))), r"shape \(3, 5\)"),
         (made(step=early), "agent_1 ended at step 1 before its team"),
         (made(step=silent), "pass cost=, a function of the agents' infos"),
@@ -208,7 +212,7 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     for split in ("test", "validation"):
         app.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
-    assert "violations/" in capsys.readouterr().out
+    assert "unsafe episodes (95 % ≤)" in capsys.readouterr().out
     results = Run(folder).results
     assert [*results] == ["default", "default@validation"]
     assert results["default"]["simulator"] == "theirs.py:Theirs" and results["default"]["guard"] == "none"
@@ -229,6 +233,21 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     with pytest.raises(SystemExit):
         app.main(["eval", str(folder)])
     assert "--env FILE.py:NAME" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "command, said",
+    [
+        (["stress", "--delay", "2", "--guard", "shield"], "`ringfence play RUN --env FILE.py:NAME --delay 2`"),
+        (["certify", "--delay", "2", "--out", "c.json"], "certificates need a simulator of `ringfence tasks`"),
+    ],
+)
+def test_what_needs_a_simulator_from_here_says_what_to_do_without(run, command, said, capsys):
+    name, *options = command
+    with pytest.raises(SystemExit):
+        app.main([name, str(run.path), *options])
+    told = capsys.readouterr().err
+    assert said in told and "`ringfence eval`" not in told
 
 
 def test_anybodys_function_under_guard_is_played(small_world):

@@ -341,6 +341,30 @@ def test_compensating_and_saying_so_oneself_are_one_too_many(run):
         ringfence.stress(run, {"delay": 1}, guard="shield", delay=1, compensate=True)
 
 
+def test_the_guard_is_told_in_simulators_of_anybody_too(run, monkeypatch, capsys):
+    seen = {}
+
+    def played(run, planner, split, options, faults):
+        seen.update(options)
+        raise UserError("enough.")
+
+    monkeypatch.setattr("ringfence.evaluation.play.player_of", played)
+    command = ["play", str(run.path), "--env", "ringfence.envs.pettingzoo:CrossingParallel", "--async", "0.5"]
+    with pytest.raises(SystemExit):
+        main([*command, "--guard", "shield", "--compensate"])
+    assert seen["guard"] == "shield" and seen["hold"] == 2
+    with pytest.raises(SystemExit):
+        main([*command, "--compensate"])
+    assert "compensate is read by nothing without a guard" in capsys.readouterr().err
+
+
+def test_faults_are_called_so_in_the_help(capsys):
+    with pytest.raises(SystemExit):
+        main(["play", "--help"])
+    told = capsys.readouterr().out
+    assert " faults options " in told and "wrong options" not in told
+
+
 # --- certificates ---
 
 

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
-from ringfence.cli.console import Refusals, complain
+from ringfence.cli.console import Refusals, complain, console
 from ringfence.cli.doctor import doctor
 from ringfence.cli.faults import NO_FAULTS, Wrong
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     from ringfence.logs.store import EpisodeStore
     from ringfence.training.runs import Run
 
-out = Console(highlight=False)
+out = console()
 OFTEN = 0.05  # share of steps without an action that keeps the margin, from which on it is said
 Positional = tyro.conf.Positional
 # --tasks a b and --tasks a --tasks b mean the same.
@@ -187,7 +186,7 @@ def evaluate(
         "return",
         "cost",
         "safe starts",
-        "violations/episode (95 % ≤)",
+        "unsafe episodes (95 % ≤)",
         "return norm",
         "cost norm",
     )
@@ -253,6 +252,7 @@ def play(
     num_envs: int = 16,
     early_ends: Literal["refuse", "cut", "skip"] = "refuse",
     wrong: Wrong = NO_FAULTS,
+    compensate: bool = False,
     playing: How = AS_IT_IS,
 ) -> None:
     """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports, but
@@ -265,6 +265,7 @@ def play(
         split: test resets, or validation resets for choosing settings.
         num_envs: simulators that are stepped side by side.
         early_ends: what becomes of an episode that an agent leaves before its team.
+        compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.play import play as run_play
     from ringfence.evaluation.simulators import simulator
@@ -279,10 +280,11 @@ def play(
         "num_envs": num_envs,
         "early_ends": early_ends,
         "faults": faults,
+        "compensate": compensate,
         "keep": not faults.given,
         "quiet": False,
     }
-    table = Table("run", "guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    table = Table("run", "guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     refusals = Refusals()
     for run in found:
         with refusals.of(run):
@@ -306,7 +308,7 @@ def _played(run: Run, result: dict[str, Any]) -> list[Text | str]:
         costs.append(f"{terminal(name)} {cost['cost_mean']:.3f}{limit}")
     return [
         terminal(run.path),
-        result["guard"],
+        result["guard"] + (" (compensated)" if result.get("compensated") else ""),
         f"{result['return_mean']:.4g} ({low:.4g} to {high:.4g})",
         "\n".join(costs),
         f"{result['violation_rate']:.3f} (≤ {result['violation_upper']:.3f})",
@@ -345,16 +347,14 @@ def stress(
         "compensate": compensate,
         "quiet": False,
     }
-    names = ("guard", "return", "cost", "violations/episode (95 % ≤)", "infeasible")
+    names = ("guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
     table = Table("run", Column("faults", no_wrap=True), *names)
     refusals = Refusals()
     shown = "\n".join(f"{name} {value}" for name, value in faults.given.items()) or "none"
     for run in found:
         with refusals.of(run):
-            result = run_stress(run, faults, **given)
-            mark = " (compensated)" if compensate else ""
-            first, guard, *rest = _played(run, result)
-            table.add_row(first, shown, f"{guard}{mark}", *rest)
+            first, *rest = _played(run, run_stress(run, faults, **given))
+            table.add_row(first, shown, *rest)
     _say(table, refusals, len(found))
 
 

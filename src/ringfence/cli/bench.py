@@ -11,7 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
-from ringfence.cli.console import complain
+from ringfence.cli.console import complain, console
 from ringfence.errors import UserError, unknown
 from ringfence.utils.escape import terminal
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ringfence.bench import Grid
     from ringfence.faults.certificate import Certificate
 
-out = Console(highlight=False)
+out = console()
 Positional = tyro.conf.Positional
 # --tasks a b and --tasks a --tasks b mean the same.
 Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,6 +15,14 @@ from ringfence.errors import UserError
 
 if TYPE_CHECKING:
     from ringfence.training.runs import Run
+
+
+WIDE = 1000  # columns of what is no terminal: nothing is cut that another program, or a file, is to read
+
+
+def console() -> Console:
+    """Of stdout, as wide as its terminal."""
+    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
 
 
 def complain(message: str) -> None:

@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
+from ringfence.cli.console import console
 from ringfence.errors import UserError, plain
 from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
 
-out = Console(highlight=False)
+out = console()
 Positional = tyro.conf.Positional
 Robot = Literal["halfcheetah_2x3", "ant_2x4", "ant_4x2"]
 Out = Annotated[Path, tyro.conf.arg(name="out")]

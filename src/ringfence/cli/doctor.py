@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib.metadata as metadata
 import os
 
-from rich.console import Console
 from rich.markup import escape
 
+from ringfence.cli.console import console
 from ringfence.errors import UserError
 from ringfence.utils.environment import device_problem
 
-out = Console(highlight=False)
+out = console()
 
 
 def doctor() -> None:

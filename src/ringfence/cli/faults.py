@@ -43,4 +43,4 @@ class FaultFlags:
 
 
 NO_FAULTS = FaultFlags()
-Wrong = tyro.conf.OmitArgPrefixes[FaultFlags]
+Wrong = Annotated[tyro.conf.OmitArgPrefixes[FaultFlags], tyro.conf.arg(name="faults")]

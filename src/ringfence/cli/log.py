@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
 
+from ringfence.cli.console import console
 from ringfence.errors import whole_number
 from ringfence.utils.escape import lines
 
-out = Console(highlight=False)
+out = console()
 Positional = tyro.conf.Positional
 
 

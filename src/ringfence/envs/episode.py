@@ -82,6 +82,7 @@ class Episode:
                 f"reset() of {self.name} returned a {type(begun).__name__}; a ParallelEnv's returns two "
                 "things, observations and infos."
             )
+        self._check_count(begun[0])
         self._observe(begun[0])
 
     def _check_agents(self) -> None:
@@ -90,9 +91,18 @@ class Episode:
             raise UserError(f"{self.name} has no possible_agents; give at least one.")
         if len(set(map(str, self.agents))) < count:
             raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
-        if self.shape.agents not in (None, count):
-            remedy = f"; pass agents={count}" if self.shape.homogeneous else ""
-            raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}{remedy}.")
+
+    def _check_count(self, observations: ByAgent) -> None:
+        """Refuse another number of agents; where they see something else, too, that is said first."""
+        count, width = len(self.agents), self.shape.observation
+        if self.shape.agents in (None, count):
+            return
+        self._check_all_in("observations", observations, 0)
+        shapes = {np.asarray(observations[a], object).shape for a in self.agents}
+        if width is not None and shapes != {(width,)}:
+            self._rows(observations, self.shape.agents)
+        remedy = f"; pass agents={count} (--agents {count})" if self.shape.homogeneous else ""
+        raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}{remedy}.")
 
     @property
     def lacks_cost(self) -> bool:
@@ -232,13 +242,17 @@ class Episode:
 
     def _observe(self, observations: ByAgent) -> None:
         self._check_all_in("observations", observations, len(self.rewards))
-        rows = [observations[a] for a in self.agents]
-        origins = self.shape.origins
-        shape = (len(self.agents), self.shape.observation)
-        self.seen = given_as("observations", rows, shape, origins=origins.observations)
+        self.seen = self._rows(observations, len(self.agents))
         self.state = None
         if self._read_state is not None:
-            self.state = given_as("state", self._read_state(), (self.shape.state,), origins=origins.state)
+            state = self._read_state()
+            self.state = given_as("state", state, (self.shape.state,), origins=self.shape.origins.state)
+
+    def _rows(self, observations: ByAgent, agents: int | None) -> np.ndarray:
+        """(N, O) in the order of the agents, or a refusal of what so many of them cannot have seen."""
+        rows = [observations[a] for a in self.agents]
+        shape = (agents, self.shape.observation)
+        return given_as("observations", rows, shape, origins=self.shape.origins.observations)
 
 
 class Step(NamedTuple):

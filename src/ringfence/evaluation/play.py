@@ -15,6 +15,7 @@ from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_num
 from ringfence.evaluation import protocol, rollout, statistics
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
+from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.loading.controller import Controller
 from ringfence.problem.bounds import Bounds
@@ -44,6 +45,7 @@ def play(
     max_episode_steps: int | None = None,
     early_ends: Literal["refuse", "cut", "skip"] = "refuse",
     faults: Faults | Mapping[str, Any] | None = None,
+    compensate: bool = False,
     keep: bool = False,
     quiet: bool = True,
     **options: Any,
@@ -58,8 +60,9 @@ def play(
     noise. `early_ends` says what becomes of an episode that an agent leaves before its team: it is refused, cut there
     (`cut_episodes` counts them), or skipped (`skipped_episodes`). A refusal's `finished` is the summary of the episodes
     that were finished before, and so is that of a Ctrl-C (`errors.Interrupted`). `planner` and `options` (guard,
-    barrier, execution, world, ...) are as in `ringfence.load`. `faults` lie between policy and simulator
-    (`ringfence.stress`). `keep` adds the result to the run's results.json, as `ringfence eval` does, for reports.
+    barrier, execution, world, ...) are as in `ringfence.load`. `faults` lie between policy and simulator, and
+    `compensate` tells the guard of them, both as in `ringfence.stress`. `keep` adds the result to the run's
+    results.json, as `ringfence eval` does, for reports.
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -77,6 +80,8 @@ def play(
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     if keep and faults.given:
         raise UserError("keep=True adds to results.json, where no result has faults; leave keep or faults out.")
+    if compensate:
+        options = _compensated(run, faults, options)
     player = player_of(run, planner, split, options, faults)
     if keep:
         _check_kept(player)
@@ -101,6 +106,7 @@ def play(
         raise _interrupted(player, tables, episodes) from stopped
     summary = _summary(player, tables)
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
+    about |= {"compensated": compensate} if faults.given else {}
     if keep and isinstance(player, RunPlayer):
         of_file = {"split": split, "simulator": name_of(make_env, envs[0])}
         _add_to_run(player, summary | about | of_file)
@@ -120,6 +126,12 @@ def _check_choices(early_ends: str, split: str) -> None:
     known("early_ends", early_ends, EARLY_ENDS)
     if split not in rollout.RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
+
+
+def _compensated(run: Run | str | Controller, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:
+    if isinstance(run, Controller):
+        raise UserError("compensate is of a run's guard; give delay, max_age and hold to ringfence.guard() itself.")
+    return compensated(run, faults, options)
 
 
 def _add_to_run(player: RunPlayer, result: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.faults import Faults
 from ringfence.faults.certificate import digest
 from ringfence.guards.policy import rows_foreseen
-from ringfence.loading.resolve import resolve
+from ringfence.loading.resolve import load_job, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run, write_json
 from ringfence.utils import schemas
@@ -67,6 +67,7 @@ def stress_spec(
     """`stress` of what a spec names."""
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
+    _check_simulator(spec)
     resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
     kept = results(resolved.run)
@@ -81,6 +82,18 @@ def stress_spec(
         result["digests"] = {"policy": digest(resolved.proposal), "world": digest(resolved.guard.world)}
     write_json(file, kept | {name: result})
     return result
+
+
+def _check_simulator(spec: PolicySpec) -> None:
+    """Refuse, before a guard asks for its World, a run of data that has no simulator here."""
+    if spec.run is None:
+        return
+    task = load_job(spec.run, spec.agents).task
+    if task.env is None:
+        raise UserError(
+            f"Task '{task.name}' exists only as data, so `ringfence stress` has nothing to play in; play it behind "
+            "faults in a simulator of your own: `ringfence play RUN --env FILE.py:NAME --delay 2`."
+        )
 
 
 def results(run: Run) -> dict[str, dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -156,6 +157,7 @@ def under_guard(
         raise UserError(
             f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
         )
+    _check_takes_two(policy)
     spec = world.spec
     if agents is None and spec.homogeneous:
         raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
@@ -163,6 +165,20 @@ def under_guard(
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
     guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
     return Callback(policy, guarded, agents or spec.n_agents)
+
+
+def _check_takes_two(function: Callable) -> None:
+    """Refuse a function that cannot be called with observations and state; what has no signature is taken as it is."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(None, None)
+    except TypeError:
+        raise UserError(
+            "policy takes (observations, state); give it a second argument, e.g. lambda observations, state: …"
+        ) from None
 
 
 def guarded_of(policy: Any) -> Guarded | None:

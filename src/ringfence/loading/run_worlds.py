@@ -73,7 +73,7 @@ def _of_data(run: Run, execution: str | None, quiet: bool) -> World:
         flag = " --execution decentralized" if execution == "decentralized" else ""
         raise UserError(
             f"A guard of '{run.path}' needs the World of its data, which is not there; make one with `ringfence fit "
-            f"STORE --out FILE{flag}` and name it with world=FILE."
+            f"STORE --out FILE{flag}` and name it with world=FILE (--world FILE)."
         )
     from ringfence.datasets.make import make
 
