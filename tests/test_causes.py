@@ -354,7 +354,8 @@ def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     assert verdict.judge(blind).reasons == (
         "it errs by 0.4 in length of other.dx, other.dy, of the nearest at 2 s, and constant velocity by 0.3",
     )
-    assert "foreseen to 0.1 at 0.96 s, 0.4 at 2 s (constant velocity: 0.2, 0.3, which foresees it better)" in str(blind)
+    said = "predicted to 0.1 at 0.96 s, 0.4 at 2 s (constant velocity: 0.2, 0.3, which predicts it better)"
+    assert said in str(blind)
     assert verdict.judge(card((0.1, 0.2), (0.2, 0.3))).word == "fit"
     assert verdict.judge(card((0.0, 0.019), (0.0, 0.0))).word == "fit", "so little is no error"
     assert "at 25 steps" in str(card((0.1, 0.2), (0.2, 0.3), ()))

@@ -21,6 +21,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.report import replay_page
 from ringfence.world import save
 from ringfence.world.card import Verdict
+from ringfence.world.causes import Cause, Edge, Found
 from tests.quick import QUICK_WORLD
 
 DT, STEPS, EPISODES, RADIUS = 0.1, 40, 12, 0.5
@@ -161,6 +162,37 @@ def test_the_radius_is_told_by_the_formula_or_by_costs():
     assert radius_of(store, motion, 0.3) == (0.3, "given")
     with pytest.raises(UserError, match="Nothing says how close is contact"):
         radius_of(walkers(), motion, None)
+
+
+def test_the_radius_is_that_of_the_worlds_cause_where_costs_tell_no_distance():
+    """Half of the danger is a speed, say, and the World's card knows below what distance the rest of it is."""
+    store = walkers(reach=0.9)
+    motion = motion_of(store, Names.of(store))
+    elsewhere = np.random.default_rng(0).random(store.costs.shape) < 0.5
+    several = dataclasses.replace(store, costs=np.maximum(store.costs, elsewhere).astype(np.float32))
+    near = Cause("length of other.dx, other.dy", ((2, 3),), length=True)
+    fast = Cause("length of other.dvx, other.dvy", ((4, 5),), length=True)
+    edges = (Edge((0.0,), (2.0,), at=0.9, below=False), Edge((0.0,), (2.0,), at=0.45))
+    found = Found((fast, near), shares=(0.6, 0.4), edges=edges)
+    radius, source = radius_of(several, motion, None, {"contact": found})
+    assert radius == 0.45 and source.startswith("the World's cause 'length of other.dx, other.dy'")
+    assert "other dangers are not counted" in source
+    assert radius_of(store, motion, None, {"contact": found}) == radius_of(store, motion, None)
+    assert radius_of(walkers(), motion, None, {"": found})[0] == 0.45, "and where nothing has a cost"
+    for causes in ({}, {"": Found((fast,), shares=(0.6,), edges=edges[:1])}):
+        with pytest.raises(UserError, match=r"No distance tells .* give radius= \(--radius\)"):
+            radius_of(several, motion, None, causes)
+
+
+def test_replays_show_their_progress_unless_they_are_quiet(capsys):
+    stage = stage_of(walkers())
+    quiet = judge._played(stage, {"straight": "straight"}, {}, brake=True)
+    assert capsys.readouterr().err == ""
+    shown = judge._played(stage, {"straight": "straight"}, {}, brake=True, quiet=False)
+    said = capsys.readouterr().err
+    assert f"straight, no guard (1 of 2): {STEPS}/{STEPS}" in said and "straight, brake (2 of 2)" in said
+    np.testing.assert_array_equal(shown[0].plain.contact, quiet[0].plain.contact)
+    assert list(shown[0].under) == ["brake"]
 
 
 def test_what_cannot_be_replayed_is_refused_in_a_sentence():

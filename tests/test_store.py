@@ -201,9 +201,9 @@ def ends_inside(store):
 
 
 RULES = {
-    "nan": (changed("observations", (4, 1, 2), np.nan), r"observations\[4, 1, 2\] is nan"),
+    "nan": (changed("observations", (5, 1, 2), np.nan), r"observations\[5, 1, 2\] is nan \(episode 1, step 1\)"),
     "inf": (changed("state", (3, 2), np.inf), r"state\[3, 2\] is inf"),
-    "nan reward": (changed("rewards", (0, 1), np.nan), r"rewards\[0, 1\] is nan"),
+    "nan reward": (changed("rewards", (0, 1), np.nan), r"rewards\[0, 1\] is nan \(episode 0, step 0\)"),
     "action": (changed("actions", (5, 0, 1), 1.5), r"actions\[5, 0, 1\] is 1.5, outside \[-1, 1\]"),
     "negative cost": (changed("costs", 1, -1.0), "costs holds negative entries"),
     "flat actions": (lambda s: {"actions": s.actions[:, 0]}, r"actions has shape \(8, 2\), expected \(T, N, A\)"),
@@ -515,6 +515,22 @@ def test_a_card_can_be_made_by_its_fields(small_store):
     assert store.card == complete_card({"task": "fleet", "dt": 0.1, "wheels": 4}) and store.card.extra == {"wheels": 4}
     with pytest.raises(StoreError, match="task='a/b'; it must be a name"):
         dataclasses.replace(small_store, card=StoreCard(task="a/b"))
+
+
+def test_a_mistyped_field_of_a_card_is_refused_where_it_is_written_by_hand(tmp_path):
+    arrays = (np.zeros((2, 5, 1, 2)), np.zeros((2, 4, 1, 2)), np.zeros((2, 4)), None)
+    with pytest.raises(StoreError, match="'observation_name', which is no field of it; did you mean 'observation_n"):
+        EpisodeStore.from_episodes(*arrays, card={"observation_name": ["x", "y"]})
+    steps = dict(episode_ends=[2], final_observations=np.zeros((1, 1, 2)))
+    with pytest.raises(StoreError, match="did you mean 'cost_limit'"):
+        EpisodeStore.from_steps(np.zeros((2, 1, 2)), np.zeros((2, 1, 2)), [0, 0], **steps, card={"cost_limits": 3})
+    store = EpisodeStore.from_episodes(*arrays, card={"seed": 3, "site": "hall"})
+    assert store.card.extra == {"seed": 3, "site": "hall"}
+    before = dataclasses.replace(store, card=store.card.updated(observation_name="of before"))
+    before.save(tmp_path / "before.h5")
+    found = EpisodeStore.load(tmp_path / "before.h5")
+    assert found.card.extra["observation_name"] == "of before"
+    assert EpisodeStore.from_episodes(*arrays, card=found.card).card.extra == found.card.extra
 
 
 def test_a_card_reads_as_the_dictionary_that_it_was(small_store):

@@ -110,7 +110,7 @@ def fit(
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
 ) -> None:
-    """Fit the World of a task's data or of a store, and print its card: what can be foreseen, how well, where not. The
+    """Fit the World of a task's data or of a store, and print its card: what can be predicted, how well, where not. The
     last line is the verdict; exit status 3 says that it is unfit to guard by.
 
     Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on.
@@ -517,7 +517,8 @@ def replay(
         kinematics: how the driven agent moves; by default a double integrator where that explains the logs, else the
             World's.
         wheelbase: m, of a bicycle.
-        radius: m between two agents below which they touch; by default the task's formula, else as costs tell it.
+        radius: m between two agents below which they touch; by default the task's formula, else as costs tell it, else
+            the World's causes.
         windows: at most so many, drawn evenly.
         steps: of a window; 8 s by default.
         every_episode: replay the episodes that the World learned from, too.
@@ -542,7 +543,7 @@ def replay(
         "windows": windows,
         "steps": steps,
     }
-    result = replayed(policy, _store(data), seed=seed, every_episode=every_episode, **how, **given)
+    result = replayed(policy, _store(data), seed=seed, every_episode=every_episode, quiet=False, **how, **given)
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if out_file is not None:

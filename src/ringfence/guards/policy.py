@@ -28,12 +28,11 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
-from ringfence.world.card import Avoidable
+from ringfence.world.card import FARTHEST, Avoidable
 from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
 BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
-FARTHEST = 15  # rows (benchmarks/proving.py plays more of them)
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
 FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps

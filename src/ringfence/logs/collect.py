@@ -13,6 +13,7 @@ import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
 from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
+from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.utils.files import writable
@@ -55,6 +56,7 @@ def collect(
     whole_number("max_episode_steps", max_episode_steps, 1)
     if not callable(make_env):
         raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
+    given_card(card or {})
     file = None if out is None else writable(out)
     env = make_env()
     check(env, "action_space")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import difflib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -24,6 +25,8 @@ from ringfence.utils.renamed import deprecated
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 LARGEST = 1e15  # entry of an array: its square, and sums of that, are still numbers of 32 bits
 OPTIONAL = ("state", "speed", "constraints")
+ROWS = ("observations", "state")  # arrays with one row more than steps in every episode
+LIKELY = 0.85  # similarity of two names, from which one is taken for the other mistyped
 LISTS_OF_NAMES = ("observation_names", "state_names")
 ALWAYS = (
     "task",
@@ -179,6 +182,16 @@ def complete_card(given: GivenCard) -> StoreCard:
     known["warnings"] = known.get("warnings") or []
     extra = {name: value for name, value in values.items() if name not in FIELDS}
     return StoreCard(**known, extra=extra, written=tuple(values))
+
+
+def given_card(given: GivenCard) -> StoreCard:
+    """The card of fields that somebody wrote by hand: what looks like a known field, mistyped, is refused. Cards in
+    files are read by `complete_card` alone, whatever they hold."""
+    for name in stored.card(given) if isinstance(given, dict) else ():
+        near = difflib.get_close_matches(str(name), FIELDS, n=1, cutoff=LIKELY)
+        if near and name not in FIELDS:
+            raise StoreError(f"The card has '{name}', which is no field of it; did you mean '{near[0]}'?")
+    return complete_card(given)
 
 
 def validate(store: Arrays) -> None:
@@ -445,7 +458,12 @@ def _finite(store: Arrays) -> None:
             )
             continue
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise StoreError(f"{name}{list(where)} is {array[where]}; remove or repair the episode that holds it.")
+        ends = store.episode_ends + (np.arange(1, len(store.episode_ends) + 1) if name in ROWS else 0)
+        episode = int(np.searchsorted(ends, where[0], side="right"))
+        step = where[0] - (int(ends[episode - 1]) if episode else 0)
+        raise StoreError(
+            f"{name}{list(where)} is {array[where]} (episode {episode}, step {step}); remove or repair that episode."
+        )
 
 
 def _costs(store: Arrays) -> None:

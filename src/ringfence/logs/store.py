@@ -33,7 +33,7 @@ from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
 from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
 from ringfence.logs.moving import moved
-from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, validate
+from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, given_card, validate
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
@@ -285,7 +285,7 @@ class EpisodeStore:
         steps = e * length
         ends = np.arange(1, e + 1) * length
         states = None if state is None else _rows(state, e * (length + 1))
-        seen, states, card = moved(_rows(observations, e * (length + 1)), states, ends, complete_card(card or {}))
+        seen, states, card = moved(_rows(observations, e * (length + 1)), states, ends, given_card(card or {}))
         return cls(
             seen,
             _flat(actions, steps),
@@ -336,7 +336,7 @@ class EpisodeStore:
             rewards = np.repeat(rewards[:, None], n_agents, 1)
         ended = np.zeros(len(ends), bool) if terminated is None else _truths("terminated", terminated)
         seen = np.insert(observations, ends, final_observations, axis=0)
-        seen, states, card = moved(seen, states, ends, complete_card(card or {}))
+        seen, states, card = moved(seen, states, ends, given_card(card or {}))
         return cls(
             seen,
             actions,
@@ -527,6 +527,8 @@ def _several(
             raise unknown("constraint with a limit", name, found)
     several = np.stack(list(found.values()), -1).astype(np.float32)
     limits = {name: given.get(name, 0.0) for name in found}
+    if isinstance(card, StoreCard):
+        return several.max(-1), several, card.updated(constraints=limits)
     return several.max(-1), several, {**fields, "constraints": limits}
 
 

@@ -15,9 +15,10 @@ from ringfence.utils.renamed import deprecated
 from ringfence.world.causes import Edge, Found
 from ringfence.world.settings import Settings, settings_named
 
+FARTHEST = 15  # rows that a guard looks ahead by itself (benchmarks/proving.py plays more of them)
 JUDGED = 3  # steps ahead that the margin is calibrated for
 NO_ERROR = 0.01  # of the deviation of what is predicted: less is exact enough
-SHOWN = 3  # things that a barrier reads, beside distances, that its words show the foresight of
+SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
 
@@ -257,7 +258,7 @@ def _of_prediction(card: Card) -> Iterator[str]:
         far = ", ".join(f"{percent(errors[k])} at {k + 1}" for k in shown)
         coasting = card.prediction_error.coasting
         beside = f" (constant velocity: {percent(coasting[-1])} at {len(coasting)})" if coasting else ""
-        yield f"Predictions err by this share of what changes, steps ahead: {far}{beside}."
+        yield f"Prediction error as a share of what changes, steps ahead: {far}{beside}."
         yield from _of_foresight(card.prediction_error.read)
     if card.values is not None:
         yield (
@@ -279,8 +280,8 @@ def _of_foresight(read: tuple[Foresight, ...]) -> Iterator[str]:
         when = [f"{s:g} s" for s in one.seconds] or [f"{k} steps" for k in one.steps_ahead]
         far = ", ".join(f"{error:.3g} at {at}" for error, at in zip(one.error, when))
         coasting = ", ".join(f"{error:.3g}" for error in one.coasting)
-        beaten = "" if one.beats_coasting else ", which foresees it better"
-        yield f"  {one.name}: foreseen to {far} (constant velocity: {coasting}{beaten})"
+        beaten = "" if one.beats_coasting else ", which predicts it better"
+        yield f"  {one.name}: predicted to {far} (constant velocity: {coasting}{beaten})"
 
 
 def _explained(share: float) -> str:
@@ -316,8 +317,8 @@ def _of_barrier(card: Card) -> Iterator[str]:
         )
     if card.constraints is None:
         yield (
-            f"Default margin {scores.margin:.2g}: of 1000 steps that entered danger, predicted from up to {JUDGED} "
-            f"steps before, {significant(1000 * scores.miscoverage)} looked as safe as that."
+            f"Default margin {scores.margin:.2g} (--margin 1 stands for it): of 1000 steps that entered danger, "
+            f"predicted from up to {JUDGED} steps before, {significant(1000 * scores.miscoverage)} looked as safe."
         )
         return
     for name, found in card.constraints.items():
@@ -354,9 +355,10 @@ def _edge(edge: Edge) -> str:
 
 def _of_horizon(avoidable: Avoidable, kept: float) -> str:
     shares = ", ".join(f"{percent(s, 3)} at {k}" for k, s in zip(avoidable.before, avoidable.avoided))
+    far = f"; guards look up to {FARTHEST} ahead by themselves" if avoidable.rows > FARTHEST else ""
     line = (
         f"Could still be avoided, steps before entering danger: {shares}. Nearly all that can be takes a look "
-        f"{avoidable.rows} ahead (horizon={avoidable.rows}), where predictions reach that far"
+        f"{avoidable.rows} ahead (horizon={avoidable.rows}{far}), where predictions reach that far"
     )
     if math.isnan(kept):
         return line + "."

@@ -46,7 +46,7 @@ def _barrier(scores: BarrierScores, of: str) -> Iterator[tuple[Word, str, str]]:
         (
             1 - scores.miscoverage,
             FORESEEN,
-            "{:.1%} of entries into danger are foreseen",
+            "{:.1%} of entries into danger are predicted",
             "log what decides where danger begins, or more episodes",
         ),
         (_avoided(scores), AVOIDABLE, "{:.0%} of danger can be avoided", "log stronger braking and turning"),

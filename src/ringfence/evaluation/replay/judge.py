@@ -31,7 +31,9 @@ from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.precision import in_float32
+from ringfence.utils.progress import Progress
 from ringfence.world import World
+from ringfence.world.causes import Found
 from ringfence.world.logged import held_out, labels_of, unsafe_of
 
 SECONDS = 8.0  # of a window, by default
@@ -59,6 +61,7 @@ def replay(
     anyway: bool = False,
     seed: int = 0,
     faults: Faults | Mapping[str, Any] | None = None,
+    quiet: bool = True,
     **options: Any,
 ) -> ReplayResult:
     """Contacts that a guard prevents and causes where one agent is driven and all others do what they did.
@@ -68,12 +71,14 @@ def replay(
     `options` are those of `load`. Windows of `steps` (8 s) do not overlap and lie in episodes that the World did
     not learn from, or in `every_episode`; each agent is driven in turn, in `windows` windows at most. Contact is being
     closer than `radius` m to another: by default the task's formula, else the distance that best tells the logged
-    unsafe steps. `kinematics` is a name of KINEMATICS. `baselines` adds a brake that takes everybody's velocity for
-    constant, and a guard that knows the formula, along 2 s.
+    unsafe steps, else where distances become dangerous by the World's card. `kinematics` is a name of KINEMATICS.
+    `baselines` adds a brake that takes everybody's velocity for constant, and a guard that knows the formula, along
+    2 s.
 
     `faults` (`ringfence.stress`) lie between the driven agent's policy or guard and its body; a brake has none.
 
-    Others do not react: what drives into a driven agent from behind counts as its contact, too.
+    Others do not react: what drives into a driven agent from behind counts as its contact, too. Without `quiet` each
+    driver under each filter shows its progress.
     """
     keep_programs()
     _check(drivers, guard, windows, steps, seed)
@@ -92,7 +97,7 @@ def replay(
     if known_world is not None:
         check_view(known_world, store)
     motion = motion_of(store, names)
-    radius, source = radius_of(store, motion, radius)
+    radius, source = radius_of(store, motion, radius, {} if known_world is None else known_world.card.causes)
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     stage, left_out = _stage(
         store, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
@@ -104,7 +109,7 @@ def replay(
         formula = _formula(known_world, radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}
         notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
-    shown = _played(stage, _players(run, drivers), filters, baselines)
+    shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
     return ReplayResult(
         task=store.card.task,
         radius=float(radius),
@@ -138,15 +143,21 @@ def _players(run: Run | None, drivers: Sequence[str]) -> dict[str, str | Policy]
 
 
 def _played(
-    stage: Stage, players: Mapping[str, str | Policy], filters: Mapping[str, Guarded], brake: bool
+    stage: Stage, players: Mapping[str, str | Policy], filters: Mapping[str, Guarded], brake: bool, quiet: bool = True
 ) -> list[Played]:
     """Each driver without a filter, and under each."""
+    ways: dict[str, dict[str, Any]] = {"no guard": {}, **{name: {"guard": one} for name, one in filters.items()}}
+    if brake:
+        ways["brake"] = {"brake": True}
+    total = len(players) * len(ways)
     shown = []
     for name, player in players.items():
-        under = {filter: stage.play(player, one) for filter, one in filters.items()}
-        if brake:
-            under["brake"] = stage.play(player, brake=True)
-        shown.append(Played(name, stage.play(player), under))
+        driven = {}
+        for way, how in ways.items():
+            label = f"{name}, {way} ({len(shown) * len(ways) + len(driven) + 1} of {total})"
+            with Progress(label, stage.windows.steps, 0, quiet) as bar:
+                driven[way] = stage.play(player, **how, bar=bar)
+        shown.append(Played(name, driven.pop("no guard"), driven))
     return shown
 
 
@@ -244,8 +255,11 @@ def _unlearned(world: World | None, store: EpisodeStore) -> np.ndarray:
     return np.flatnonzero(held_out(store, world.card.seed, unsafe_of(labels) if labels else None))
 
 
-def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple[float, str]:
-    """(m, where it is from): as given, the task's own, or the distance that best tells the logged unsafe steps."""
+def radius_of(
+    store: EpisodeStore, motion: Motion, given: float | None, causes: Mapping[str, Found] | None = None
+) -> tuple[float, str]:
+    """(m, where it is from): as given, the task's own, the distance that best tells the logged unsafe steps, or where
+    danger of a distance begins among the causes of a World's card."""
     if given is not None:
         if not 0 < given < np.inf:
             raise UserError(f"radius={given!r} must be a number of metres above 0.")
@@ -255,6 +269,17 @@ def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple
     radii = [part.radius for part in parts if isinstance(part, constraints.Separation)]
     if radii:
         return radii[0], "the task's formula"
+    try:
+        return _radius_of_costs(store, motion), "the logged costs"
+    except UserError:
+        found = _radius_of_causes(causes or {}, motion.offset.shape[-1])
+        if found is None:
+            raise
+        return found
+
+
+def _radius_of_costs(store: EpisodeStore, motion: Motion) -> float:
+    """The distance (m) that best tells the logged unsafe steps; refused where none does."""
     row = np.arange(store.steps) + store.episode_of_step + 1
     distance = np.linalg.norm(motion.offset[row], axis=-1).min(-1)  # (T, N)
     unsafe = store.costs > 0
@@ -263,7 +288,9 @@ def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple
     distance = distance.ravel()
     unsafe = unsafe.ravel()
     if not unsafe.any() or unsafe.all():
-        raise UserError(f"Nothing says how close is contact: the costs of '{store.card.task}' are alike; give radius=.")
+        raise UserError(
+            f"Nothing says how close is contact: the costs of '{store.card.task}' are alike; give radius= (--radius)."
+        )
     order = np.argsort(distance, kind="stable")
     hit = unsafe[order]
     balance = (np.cumsum(hit) / hit.sum() + 1 - np.cumsum(~hit) / (~hit).sum()) / 2
@@ -271,10 +298,27 @@ def radius_of(store: EpisodeStore, motion: Motion, given: float | None) -> tuple
     if balance[best] < TELLS or distance[order[best]] >= NOBODY:
         raise UserError(
             f"No distance tells which steps of '{store.card.task}' are unsafe (the best is right in "
-            f"{100 * balance[best]:.0f} %); give radius=."
+            f"{100 * balance[best]:.0f} %); give radius= (--radius)."
         )
     after = distance[order[min(best + 1, len(order) - 1)]]
-    return float((distance[order[best]] + min(after, 2 * distance[order[best]])) / 2), "the logged costs"
+    return float((distance[order[best]] + min(after, 2 * distance[order[best]])) / 2)
+
+
+def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, str] | None:
+    """(m, where it is from): below what distance to any other the logs of a World have danger, where it found one."""
+    offsets = [f"d{axis}" for axis in "xyz"[:axes]]
+    likely = sorted(
+        (share, edge.at, cause.name)
+        for found in causes.values()
+        for cause, share, edge in zip(found.causes, found.shares, found.edges)
+        if cause.length and not cause.who and edge.at is not None and edge.below
+        if cause.name.startswith("length of other.")
+        if cause.name.removeprefix("length of ").replace("other.", "").split(", ") == offsets
+    )
+    if not likely:
+        return None
+    _, radius, name = likely[-1]
+    return radius, f"the World's cause '{name}'; other dangers are not counted"
 
 
 def _formula(world: World, radius: float, dt: float) -> Guarded | None:

@@ -17,6 +17,7 @@ from ringfence.faults import Faults, Faulty, behind
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import act_with, held, with_cost
 from ringfence.types import Array, Policy, PolicyStep, PyTree
+from ringfence.utils.progress import Progress
 from ringfence.world import World
 
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (W, N, O) and state (W, S)
@@ -82,8 +83,11 @@ class Stage:
     seed: int
     faults: Faults = NO_FAULTS
 
-    def play(self, driver: str | Policy, guard: Guarded | None = None, brake: bool = False) -> Driven:
-        """`driver`: a name of DRIVERS, or a policy; `guard` filters what it does, and so does the `brake`."""
+    def play(
+        self, driver: str | Policy, guard: Guarded | None = None, brake: bool = False, bar: Progress | None = None
+    ) -> Driven:
+        """`driver`: a name of DRIVERS, or a policy; `guard` filters what it does, and so does the `brake`. The `bar`
+        counts steps."""
         w = self.windows
         place = w.place[:, 0].copy()
         velocity = w.velocity[:, 0].copy()
@@ -122,6 +126,8 @@ class Stage:
             contact |= touches
             places.append(place)
             memory = with_cost(actor, memory, jnp.asarray(touches, jnp.float32))
+            if bar is not None:
+                bar.advance(1)
         return Driven(np.stack(places, 1), contact, {k: np.stack(v, 1) for k, v in info.items()})
 
     def _now(self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> Now:
