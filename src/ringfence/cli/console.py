@@ -22,7 +22,8 @@ WIDE = 1000  # columns of what is no terminal: nothing is cut that another progr
 
 def console() -> Console:
     """Of stdout, as wide as its terminal."""
-    return Console(highlight=False, width=None if sys.stdout.isatty() else WIDE)
+    terminal = sys.stdout is not None and sys.stdout.isatty()  # None: it was closed
+    return Console(highlight=False, width=None if terminal else WIDE)
 
 
 def complain(message: str) -> None:
