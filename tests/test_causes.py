@@ -16,7 +16,7 @@ from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
 from ringfence.world import cause_search, causes, foresight, margins, probes, verdict
-from ringfence.world.card import BarrierScores, Card, Data, Foresight, PredictionError, Verdict
+from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
@@ -340,6 +340,17 @@ def test_a_world_of_before_says_that_it_has_no_verdict():
     assert str(card).splitlines()[-1] == "VERDICT none: an earlier version fitted it; fit it again to have one."
 
 
+def test_a_card_says_how_far_guards_look_and_what_their_margin_is():
+    def words(rows):
+        avoidable = Avoidable(before=(1, 3), avoided=(0.5, 0.9), rows=rows)
+        scores = BarrierScores(unsafe_share=0.1, margin=4.0, miscoverage=0.001, avoidable=avoidable)
+        return str(Card(data=Data(task="t", hazard={}), barrier=scores))
+
+    assert "(horizon=30; guards look up to 15 ahead by themselves)" in words(30)
+    assert "(horizon=15)" in words(15)
+    assert "Default margin 4 (--margin 1 stands for it)" in words(15)
+
+
 def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
     data = Data(task="t", hazard={})
     good = BarrierScores(entries=100, recall=0.99, margin_kept=0.9, probed=1.0)
@@ -451,7 +462,6 @@ def test_velocities_follow_from_speed_and_heading():
 
 def test_a_far_sighted_guard_looks_as_far_as_the_card_asks(fitted):
     from ringfence.guards.policy import far_sighted
-    from ringfence.world.card import Avoidable
 
     def seen(rows, avoided, error):
         barrier = BarrierScores(avoidable=Avoidable(before=(1, 3, 10), avoided=avoided, rows=rows))

@@ -151,3 +151,8 @@ def test_the_name_of_before_works_and_warns():
     assert store.content == ringfence.collect(Drift, lean, episodes=3).content
     with pytest.warns(FutureWarning, match="longest of record is called max_episode_steps"):
         ringfence.record(Drift, lean, episodes=1, longest=7)
+
+
+def test_a_mistyped_card_is_refused_before_anything_is_played():
+    with pytest.raises(StoreError, match="did you mean 'observation_names'"):
+        ringfence.collect(pytest.fail, episodes=1, card={"observation_name": ["x"]})
