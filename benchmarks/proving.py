@@ -113,8 +113,8 @@ def rows_of(file: Path, card) -> dict:
     if not file.exists():
         return {}
     kept = json.loads(file.read_text())
-    now = json.loads(json.dumps(described(card)))
-    same = all(kept.get(name) == value for name, value in now.items())
+    # as text, since what is not known is NaN, which equals nothing
+    same = all(json.dumps(kept.get(name)) == json.dumps(value) for name, value in described(card).items())
     return {name: row for name, row in kept["rows"].items() if same or name.partition(" ")[2] in OF_NO_WORLD}
 
 
