@@ -38,6 +38,7 @@ ROWS = {
 ALL = "shield learned, networks on all entries"
 BESIDE = {
     "shield learned, within the logs": LEARNED | {"within_logs": True},
+    "shield learned, margin 2": LEARNED | {"margin": 2.0},
     "adapt learned": LEARNED | {"guard": "adapt"},
     "full learned": LEARNED | {"guard": "full"},
     ALL: LEARNED | {"world": "all"},
