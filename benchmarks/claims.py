@@ -94,10 +94,11 @@ def of_systems() -> tuple[bool, str]:
     clone = {name: r["bc shield learned"]["violation_rate"] for name, r in rows.items()}
     bad = [name for name, r in rows.items() if r["naive shield learned"]["violation_rate"] <= 0.02]
     kept = {n: r["bc shield learned"]["return_mean"] / r["bc shield oracle"]["return_mean"] for n, r in rows.items()}
-    fine = [name for name in rows if clone[name] <= 0.01 and kept[name] >= 0.93]
-    refused = [one["task"] for one in found if one["verdict"] == "unfit"]
-    holds = len(rows) == 16 and len(fine) == 14 and max(clone.values()) < 0.02 and len(bad) == 11 and len(refused) == 1
-    return holds, f"at most 1 % on {len(fine)} of {len(rows)}, {max(clone.values()):.3f} at most; naive {len(bad)}"
+    fine = [name for name in rows if clone[name] <= 0.01 and kept[name] >= 0.9]
+    refused = [one["task"].removeprefix("proving-") for one in found if one["verdict"] == "unfit"]
+    most = max(rate for name, rate in clone.items() if name not in refused)
+    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 14 and len(bad) == 10 and refused == ["arms"]
+    return holds, f"fit: {most:.3f} at most, and nine tenths of the return on {len(fine)}; naive at most 2 % on {len(bad)}"
 
 
 def of_late_actions() -> tuple[bool, str]:
@@ -545,13 +546,13 @@ CLAIMS = (
     ),
     Claim(
         "README.md",
-        "On sixteen systems that chose no setting a guarded clone violates in 2 % of its episodes at most",
+        "On fifteen systems that chose no setting a guarded clone violates in at most 1 % of its episodes",
         PROVING,
         of_systems,
     ),
     Claim(
         "docs/proving-ground.md",
-        "Of sixteen systems fourteen leave the guarded clone at most 1 %",
+        "Fifteen of sixteen guarded clones violate in at most 1 % of their episodes",
         PROVING,
         of_systems,
     ),

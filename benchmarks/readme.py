@@ -120,8 +120,9 @@ def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
 
 
 def _front_proving() -> Iterator[tuple[str, str, str, str]]:
-    """The mean over the systems; returns as shares of what the clone alone earns."""
-    systems = [json.loads(file.read_text())["rows"] for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
+    """The mean over the systems whose Worlds are not refused; returns as shares of what the clone alone earns."""
+    found = [json.loads(file.read_text()) for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
+    systems = [one["rows"] for one in found if one["verdict"] != "unfit"]
     for words, danger, way in (
         (f"{_counted(len(systems))} other systems: a clone of the logs", NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),
