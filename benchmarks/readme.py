@@ -145,7 +145,7 @@ def _front_replay() -> tuple[str, str, str, str]:
 
 
 def _counted(number: int) -> str:
-    return {16: "Sixteen"}.get(number, str(number))
+    return {15: "Fifteen", 16: "Sixteen"}.get(number, str(number))
 
 
 # Rows of the summary: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
