@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from ringfence.evaluation.ope.logs import Logs
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.training import loop, worlds
+from ringfence.world.card import Verdict
 from tests.quick import QUICK_WORLD
 
 QUICK = dict(states=100, transitions=400, updates=20, num_ensemble=2, rollout_episodes=8, rollout_steps=5)
@@ -109,7 +111,9 @@ def test_pages_of_logs_and_of_policies_open_anywhere(run, logs, world, tmp_path,
     said, noted = capsys.readouterr()
     assert "'judge' is called 'ope' now" in noted
     assert "that it was trained on" in said and "danger is predicted within 3 steps" in said
-    with pytest.raises(SystemExit, match="3"):  # so little of a World is unfit to guard by
+    bad = msgspec.structs.replace(world.card, verdict=Verdict("unfit", ("it errs",), ("log more",)))
+    monkeypatch.setattr(worlds, "fit", lambda *_, **__: dataclasses.replace(world, card=bad))
+    with pytest.raises(SystemExit, match="3"):
         app.main(["fit", str(file), "--report", str(tmp_path / "fit.html")])
     for name in ("ope", "fit"):
         page = (tmp_path / f"{name}.html").read_text()
