@@ -1,6 +1,6 @@
 """A film of what a guard does: discs of Crossing under a shield, beside what their clone asked for and what was done.
 
-    python benchmarks/guard_film.py    # docs/images/guard.gif; a minute
+python benchmarks/guard_film.py    # docs/images/guard.gif; a minute
 """
 
 from __future__ import annotations

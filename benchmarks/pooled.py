@@ -43,10 +43,7 @@ ROWS = {
     "flow, the drivers' means": ("flow", "default", FLOW, {"sampling_steps": 1, "temperature": 0.0}),
     "flow, 4 steps": ("flow", "default", FLOW, {"sampling_steps": 4}),
     "flow, guided by danger": ("flow", "default", FLOW, {"barrier_guidance": 1.0}),
-    **{
-        f"flow, λ = {weight:g}": ("flow", "default", FLOW | {"barrier_weight": weight}, {})
-        for weight in (0.1, 1.0)
-    },
+    **{f"flow, λ = {weight:g}": ("flow", "default", FLOW | {"barrier_weight": weight}, {}) for weight in (0.1, 1.0)},
     "flow, 8 steps": ("flow", "default", FLOW, {"sampling_steps": 8}),
     "flow, 8 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 8, "barrier_guidance": 1.0}),
     "flow, one driver": ("flow", "default", FLOW | {"drivers": 1}, {}),

@@ -124,7 +124,7 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     found = [json.loads(file.read_text()) for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
     systems = [one["rows"] for one in found if one["verdict"] != "unfit"]
     for words, danger, way in (
-        (f"{_counted(len(systems))} other systems: a clone of the logs", NO_GUARD, "none"),
+        (f"{len(systems)} other systems: a clone of the logs", NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),
         ("the same clones under a guard", "the true formula and motion", "shield oracle"),
     ):
@@ -142,10 +142,6 @@ def _front_replay() -> tuple[str, str, str, str]:
     alone, guarded = (100 * contacts[way] / windows for way in ("none", "shield"))
     words = "Five drivers, each put among pedestrians as they were filmed"
     return words, "a cost column made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
-
-
-def _counted(number: int) -> str:
-    return {15: "Fifteen", 16: "Sixteen"}.get(number, str(number))
 
 
 # Rows of the summary: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.

@@ -253,6 +253,9 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
         pilot = guard(lambda seen, state: out, world, guard="shield", within_logs=asked)
         ends[asked] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
     assert ends[True] < 1.23 < 1.25 < ends[False]
+    still = msgspec.structs.replace(fitted.card.data, ranges={"own.x": (1.0, 1.0)})
+    with pytest.raises(UserError, match="within_logs keeps to what varies in the logs, and no entry of an agent does"):
+        shown.Shown.by(dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=still)))
     older = dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=Data("walks", {})))
     with pytest.raises(UserError, match="within_logs needs a World that says what its logs have shown.*; fit it again"):
         guard(lambda seen, state: out, older, guard="shield", within_logs=True)

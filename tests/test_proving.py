@@ -189,3 +189,5 @@ def test_the_oracle_is_refused_where_a_simulator_knows_no_distances():
     with pytest.raises(UserError, match="needs a simulator that knows"):
         oracle.known(task)
     assert PolicySpec.parse("shield-oracle").name == "shield-oracle"
+    with pytest.raises(UserError, match="an oracle has read none"):
+        oracle.options("shield", registry.get("proving-discs"), {"within_logs": True})

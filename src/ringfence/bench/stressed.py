@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +15,7 @@ from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run
-from ringfence.utils.escape import spreadsheet
-from ringfence.utils.files import whole
+from ringfence.utils import csvs
 
 COLUMNS = (
     "task, algorithm, seed, faults, guard, barrier, compensated, agents, episodes, return_mean, return_norm, "
@@ -103,13 +100,4 @@ def write_csv(out: str | Path, certificate: Certificate | None = None) -> Path |
     if not found:
         return None
     columns = COLUMNS if certificate is None else [*COLUMNS, COVERS]
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, columns, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in found:
-        cells = {name: row.get(name, "") for name in columns}
-        writer.writerow({k: f"{v:.6g}" if isinstance(v, float) else spreadsheet(v) for k, v in cells.items()})
-    path = Path(out) / "stress.csv"
-    with whole(path) as temporary:
-        temporary.write_text(buffer.getvalue())
-    return path
+    return csvs.write_csv(Path(out) / "stress.csv", columns, found)

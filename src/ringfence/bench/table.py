@@ -5,8 +5,6 @@ Ranks, intervals and comparisons are made by `report/board.py` and its neighbour
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation import reference
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.training.runs import Run
-from ringfence.utils.escape import spreadsheet
-from ringfence.utils.files import whole
+from ringfence.utils import csvs
 
 NEEDED = ("split", "protocol", "episodes", "task", "algorithm", "seed", "variant", "constants")  # of every evaluation
 COLUMNS = (
@@ -96,16 +93,4 @@ def _check_once(folder: Path, result: Row, seen: dict[tuple, Path]) -> None:
 
 def write_csv(out: str | Path) -> Path:
     """DIR/table.csv, one line per row of `rows`."""
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, COLUMNS, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for row in rows(out):
-        writer.writerow({name: _cell(row.get(name, "")) for name in COLUMNS})
-    path = Path(out) / "table.csv"
-    with whole(path) as temporary:
-        temporary.write_text(buffer.getvalue())
-    return path
-
-
-def _cell(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else spreadsheet(value)
+    return csvs.write_csv(Path(out) / "table.csv", COLUMNS, rows(out))

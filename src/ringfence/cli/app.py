@@ -210,7 +210,7 @@ def _doubt(result: dict[str, Any]) -> list[str]:
         return []
     return [
         f"{result['variant']}: in {100 * share:.2g} % of the steps the guard found no action that keeps its margin; it "
-        "took the best one, and nothing speaks for that."
+        "took the best one that it found, which may be unsafe."
     ]
 
 

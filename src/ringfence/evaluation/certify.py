@@ -23,11 +23,11 @@ from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import compensated
+from ringfence.evaluation.stress import check_simulator, compensated
 from ringfence.faults import Faults, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards import Guard
-from ringfence.loading.resolve import Resolved, load_job, resolve
+from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem.homogeneous import local_features
 from ringfence.training.runs import Run
@@ -37,6 +37,10 @@ from ringfence.utils.precision import in_float32
 
 MAX_ROUNDS = 4  # of calibration
 WIDEST = 6.0  # margin: at more a guard does little but stand
+BOUND_ELSEWHERE = (
+    "and certificates need a simulator of `ringfence tasks`; in one of your own, `violation_upper` of `ringfence play` "
+    "is the bound that can be had."
+)
 
 
 @in_float32
@@ -63,7 +67,7 @@ def certify(
     _check(confidence, quantile, calibration, episodes)
     options = {**options, "guard": guard}
     keep_programs()
-    _check_simulator(PolicySpec.of(run, **options))
+    check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
     if compensate:
         options = compensated(run, faults, options)
     resolved = _resolved(run, options)
@@ -122,18 +126,6 @@ def _check(confidence: float, quantile: float, calibration: int, episodes: int) 
     least = math.ceil(quantile / (1 - quantile) - 1e-9)
     if calibration < least:
         raise UserError(f"calibration={calibration} episodes tell no quantile of {quantile:g}; give {least} or more.")
-
-
-def _check_simulator(spec: PolicySpec) -> None:
-    """Refuse, before a guard asks for its World, a run of data that has no simulator here."""
-    if spec.run is None:
-        return
-    task = load_job(spec.run, spec.agents).task
-    if task.env is None:
-        raise UserError(
-            f"Task '{task.name}' exists only as data, and certificates need a simulator of `ringfence tasks`; in one "
-            "of your own, `violation_upper` of `ringfence play` is the bound that can be had."
-        )
 
 
 def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:

@@ -26,6 +26,10 @@ from ringfence.world import World
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
 COMPENSATION = ("delay", "max_age", "hold", "others_acceleration")  # options by which a guard knows of faults
+STRESSED_ELSEWHERE = (
+    "so `ringfence stress` has nothing to play in; play it behind faults in a simulator of your own: `ringfence play "
+    "RUN --env FILE.py:NAME --delay 2`."
+)
 MAX_AGE = 8  # steps up to which a compensating guard makes good for observations that were lost
 
 
@@ -67,7 +71,7 @@ def stress_spec(
     """`stress` of what a spec names."""
     keep_programs()
     whole_number("episodes", episodes, 1, 10**7)
-    _check_simulator(spec)
+    check_simulator(spec, STRESSED_ELSEWHERE)
     resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
     kept = results(resolved.run)
@@ -84,16 +88,13 @@ def stress_spec(
     return result
 
 
-def _check_simulator(spec: PolicySpec) -> None:
+def check_simulator(spec: PolicySpec, remedy: str) -> None:
     """Refuse, before a guard asks for its World, a run of data that has no simulator here."""
     if spec.run is None:
         return
     task = load_job(spec.run, spec.agents).task
     if task.env is None:
-        raise UserError(
-            f"Task '{task.name}' exists only as data, so `ringfence stress` has nothing to play in; play it behind "
-            "faults in a simulator of your own: `ringfence play RUN --env FILE.py:NAME --delay 2`."
-        )
+        raise UserError(f"Task '{task.name}' exists only as data, {remedy}")
 
 
 def results(run: Run) -> dict[str, dict[str, Any]]:

@@ -14,6 +14,7 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.types import Array
 from ringfence.world import World, causes
+from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
@@ -40,6 +41,10 @@ class Shown(eqx.Module):
         known = [name for name in names if name in ranges and ranges[name][1] > ranges[name][0]]
         low, high = (tuple(ranges[name][k] for name in known) for k in range(2))
         lengths = [one for one in causes.offsets(names) if one.name in ranges]
+        if not known and not lengths:
+            raise UserError(
+                "within_logs keeps to what varies in the logs, and no entry of an agent does; leave it out."
+            )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
         return cls(low, high, tuple(names.index(name) for name in known), nearest)
 
@@ -50,7 +55,6 @@ class Shown(eqx.Module):
         read = x[..., np.array(self.entries, int)]
         inside = [jnp.minimum(read - low, high - read) / (high - low)]
         for cause, least, width in self.nearest:
-            offset = x[..., np.array(cause.things)]
-            inside.append((jnp.sqrt((offset**2).sum(-1) + 1e-9) - least) / max(width, 1e-6))
+            inside.append((values_of(cause, x)[..., 0] - least) / max(width, 1e-6))
         steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
         return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0)))

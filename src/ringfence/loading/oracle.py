@@ -121,6 +121,8 @@ def options(name: str, task: Task, changes: Mapping[str, Any]) -> GuardOptions:
     dt = known(task).dt
     horizon = {"horizon": max(1, round(AHEAD / dt))}
     given = build_config(GuardOptions, {**options_of(name, "analytic"), **horizon, **changes}, "the guard")
+    if given.within_logs:
+        raise UserError("within_logs keeps a guard to logs, and an oracle has read none; leave it out.")
     return in_steps(given, dt)
 
 

@@ -72,12 +72,15 @@ class Distance(eqx.Module):
 Score = CauseNet | Distance
 
 
+def values_of(cause: Cause, x: Array) -> Array:
+    """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
+    read = x[..., np.array(cause.things)]
+    return jnp.sqrt((read**2).sum(-1, keepdims=True) + 1e-9) if cause.length else read
+
+
 def scores(net: Score, x: Array) -> Array:
     """(..., N, J) of features (..., N, D), by thing; FAR of those that the cause is not about."""
-    read = x[..., np.array(net.cause.things)]
-    if net.cause.length:
-        read = jnp.sqrt((read**2).sum(-1, keepdims=True) + 1e-9)
-    found = net.of_values(read)
+    found = net.of_values(values_of(net.cause, x))
     if not net.cause.who:
         return found
     return jnp.where(net.cause.holds(x.shape[-2]), found, FAR)
