@@ -109,14 +109,15 @@ def front() -> str:
 
 
 def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
-    rows = grouped("crossing")
-    for words, danger, variant in (
-        ("Eight discs cross a room: a clone of the logs", NO_GUARD, "default"),
-        ("the same clone under a guard", "a logged cost column", "default+shield-learned"),
+    """One seed, by benchmarks/proving.py, as the rows below."""
+    found = json.loads((RESULTS / "proving" / "crossing-hasty.json").read_text())["rows"]
+    for words, danger, way in (
+        ("Eight discs cross a room: a clone of the logs", NO_GUARD, "none"),
+        ("the same clone under a guard", "a logged cost column", "shield learned"),
     ):
-        found = rows["crossing-hasty", "bc", variant]
-        violated = f"{100 * mean(found, 'violation_rate'):.3g} % of {sum(int(r['episodes']) for r in found):,}"
-        yield words, danger, violated, f"{mean(found, 'return_mean'):.2f} m of progress"
+        row = found[f"bc {way}"]
+        violated = f"{100 * row['violation_rate']:.3g} % of {row['episodes']:,}"
+        yield words, danger, violated, f"{row['return_mean']:.2f} m of progress"
 
 
 def _front_proving() -> Iterator[tuple[str, str, str, str]]:
