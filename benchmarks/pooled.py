@@ -43,7 +43,7 @@ ROWS = {
     "flow, the drivers' means": ("flow", "default", FLOW, {"sampling_steps": 1, "temperature": 0.0}),
     "flow, 4 steps": ("flow", "default", FLOW, {"sampling_steps": 4}),
     "flow, guided by danger": ("flow", "default", FLOW, {"barrier_guidance": 1.0}),
-    **{f"flow, λ = {weight:g}": ("flow", "default", FLOW | {"barrier_weight": weight}, {}) for weight in (0.1, 1.0)},
+    **{f"flow, λ = {w:g}": ("flow", "default", FLOW | {"barrier_weight": w}, {}) for w in (0.1, 0.3, 1.0)},
     "flow, 8 steps": ("flow", "default", FLOW, {"sampling_steps": 8}),
     "flow, 8 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 8, "barrier_guidance": 1.0}),
     "flow, one driver": ("flow", "default", FLOW | {"drivers": 1}, {}),
@@ -51,10 +51,33 @@ ROWS = {
     "flow, told the return": ("flow", "return", FLOW, {}),
     "flow, told the return, 2.5 asked": ("flow", "return", FLOW, {"target_return": 2.5}),
     "flow, told the return, 2.5 asked, guidance 2": ("flow", "return", FLOW, {"target_return": 2.5, "cfg_scale": 2.0}),
+    "bc, 20,000 updates": ("bc", "default", {"num_updates": 20_000}, {}),
+    "bc, joint view, 20,000 updates": ("bc", "joint", {"num_updates": 20_000}, {}),
     "bc-best": ("bc-best", "default", {}, {}),
+    "bc-return": ("bc-return", "default", {}, {}),
+    "omar": ("omar", "default", {}, {}),
+    "ma-td3bc": ("ma-td3bc", "default", {}, {}),
+    "ma-td3bc-lag": ("ma-td3bc-lag", "default", {}, {}),
     "madiff": ("madiff", "default", {}, {}),
     "icbf": ("icbf", "split", {}, {}),
 }
+# The same runs under guards, by one World of the pool, seed 0.
+_GUARDED = (
+    "bc, 20,000 updates",
+    "bc, joint view, 20,000 updates",
+    "bc-best",
+    "bc-return",
+    "omar",
+    "ma-td3bc",
+    "ma-td3bc-lag",
+    "madiff",
+    "icbf",
+    "flow",
+)
+for _name in _GUARDED:
+    _of, _preset, _changes, _played = ROWS[_name]
+    for _guard in ("shield", "full"):
+        ROWS[f"{_name}, under {_guard}"] = (_of, _preset, _changes, _played | {"guard": _guard})
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow", "flow, 8 steps, guided by danger": "flow, 8 steps"}
 
@@ -151,7 +174,7 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
         quiet=True,
     )
     given = options
-    if "barrier_guidance" in options:
+    if "barrier_guidance" in options or "guard" in options:
         given = options | {"world": worlds.fit(store, task=task)}  # the same for all seeds
     results = [evaluate(run, episodes=EPISODES, **given) for run in trained]
     returns = task.normalised_return(per_episode(results, "return"))

@@ -16,6 +16,7 @@ from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, UserError
 from ringfence.evaluation import protocol, rollout
 from ringfence.evaluation.evaluate import evaluate
+from ringfence.guards.options import GUARDS
 from ringfence.loading import resolve
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
@@ -97,6 +98,21 @@ def test_policies_act_within_any_bounds(name, trained):
         act = jax.jit(lambda key, told=told: told.act(told.initial_state(5), seen, whole, key)[1].action)
         acted.append(np.asarray(act(jax.random.key(1))))
     np.testing.assert_allclose(acted[1], 5 + 3 * acted[0], atol=1e-4)
+
+
+@pytest.mark.parametrize("guard", [name for name in GUARDS if name != "none"])
+@pytest.mark.parametrize("name", TINY)
+def test_every_guard_takes_every_algorithm(name, guard, trained, small_world):
+    """Whatever number of proposals a guard asks for. Shapes alone: nothing is compiled."""
+    _, policy = load(trained[name], guard=guard, horizon=3, world=small_world, anyway=True)
+    env = registry.get("simple_spread-random").env
+    state = jax.eval_shape(lambda key: env.reset(key, 5), jax.random.key(0))
+
+    def acted(state, key):
+        return policy.act(policy.initial_state(5), env.observe(state), env.global_state(state), key)
+
+    _, out = jax.eval_shape(acted, state, jax.random.key(1))
+    assert out.action.shape == (5, 3, 2)
 
 
 def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path):

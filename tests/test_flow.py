@@ -104,6 +104,19 @@ def test_drivers_that_nobody_needs_are_left(two_drivers, tmp_path):
     assert (np.abs(acts) > 0.4).mean() > 0.9
 
 
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_guard_gets_as_many_proposals_as_it_asks_for(run, two_drivers, count):
+    """The first is the episode's own driver's, however many there are; a shield asks for one."""
+    policy = load(run)[1]
+    world = worlds.fit(two_drivers, **QUICK_WORLD, barrier=False)
+    x = jnp.asarray(two_drivers.observations[:4])
+    carry, plans, _ = policy.propose(policy.initial_state(4), x, None, jax.random.key(0), count, 2, world)
+    assert plans.shape == (4, count, 2, 2, 1)
+    again, action = policy.act(policy.initial_state(4), x, None, jax.random.key(0))
+    np.testing.assert_array_equal(carry["driver"], again["driver"])
+    assert np.isfinite(plans).all()
+
+
 @pytest.mark.parametrize(
     "options, said",
     [

@@ -10,6 +10,7 @@ f(â) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins, �
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -126,7 +127,7 @@ class FlowPolicy(eqx.Module):
         same in the World's view."""
         o, s = self.options, self.spec
         batch = x.shape[0]
-        seen = self.normaliser.state(x).reshape(batch, -1)
+        seen = self._seen(x)
         which = jax.nn.one_hot(driver, self.drivers)
 
         def clean(action: Array, tau: Array) -> Array:
@@ -176,7 +177,9 @@ class FlowPolicy(eqx.Module):
 
     def _drawn(self, x: Array, key: Key) -> Array:
         """(B,) who drives at features x (B, N, D), drawn."""
-        batch = x.shape[0]
-        seen = self.normaliser.state(x).reshape(batch, -1)
-        logits = self._guided(partial(driver_scores, self.networks["prior"], seen), batch)
+        logits = self._guided(partial(driver_scores, self.networks["prior"], self._seen(x)), x.shape[0])
         return drawn(logits, jax.random.normal(key, logits.shape))
+
+    def _seen(self, x: Array) -> Array:
+        """(B, N·D) what networks read of features (B, N, D); B may be 0, where a guard asks for one proposal alone."""
+        return self.normaliser.state(x).reshape(x.shape[0], math.prod(x.shape[1:]))
