@@ -37,7 +37,7 @@ ROWS = {
 # What differs in one thing; the World of `all` is fitted without a search for causes.
 ALL = "shield learned, networks on all entries"
 BESIDE = {
-    "shield learned, within the logs": LEARNED | {"within_logs": True},
+    "shield learned, beyond the logs": LEARNED | {"within_logs": False},
     "shield learned, margin 2": LEARNED | {"margin": 2.0},
     "adapt learned": LEARNED | {"guard": "adapt"},
     "full learned": LEARNED | {"guard": "full"},

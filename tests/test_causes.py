@@ -226,7 +226,7 @@ def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
 
 
 def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
-    """On demand: beyond the logs may be a wall that nobody touched."""
+    """Beyond the logs may be a wall that nobody touched."""
     ranges = fitted.card.data.ranges
     names = ["own.x", "own.y", "own.v", *[one.name for one in causes.offsets(NAMES)]]
     assert sorted(ranges) == sorted(names), "entries of goals and others have none"
@@ -249,10 +249,10 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
     out = np.zeros((N, 2), np.float32)
     out[0, 0] = 0.5
     ends = {}
-    for asked in (False, True):
-        pilot = guard(lambda seen, state: out, world, guard="shield", within_logs=asked)
-        ends[asked] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
-    assert ends[True] < 1.23 < 1.25 < ends[False]
+    for beyond in ({}, {"within_logs": False}):
+        pilot = guard(lambda seen, state: out, world, guard="shield", **beyond)
+        ends[bool(beyond)] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
+    assert ends[False] < 1.23 < 1.25 < ends[True]
     still = msgspec.structs.replace(fitted.card.data, ranges={"own.x": (1.0, 1.0)})
     with pytest.raises(UserError, match="within_logs keeps to what varies in the logs, and no entry of an agent does"):
         shown.Shown.by(dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=still)))
@@ -463,15 +463,19 @@ def test_velocities_follow_from_speed_and_heading():
     assert features.from_dict(features.to_dict(found)) == found
 
 
-def test_a_far_sighted_guard_looks_as_far_as_the_card_asks(fitted):
-    from ringfence.guards.policy import far_sighted
+def test_a_guard_looks_as_far_as_the_card_asks(fitted):
+    from ringfence.guards.policy import by_card
 
-    def seen(rows, avoided, error):
+    def seen(rows, avoided, error, read=()):
         barrier = BarrierScores(avoidable=Avoidable(before=(1, 3, 10), avoided=avoided, rows=rows))
-        prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={})
-        card = Card(data=fitted.card.data, barrier=barrier, prediction_error=prediction)
-        return far_sighted(dataclasses.replace(fitted, card=card))
+        prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={}, read=read)
+        card = Card(data=Data("walks", {}), barrier=barrier, prediction_error=prediction)
+        return by_card(dataclasses.replace(fitted, card=card), "shield", {})
 
-    assert seen(10, (0.1, 0.4, 0.9), 0.1)["shield"] == {"horizon": 10}
+    assert seen(10, (0.1, 0.4, 0.9), 0.1) == {"horizon": 10}
     assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
     assert seen(10, (0.1, 0.4, 0.9), 0.8) == {}, "rows that are predicted badly see nothing"
+    place = Foresight(name="own.x", steps_ahead=(10, 20), error=(0.1, 0.9), coasting=(0.5, 1.0), deviation=1.0)
+    chance = Foresight(name="goal.x", steps_ahead=(10, 20), error=(0.9, 0.9), coasting=(0.5, 1.0), deviation=1.0)
+    assert seen(10, (0.1, 0.4, 0.9), 0.8, (place,)) == {"horizon": 10}, "of what danger follows from alone"
+    assert seen(10, (0.1, 0.4, 0.9), 0.8, (place, chance)) == {}

@@ -40,7 +40,8 @@ class GuardOptions:
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: Fall = 0.5  # share of what is left of the distance that one step may use up
     margin: float = 0.6  # distance that is kept
-    within_logs: bool = False  # keep own entries in the range that the logs show, and others no nearer than they came
+    # keep own entries in the range that the logs show, and others no nearer than they came; on for your own data
+    within_logs: bool = False
     terminal_value: bool = False  # judge the last row by the value of danger, where it is learned
     adapt: NonNegative = 0.0  # step of the margin after a cost; 0: it stays
     rate: CostRate = 0.0125  # share of steps with a cost at which an adapting margin settles

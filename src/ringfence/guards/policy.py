@@ -28,14 +28,14 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
-from ringfence.world.card import FARTHEST, Avoidable
+from ringfence.world.card import FARTHEST, Avoidable, PredictionError
 from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
-BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
+BEARABLE = 0.3  # error of predictions as a share of what changes or varies, up to which more rows are looked at
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
-FAR_SIGHTED = ("shield", "adapt", "full")  # guards that V helps
+BY_CARD = ("shield", "adapt", "full")  # guards that do what the card asks for
 
 Paid = float | Mapping[str, float]  # what a step cost, in all or by each constraint's name
 Cost = Array | dict[str, Array]  # the same of a batch: (B,) or (B, N), or that by constraint
@@ -292,25 +292,36 @@ def options_of(name: str, barrier: str, usual: Named = MappingProxyType({}), **c
     return {**GUARDS[name], **margin, **usual.get(name, {}), **changes}
 
 
-def far_sighted(world: World) -> Named:
-    """Options of named guards that look farther ahead, where the World's card says that the usual rows come too late:
-    as many rows as avoiding takes, where they are predicted well, or the value of danger after the last row, where
-    that leaves nearly all safe steps their margin."""
+def by_card(world: World, name: str, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Options of a named guard that a World's card asks for, unless they are asked for otherwise: to look farther ahead
+    where the usual rows come too late, and to stay within what its logs have shown."""
+    if name not in BY_CARD:
+        return {}
+    asked = {"within_logs": True} if Shown.known(world) else {}
+    if not {*HORIZONS, "terminal_value"} & set(changes):
+        asked |= _far_sighted(world, GUARDS[name].get("horizon", GuardOptions().horizon))
+    return asked
+
+
+def _far_sighted(world: World, least: int) -> dict[str, Any]:
+    """As many rows as avoiding takes, and at least so many, where they are predicted well, or the value of danger after
+    the last row, where that leaves nearly all safe steps their margin."""
     scores = world.card.barrier
     if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
         return {}
-    error = world.card.prediction_error
-    if error is not None and error.error_of_change[-1] <= BEARABLE:
-        rows = min(scores.avoidable.rows, FARTHEST)
-        return {name: {"horizon": max(rows, _rows_of(name))} for name in FAR_SIGHTED}
-    if scores.ahead_kept >= KEPT:
-        return {name: {"terminal_value": True} for name in FAR_SIGHTED}
-    return {}
+    if _foreseen(world.card.prediction_error):
+        return {"horizon": max(min(scores.avoidable.rows, FARTHEST), least)}
+    return {"terminal_value": True} if scores.ahead_kept >= KEPT else {}
 
 
-def _rows_of(name: str) -> int:
-    """The horizon that a named guard has by itself."""
-    return GUARDS[name].get("horizon", GuardOptions().horizon)
+def _foreseen(error: PredictionError | None) -> bool:
+    """Whether rows ahead are predicted well, or what the barrier reads of them, as shares of what changes and of what
+    was logged: goals and others' motion may come by chance, and danger follow from what does not."""
+    if error is None:
+        return False
+    return error.error_of_change[-1] <= BEARABLE or (
+        bool(error.read) and all(one.share(FARTHEST) <= BEARABLE for one in error.read)
+    )
 
 
 def _too_late(avoidable: Avoidable) -> bool:
@@ -338,8 +349,7 @@ def build(
     if barrier != "analytic":
         require(world.card, anyway)
     if usual is None:
-        looks = barrier == "learned" and not {*HORIZONS, "terminal_value"} & set(changes)
-        usual = far_sighted(world) if looks else {}
+        usual = {name: by_card(world, name, changes)} if barrier == "learned" else {}
     _refuse_two_horizons(changes)
     options = build_config(GuardOptions, options_of(name, barrier, usual, **changes), "the guard")
     options = in_steps(options, world.card.data.dt)

@@ -1,8 +1,8 @@
 """What the logs have shown: one's own entries within their range, and nobody nearer than anybody came.
 
 A guard that turns away from a danger that it knows may drive into one that never happened: a wall that no log touches,
-an empty battery. Nothing that is logged says how far beyond the logs it is safe, so a guard may be asked to stay within
-them (`within_logs`). This is the support constraint of offline learning, on predicted rows.
+an empty battery. Nothing that is logged says how far beyond the logs it is safe, so a guard stays within them
+(`within_logs`). This is the support constraint of offline learning, on predicted rows.
 """
 
 from __future__ import annotations
@@ -38,15 +38,20 @@ class Shown(eqx.Module):
                 "fit it again."
             )
         names = list(world.map.names)
-        known = [name for name in names if name in ranges and ranges[name][1] > ranges[name][0]]
+        known = _varying(world)
         low, high = (tuple(ranges[name][k] for name in known) for k in range(2))
-        lengths = [one for one in causes.offsets(names) if one.name in ranges]
+        lengths = _lengths(world)
         if not known and not lengths:
             raise UserError(
                 "within_logs keeps to what varies in the logs, and no entry of an agent does; leave it out."
             )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
         return cls(low, high, tuple(names.index(name) for name in known), nearest)
+
+    @staticmethod
+    def known(world: World) -> bool:
+        """Whether a World says anything of what its logs have shown."""
+        return bool(_varying(world) or _lengths(world))
 
     def score(self, x: Array) -> Array:
         """(..., N) of features (..., N, D), in margins: 1 at the end of what was shown, more inside, and never below 0,
@@ -58,3 +63,15 @@ class Shown(eqx.Module):
             inside.append((values_of(cause, x)[..., 0] - least) / max(width, 1e-6))
         steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
         return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0)))
+
+
+def _varying(world: World) -> list[str]:
+    """Entries that vary in the logs, of those whose ranges are known."""
+    ranges = world.card.data.ranges or {}
+    return [name for name in world.map.names if name in ranges and ranges[name][1] > ranges[name][0]]
+
+
+def _lengths(world: World) -> list[causes.Cause]:
+    """How far things are away, of the kinds whose ranges are known."""
+    ranges = world.card.data.ranges or {}
+    return [one for one in causes.offsets(world.map.names) if one.name in ranges]

@@ -112,6 +112,8 @@ def resolve(spec: PolicySpec) -> Resolved:
         _check_width(job, world.map, "The World")
         usual = None if job.task.guard_by_card else job.task.guard
         options = dict(spec.guard_options)
+        if spec.agents:  # another team has other places to be than the logs' had
+            options = {"within_logs": False} | options
         policy = build(policy, world, job.hazard.hazard, spec.guard, spec.barrier, usual, spec.anyway, **options)
     spec = spec if plans else spec.without_plans()
     # Homogeneous agents see for themselves anyway.

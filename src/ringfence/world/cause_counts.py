@@ -81,8 +81,8 @@ def some_steps(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, rng: np.r
     bad = unsafe if unsafe.ndim == 1 else np.asarray(unsafe.any(1))
     some = _sampled(bad, rng) if len(x) > SAFE_STEPS // 2 else np.arange(len(x))
     x = np.asarray(x[some], np.float32)
-    flat = x.reshape(-1, x.shape[-1])
-    flat = flat[:: max(1, len(flat) // 200_000)]
+    # Whole teams are left out: every other row of all agents' would be of every other agent.
+    flat = x[:: max(1, x[..., 0].size // 200_000)].reshape(-1, x.shape[-1])
     low, high = np.quantile(flat, [0.0005, 0.9995], axis=0)
     fold = rng.permutation(int(episode.max()) + 1) % FOLDS
     return Steps(x, unsafe[some], fold[episode[some]], episode[some], low, high, {})

@@ -13,7 +13,7 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from msgspec.structs import replace
@@ -22,7 +22,7 @@ from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gai
 from ringfence.world.causes import Cause, Edge, Found, candidates, narrowed, only_of, wider
 from ringfence.world.cells import CELLS, Cells
 
-VERSION = 11  # of the search: what was found by another is looked for again
+VERSION = 12  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -48,7 +48,7 @@ def find(
     """The causes of danger in steps that led to features x (T, N, D), `unsafe` (T,) of the team or (T, N) bool of each
     agent, of these episodes (T,); with the cells of each cause."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
-    chosen = _best_grown(steps, names)
+    chosen = _split(steps, _best_grown(steps, names), names)
     if not chosen:
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
@@ -69,6 +69,43 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, pure).safe)
     less = gain(steps, Explained.by(steps, pure), Explained.by(steps, chosen).safe)[0]
     return pure if more - less > SURE * error else chosen
+
+
+def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
+    """The causes with some of fewer entries in the place of one of more, where these tell as much: two walls for a
+    room, those before and behind oneself for a row. A place that nobody visited is then no danger of its own."""
+    for one in [one for one in chosen if one.cause.width > 1]:
+        if one not in chosen:  # another's parts tell it, too
+            continue
+        rest = [t for t in chosen if t is not one]
+        parts = _added(steps, rest, list(_of_fewer_entries(steps, one.cause, names)), PURE)[len(rest) :]
+        explained = Explained.by(steps, rest)
+        told = gain(steps, explained, Explained.by(steps, parts).safe)[0]
+        less = told < (1 - SIMPLER) * gain(steps, explained, one.safe)[0]
+        both = [*rest, *parts]
+        if parts and not less and all(_is_left(steps, part, both) for part in both):
+            chosen = _pruned(steps, both)
+    return chosen
+
+
+def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
+    """Causes of some of the entries of one, of all agents for whom these vary, and of each."""
+    varies = np.ptp(steps.x, axis=0) > 0  # (N, D)
+    whole = {frozenset(thing) for thing in cause.things}
+    for fewer in candidates(names):
+        if fewer.length or not all(any(set(thing) < every for every in whole) for thing in fewer.things):
+            continue
+        vary = varies[:, np.array(fewer.things)].all(-1)  # (N, J)
+        if vary.all():
+            yield fewer
+        elif vary.any():
+            yield narrowed(fewer, tuple((int(i), int(j)) for i, j in np.argwhere(vary)))
+        yield from (one for one in only_of(fewer, len(vary)) if vary[one.who[0]])
+
+
+def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:
+    """Whether a cause has danger of its own beside the others."""
+    return bool((counted(steps, one.cause, _without(steps, chosen, one)).cells.danger > 0.5).any())
 
 
 def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
