@@ -15,7 +15,7 @@ from ringfence.errors import UserError
 from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
-from ringfence.world import cause_search, causes, foresight, margins, probes, verdict
+from ringfence.world import cause_counts, cause_search, causes, foresight, margins, probes, verdict
 from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
@@ -134,6 +134,40 @@ def test_a_blurred_cause_of_all_does_not_hide_those_of_some(monkeypatch):
         np.testing.assert_allclose(edge.bounds, (-1.0, 1.0), atol=0.05)
     monkeypatch.setattr(cause_search, "ENOUGH", 0.0)
     assert cause_search.find(*about)[0].false_alarms > 0.01, "without it"
+
+
+def row_of(agents: int, steps: int, seed: int = 0):
+    """A row of agents who keep their order, each of whom sees how far all others are; the next may not come nearer than
+    0.3. Returns what `find` takes."""
+    rng = np.random.default_rng(seed)
+    gaps = np.where(rng.random((steps, agents - 1)) < 0.1, rng.uniform(0.1, 0.5, (steps, agents - 1)), 2.0)
+    gaps = gaps + 0.2 * rng.random(gaps.shape)
+    place = np.concatenate([np.zeros((steps, 1)), np.cumsum(gaps, 1)], 1)
+    others = [[j for j in range(agents) if j != i] for i in range(agents)]
+    x = np.stack([place[:, who] - place[:, [i]] for i, who in enumerate(others)], 1).astype(np.float32)
+    return x, (gaps < 0.3).any(1), np.arange(steps) // 40, [f"e{d}" for d in range(agents - 1)]
+
+
+def test_causes_of_fewer_entries_take_the_place_of_one_of_more():
+    """Two entries tell who is next to the agents in the middle; each by itself tells it, too, wherever the other is."""
+    x, unsafe, episode, names = row_of(3, 20_000)
+    steps = cause_counts.some_steps(x, unsafe, episode, np.random.default_rng(0))
+    both = causes.Cause("e0, e1", ((0, 1),))
+    whole = cause_counts.counted(steps, both, cause_counts.Explained.by(steps, []))
+    split = cause_search._split(steps, [whole], names)
+    assert {one.cause.things for one in split} == {((0,),), ((1,),)}
+    place = causes.Cause("x, y", ((0, 1),))  # a post: neither entry tells it
+    x = np.random.default_rng(0).uniform(-1, 1, (20_000, 1, 2)).astype(np.float32)
+    steps = cause_counts.some_steps(x, (x**2).sum((1, 2)) < 0.1, episode, np.random.default_rng(0))
+    post = cause_counts.counted(steps, place, cause_counts.Explained.by(steps, []))
+    assert cause_search._split(steps, [post], ["x", "y"]) == [post]
+
+
+def test_ranges_are_those_of_all_agents():
+    """However many steps there are: of four agents every other row would be of two of them."""
+    x = np.broadcast_to(np.arange(4.0)[:, None], (110_000, 4, 1))
+    steps = cause_counts.some_steps(x, np.zeros(110_000, bool), np.arange(110_000) // 100, np.random.default_rng(0))
+    assert steps.low == 0.0 and steps.high == 3.0
 
 
 def cells_of(pattern, length=True, visits=100.0):
