@@ -55,7 +55,7 @@ ROWS = {
     "bc, joint view, 20,000 updates": ("bc", "joint", {"num_updates": 20_000}, {}),
     "bc-best": ("bc-best", "default", {}, {}),
     "bc-return": ("bc-return", "default", {}, {}),
-    "omar": ("omar", "default", {}, {}),
+    "omar": ("omar", "expert", {}, {}),
     "ma-td3bc": ("ma-td3bc", "default", {}, {}),
     "ma-td3bc-lag": ("ma-td3bc-lag", "default", {}, {}),
     "madiff": ("madiff", "default", {}, {}),

@@ -73,8 +73,10 @@ class BarrierSource(eqx.Module):
     def now(self, before: Array, present: Array) -> Array:
         """(..., N, C) scores of the step that led from one state (..., N, D) to the present."""
         if self.source == "analytic":
-            return self._within(self._analytic(present), present)
-        return self._within(self._with_analytic(self._barrier.apart(before, present), present), present)
+            score = self._analytic(present)
+        else:
+            score = self._with_analytic(self._barrier.apart(before, present), present)
+        return score if self.shown is None else jnp.minimum(score, self.shown.score(present)[..., None])
 
     def parts(self, rows: Array) -> Array:
         """(..., K, N, M) what the scores of predicted rows (..., K+1, N, D) are the least of, without what is taken off
@@ -90,7 +92,7 @@ class BarrierSource(eqx.Module):
         if self.source != "learned":
             found.append(self._analytic(after))
         if self.shown is not None:
-            found.append(self.shown.score(after)[..., None])
+            found.append(self.shown.along(after)[..., None])
         return jnp.concatenate(found, -1)
 
     @property
@@ -118,9 +120,9 @@ class BarrierSource(eqx.Module):
         assert self.world.barrier is not None, "checked when it was made"
         return self.world.barrier
 
-    def _within(self, score: Array, x: Array) -> Array:
-        """Scores (..., N, C), no larger than those of staying within what the logs have shown."""
-        return score if self.shown is None else jnp.minimum(score, self.shown.score(x)[..., None])
+    def _within(self, score: Array, rows: Array) -> Array:
+        """Scores (..., K, N, C), no larger than those of staying within what the logs have shown."""
+        return score if self.shown is None else jnp.minimum(score, self.shown.along(rows)[..., None])
 
     def _with_analytic(self, score: Array, x: Array) -> Array:
         return score if self.source == "learned" else jnp.minimum(score, self._analytic(x))

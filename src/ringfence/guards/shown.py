@@ -18,6 +18,8 @@ from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
+SOON = 3  # rows that are judged: a proposal that is held for longer comes to speeds that nobody means to reach
+FAR = 1e3  # score of the others
 
 
 class Shown(eqx.Module):
@@ -47,6 +49,12 @@ class Shown(eqx.Module):
             )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
         return cls(low, high, tuple(names.index(name) for name in known), nearest)
+
+    def along(self, x: Array) -> Array:
+        """(..., K, N) of predicted rows (..., K, N, D): the first ones count."""
+        soon = self.score(x[..., :SOON, :, :])
+        later = max(x.shape[-3] - SOON, 0)
+        return jnp.concatenate([soon, jnp.full((*x.shape[:-3], later, x.shape[-2]), FAR)], -2)
 
     @staticmethod
     def known(world: World) -> bool:
