@@ -19,8 +19,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
-from ringfence.world.causes import Cause, Edge, Found, candidates, narrowed, only_of, wider
-from ringfence.world.cells import CELLS, Cells
+from ringfence.world.cause_edges import refined, within
+from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, wider
+from ringfence.world.cells import Cells
 
 VERSION = 12  # of the search: what was found by another is looked for again
 MOST = 8  # causes
@@ -30,16 +31,8 @@ SURE = 3.0  # standard errors, over episodes, by which a gain has to exceed noth
 NEEDED = 2.0  # standard errors, by which one that is kept beside all others has to
 PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one that is no mixture of others
 ENOUGH = 0.98  # share of unsafe steps that causes tell, from which on they are not looked for in another way
-AROUND = 3.0  # cells to either side that an edge is looked for in
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
-
-
-def radius(x: np.ndarray, unsafe: np.ndarray, episode: np.ndarray, cause: Cause) -> Edge:
-    """Where one cause is dangerous, as steps tell it that look for no other."""
-    steps = some_steps(x, unsafe, episode, np.random.default_rng(0))
-    nothing = Explained.by(steps, [])
-    return refined(steps, counted(steps, cause, nothing).cells.edge, cause, nothing)
 
 
 def find(
@@ -188,18 +181,11 @@ def _tells_nearly_all(steps: Steps, one: Counted, explained: Explained) -> bool:
     for fold in np.unique(steps.fold):
         rest, own = steps.part(steps.fold != fold), steps.part(steps.fold == fold)
         edge = refined(rest, one.cells.edge, one.cause, explained.part(steps.fold != fold))
-        called = _within(rest, one.cause, edge)
+        called = within(rest, one.cause, edge)
         share = min(rest.unsafe[called].mean(), 0.999) if called.any() else 0.0
-        safe[steps.fold == fold] = np.where(_within(own, one.cause, edge), np.log1p(-share), 0.0)
+        safe[steps.fold == fold] = np.where(within(own, one.cause, edge), np.log1p(-share), 0.0)
     to_win = -likelihood(steps, explained.safe).mean() * (1 if steps.unsafe.ndim == 1 else steps.unsafe.shape[1])
     return gain(steps, explained, safe)[0] > NEARLY_ALL * to_win
-
-
-def _within(steps: Steps, cause: Cause, edge: Edge) -> np.ndarray:
-    """(T,) or (T, N) bool: somebody is in danger by a cause of one number."""
-    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
-    score = signed(cause.of(steps.x)[:, agents, things, 0], edge)
-    return _of_the_worst(steps, score, score, agents) < 0
 
 
 def _gathered(steps: Steps, best: Counted, pool: Sequence[Cause], explained: Explained) -> Counted:
@@ -272,52 +258,3 @@ def _summary(steps: Steps, chosen: list[Counted]) -> Found:
     share, false_alarms = explained(np.logical_or.reduce([one.called for one in chosen]))
     shares = tuple(round(explained(one.called)[0], 4) for one in chosen)
     return Found(tuple(one.cause for one in chosen), round(share, 4), round(false_alarms, 4), shares)
-
-
-def refined(steps: Steps, edge: Edge, cause: Cause, explained: Explained) -> Edge:
-    """The edge with bounds between the values that parted unsafe steps from safe ones, finer than cells are."""
-    if not edge.bounds:
-        return edge
-    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
-    values = cause.of(steps.x)[:, agents, things, 0]
-    value = _of_the_worst(steps, values, signed(values, edge), agents)
-    left = explained.left(steps.unsafe) > 0.5
-    size = (edge.high[0] - edge.low[0]) / CELLS[1]
-    bounds = list(edge.bounds)
-    for k, bound in enumerate(edge.bounds):
-        near = np.abs(value - bound) < AROUND * size
-        bad, fine = value[near & left], value[near & ~steps.unsafe]
-        if not edge.unseen[k] and len(bad) and len(fine):
-            bounds[k] = _parting(bad, fine, low_is_bad=(k % 2 == 0) == edge.inside)
-    seen = [bound for bound, unseen in zip(bounds, edge.unseen) if not unseen]
-    at = None if edge.at is None else round(seen[0], 4)
-    return replace(edge, bounds=tuple(sorted(bounds)), at=at)
-
-
-def signed(values: np.ndarray, edge: Edge) -> np.ndarray:
-    """Distances of values to where danger begins, below 0 in danger."""
-    offset = values[..., None] - np.array(edge.bounds)
-    safe = ((offset > 0).sum(-1) % 2 == 1) == edge.inside
-    return np.where(safe, 1.0, -1.0) * np.abs(offset).min(-1)
-
-
-def _of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: np.ndarray) -> np.ndarray:
-    """(T,) or (T, N) the values of the things in most danger; far off where an agent has none."""
-    if not steps.each:
-        return np.take_along_axis(values, score.argmin(1)[:, None], 1)[:, 0]
-    found = np.full(steps.unsafe.shape, np.inf)
-    for agent in np.unique(agents):
-        own = agents == agent
-        found[:, agent] = np.take_along_axis(values[:, own], score[:, own].argmin(1)[:, None], 1)[:, 0]
-    return found
-
-
-def _parting(bad: np.ndarray, fine: np.ndarray, low_is_bad: bool) -> float:
-    """The value that parts most unsafe steps from safe ones: in the middle of all that do as well."""
-    sign = 1.0 if low_is_bad else -1.0
-    bad, fine = np.sort(sign * bad), np.sort(sign * fine)
-    tried = np.unique(np.concatenate([bad, fine]))
-    wrong = len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
-    best = int(wrong.argmin())
-    following = tried[best + 1] if best + 1 < len(tried) else tried[best]
-    return float(sign * 0.5 * (tried[best] + following))

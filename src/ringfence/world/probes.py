@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.types import Array
-from ringfence.world import cause_search, causes
+from ringfence.world import cause_edges, causes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
@@ -156,7 +156,7 @@ def _radius(cause: Cause, logged: Logged) -> Edge:
     steps = logged.fitted_steps
     rows = np.asarray(logged.arrays["row"])[steps] + 1
     x = logged.picked("features", rows)
-    return cause_search.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
+    return cause_edges.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
 
 
 def _states(logged: Logged, rng: np.random.Generator) -> Array:
