@@ -176,8 +176,8 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     wanted = names.guard_options(dataclasses.asdict(options)) | {name: played[name] for name in newer}
     if options.horizon_seconds:  # how many steps these are, the World knew
         wanted["horizon"] = played["horizon"]
-    if task.guard_by_card:  # how far the guard looked was the World's affair
-        looked = {"horizon", "terminal_value"} - asked.keys()
+    if task.guard_by_card:  # how far the guard looked, and whether beyond the logs, was the World's affair
+        looked = {"horizon", "terminal_value", "within_logs"} - asked.keys()
         wanted |= {name: played[name] for name in looked}
     world = Settings(**worlds.usual(task, worlds.execution_of(task, spec.execution)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
