@@ -72,6 +72,8 @@ UNSHOWN = re.compile(
 
 def main() -> None:
     put("README.md", "front", front())
+    put("docs/replay-results.md", "drivers", replayed_drivers())
+    put("docs/replay-results.md", "recordings", replayed_recordings())
     put("docs/tables.md", "summary", summary())
     put("docs/tables.md", "table", spread(grouped("simple_spread")))
     measured = grouped("mujoco")
@@ -143,6 +145,49 @@ def _front_replay() -> tuple[str, str, str, str]:
     alone, guarded = (100 * contacts[way] / windows for way in ("none", "shield"))
     words = "Five drivers, each put among pedestrians as they were filmed"
     return words, "a cost column made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
+
+
+# Filters of a replay: their words, and where their rows are.
+FILTERS = {
+    "shield, learned danger": ("rows", "shield"),
+    "the same beyond the logs": ("beyond the logs", "shield"),
+    "the same without restarts": ("without restarts", "shield"),
+    "formula, 2 s": ("rows", "formula"),
+    "constant-velocity brake": ("rows", "brake"),
+}
+RECORDINGS = ("zara02", "seq_hotel", "zara01", "seq_eth", "students03")
+DRIVERS = {"bc": "clone (`bc`)", "straight": "", "accelerate": "", "hasty": "", "seek": ""}
+
+
+def replayed_drivers() -> str:
+    """Contacts prevented and caused in zara02, by driver."""
+    found = json.loads((RESULTS / "replay" / "zara02.json").read_text())
+    lines = [f"| driver | contacts | {' | '.join(FILTERS)} |", "|---" * (2 + len(FILTERS)) + "|"]
+    for driver, words in DRIVERS.items():
+        lines.append(f"| {words or f'`{driver}`'} | {_filtered(found, {driver})} |")
+    lines.append(f"| all | {_filtered(found, set(DRIVERS))} |")
+    return "\n".join(lines)
+
+
+def replayed_recordings() -> str:
+    """The same of all drivers together, by recording."""
+    lines = [f"| recording | verdict | windows | contacts | {' | '.join(FILTERS)} |"]
+    lines.append("|---" * (4 + len(FILTERS)) + "|")
+    for name in RECORDINGS:
+        found = json.loads((RESULTS / "replay" / f"{name}.json").read_text())
+        lines.append(f"| `{name}` | {found['verdict']} | {found['windows']} | {_filtered(found, set(DRIVERS))} |")
+    return "\n".join(lines)
+
+
+def _filtered(found: dict, drivers: set[str]) -> str:
+    """Contacts alone, and what each filter makes of them; nothing where a file does not have it."""
+    alone = sum(r["contacts"] for r in found["rows"] if r["filter"] == "none" and r["policy"] in drivers)
+    cells = [str(alone)]
+    for where, name in FILTERS.values():
+        rows = [r for r in found.get(where, ()) if r["filter"] == name and r["policy"] in drivers]
+        prevented, caused = (sum(r[what] for r in rows) for what in ("prevented", "caused"))
+        cells.append(f"{prevented} ({100 * prevented / alone:.0f} %), {caused} caused" if rows else "")
+    return " | ".join(cells)
 
 
 # Rows of the summary: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.

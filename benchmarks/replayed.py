@@ -24,6 +24,7 @@ from ringfence.training.runs import write_json
 OUT = Path(__file__).resolve().parent.parent / "results" / "replay"
 LEARN = 0.7  # share of the time
 NEIGHBOURS = 6
+PAIRED = {"without restarts": {"correction_restarts": 0}, "beyond the logs": {"within_logs": False}}
 LONGEST = 40  # steps of an episode: a longer track is several, or few episodes would hold out much of the danger
 
 
@@ -54,18 +55,20 @@ def by_cost(file: Path, radius: float, name: str, **how: Any) -> tuple[EpisodeSt
 
 
 def replayed(learn: EpisodeStore, judge: EpisodeStore, **how: Any) -> dict[str, Any]:
-    """A clone and bad drivers among the logged others, and under the guard also without restarts of its correction;
-    `how` as for `ringfence.replay`."""
+    """A clone and bad drivers among the logged others, and under the guard also without what PAIRED leaves out; `how`
+    as for `ringfence.replay`."""
     world = ringfence.fit(learn)
     print(world.card, flush=True)
     with tempfile.TemporaryDirectory() as runs:
         (run,) = ringfence.train("bc", learn, seeds=(0,), out=runs)
         result = ringfence.replay(run, judge, world=world, anyway=True, **how)
         print(*result.summary(), sep="\n", flush=True)
-        beside = ringfence.replay(run, judge, world=world, anyway=True, baselines=False, correction_restarts=0, **how)
-    print("Without restarts of the correction:", *beside.summary(), sep="\n")
+        paired = {}
+        for name, without in PAIRED.items():
+            beside = ringfence.replay(run, judge, world=world, anyway=True, baselines=False, **without, **how)
+            print(f"{name}:", *beside.summary(), sep="\n", flush=True)
+            paired[name] = beside.to_json()["rows"]
     logs = {"episodes": learn.episodes, "steps": learn.steps, "unsafe": int((learn.costs > 0).sum())}
-    paired = {"without restarts": beside.to_json()["rows"]}
     return result.to_json() | paired | {"logs": logs, "world": told(world)}
 
 

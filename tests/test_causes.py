@@ -502,16 +502,12 @@ def test_velocities_follow_from_speed_and_heading():
 def test_a_guard_looks_as_far_as_the_card_asks(fitted):
     from ringfence.guards.policy import by_card
 
-    def seen(rows, avoided, error, read=()):
+    def seen(rows, avoided, error):
         barrier = BarrierScores(avoidable=Avoidable(before=(1, 3, 10), avoided=avoided, rows=rows))
-        prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={}, read=read)
+        prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={})
         card = Card(data=Data("walks", {}), barrier=barrier, prediction_error=prediction)
         return by_card(dataclasses.replace(fitted, card=card), "shield", {})
 
     assert seen(10, (0.1, 0.4, 0.9), 0.1) == {"horizon": 10}
     assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
     assert seen(10, (0.1, 0.4, 0.9), 0.8) == {}, "rows that are predicted badly see nothing"
-    place = Foresight(name="own.x", steps_ahead=(10, 20), error=(0.1, 0.9), coasting=(0.5, 1.0), deviation=1.0)
-    chance = Foresight(name="goal.x", steps_ahead=(10, 20), error=(0.9, 0.9), coasting=(0.5, 1.0), deviation=1.0)
-    assert seen(10, (0.1, 0.4, 0.9), 0.8, (place,)) == {"horizon": 10}, "of what danger follows from alone"
-    assert seen(10, (0.1, 0.4, 0.9), 0.8, (place, chance)) == {}

@@ -28,11 +28,11 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
-from ringfence.world.card import FARTHEST, Avoidable, PredictionError
+from ringfence.world.card import FARTHEST, Avoidable
 from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
-BEARABLE = 0.3  # error of predictions as a share of what changes or varies, up to which more rows are looked at
+BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
 BY_CARD = ("shield", "adapt", "full")  # guards that do what the card asks for
@@ -309,19 +309,10 @@ def _far_sighted(world: World, least: int) -> dict[str, Any]:
     scores = world.card.barrier
     if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
         return {}
-    if _foreseen(world.card.prediction_error):
+    error = world.card.prediction_error
+    if error is not None and error.error_of_change[-1] <= BEARABLE:
         return {"horizon": max(min(scores.avoidable.rows, FARTHEST), least)}
     return {"terminal_value": True} if scores.ahead_kept >= KEPT else {}
-
-
-def _foreseen(error: PredictionError | None) -> bool:
-    """Whether rows ahead are predicted well, or what the barrier reads of them, as shares of what changes and of what
-    was logged: goals and others' motion may come by chance, and danger follow from what does not."""
-    if error is None:
-        return False
-    return error.error_of_change[-1] <= BEARABLE or (
-        bool(error.read) and all(one.share(FARTHEST) <= BEARABLE for one in error.read)
-    )
 
 
 def _too_late(avoidable: Avoidable) -> bool:

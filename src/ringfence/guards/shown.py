@@ -58,19 +58,20 @@ class Shown(eqx.Module):
 
     @staticmethod
     def known(world: World) -> bool:
-        """Whether a World says anything of what its logs have shown."""
-        return bool(_varying(world) or _lengths(world))
+        """Whether a World says what its logs have shown of what is an agent's own. Without names it is any entry, goals
+        among them, and nobody can keep to all."""
+        return bool(_lengths(world)) or any(name.startswith("own.") for name in _varying(world))
 
     def score(self, x: Array) -> Array:
-        """(..., N) of features (..., N, D), in margins: 1 at the end of what was shown, more inside, and never below 0,
-        so that danger that is known counts for more."""
+        """(..., N) of features (..., N, D), in margins: 1 at the end of what was shown, more inside, a half where that
+        is as far outside as it is wide, and never below 0, so that danger that is known counts for more."""
         low, high = np.array(self.low), np.array(self.high)
         read = x[..., np.array(self.entries, int)]
         inside = [jnp.minimum(read - low, high - read) / (high - low)]
         for cause, least, width in self.nearest:
             inside.append((values_of(cause, x)[..., 0] - least) / max(width, 1e-6))
         steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
-        return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0)))
+        return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
 
 
 def _varying(world: World) -> list[str]:

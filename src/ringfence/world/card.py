@@ -60,11 +60,6 @@ class Foresight(Part, frozen=True):
     deviation: float  # of what was logged
     seconds: tuple[float, ...] = ()  # that these steps take, where the logs say
 
-    def share(self, steps: int) -> float:
-        """The error so many steps ahead, or at the nearest steps that are known, as a share of the deviation."""
-        nearest = min(range(len(self.error)), key=lambda k: abs(self.steps_ahead[k] - steps))
-        return self.error[nearest] / max(self.deviation, 1e-9)
-
     @property
     def beats_coasting(self) -> bool:
         """Whether anything is gained by its predictions; errors of a hundredth of what is logged are none."""
