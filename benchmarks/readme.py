@@ -181,6 +181,10 @@ def replayed_recordings() -> str:
 
 def _filtered(found: dict, drivers: set[str]) -> str:
     """Contacts alone, and what each filter makes of them; nothing where a file does not have it."""
+    if "beyond the logs" not in found:  # an older file, of a guard that went there
+        guarded = [r for r in found["rows"] if r["filter"] == "shield"]
+        rest = [r for r in found["rows"] if r["filter"] != "shield"]
+        found = {"rows": rest, "beyond the logs": guarded}
     alone = sum(r["contacts"] for r in found["rows"] if r["filter"] == "none" and r["policy"] in drivers)
     cells = [str(alone)]
     for where, name in FILTERS.values():
