@@ -74,10 +74,11 @@ _GUARDED = (
     "icbf",
     "flow",
 )
-for _name in _GUARDED:
-    _of, _preset, _changes, _played = ROWS[_name]
-    for _guard in ("shield", "full"):
-        ROWS[f"{_name}, under {_guard}"] = (_of, _preset, _changes, _played | {"guard": _guard})
+ROWS |= {
+    f"{name}, under {guard}": (*ROWS[name][:-1], ROWS[name][-1] | {"guard": guard})
+    for name in _GUARDED
+    for guard in ("shield", "full")
+}
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow", "flow, 8 steps, guided by danger": "flow, 8 steps"}
 

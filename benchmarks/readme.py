@@ -190,7 +190,7 @@ def _filtered(found: dict, drivers: set[str]) -> str:
     for where, name in FILTERS.values():
         rows = [r for r in found.get(where, ()) if r["filter"] == name and r["policy"] in drivers]
         prevented, caused = (sum(r[what] for r in rows) for what in ("prevented", "caused"))
-        cells.append(f"{prevented} ({100 * prevented / alone:.0f} %), {caused} caused" if rows else "")
+        cells.append(f"{prevented} ({100 * prevented / alone:.0f} %), {caused}" if rows else "")
     return " | ".join(cells)
 
 
