@@ -388,6 +388,11 @@ def test_a_card_says_how_far_guards_look_and_what_their_margin_is():
     assert "(horizon=30; guards look up to 15 ahead by themselves)" in words(30)
     assert "(horizon=15)" in words(15)
     assert "Default margin 4 (--margin 1 stands for it)" in words(15)
+    assert "Margins that are added" not in words(15)
+    wider = BarrierScores(margin=4.0, widening=((0.0,) * 15, (0.0,) * 4 + (0.5,) * 11))
+    two = Found(tuple(Cause(name, ((0,),)) for name in ("own.v", "own.x")), edges=(Edge((0.0,), (1.0,)),) * 2)
+    said = str(Card(data=Data(task="t", hazard={}), barrier=wider, causes={"": two}))
+    assert "rows ahead, which are predicted worse: own.x 0.5 at 5, 0.5 at 10, 0.5 at 15." in said
 
 
 def test_a_world_that_foresees_worse_than_constant_velocity_says_so():
@@ -436,6 +441,66 @@ def test_entries_that_a_cause_does_not_explain_leave_its_margin(fitted):
     of_pairs = length(lambda why: why[..., 0])
     assert of_pairs < 0.5 * NEAR
     assert length(lambda why: why.any(-1)) == pytest.approx(of_pairs, rel=0.3)
+
+
+def test_margins_widen_by_what_rows_ahead_are_predicted_worse(fitted):
+    """Where every step is predicted to lead farther apart than it does, by more in every row ahead; rows for which the
+    margin itself is calibrated ask for no more."""
+    store = store_of()
+    logged = Logged.of(store, fitted.map, held_out(store, 0), labels_of(store, fitted.map, fitted.card.settings, None))
+
+    class Sparse(eqx.Module):
+        """Dynamics by which others part."""
+
+        def step(self, x, action):
+            after, spread = fitted.dynamics.step(x, action)
+            return after.at[..., 5:].multiply(1.05), spread
+
+    def of(dynamics):
+        found = margins.widening(fitted.barrier, dynamics, logged, np.random.default_rng(2))
+        return dict(zip((net.cause.name for net in fitted.barrier.causes), found))
+
+    pair = "length of other.dx, other.dy"
+    good, bad = of(fitted.dynamics), of(Sparse())
+    for one in (*good.values(), *bad.values()):
+        assert one[:3] == (0.0, 0.0, 0.0) and list(one) == sorted(one)
+    assert bad[pair][9] > good[pair][9] + 0.5
+    assert bad["own.v"] == good["own.v"]
+
+
+def test_scores_of_rows_ahead_are_less_by_what_they_ask_for(fitted):
+    rows = jnp.asarray(walks(1)[0][:, :7])
+    plain = fitted.barrier.along(rows)
+    np.testing.assert_array_equal(plain, fitted.barrier.apart(rows[:, :-1], rows[:, 1:]))
+    count = len(fitted.barrier.causes)
+    nothing = fitted.barrier.along(rows, [(0.0,)] * count)
+    np.testing.assert_allclose(jnp.maximum(nothing, 0.0), jnp.maximum(plain, 0.0), atol=1e-5)
+    wider = fitted.barrier.along(rows, [(0.0, 0.0, 1.0)] * count)
+    np.testing.assert_array_equal(wider[:, :2], nothing[:, :2])
+    assert (wider[:, 2:] < nothing[:, 2:]).all()
+    parts = fitted.barrier.parts(rows, [(0.0, 0.0, 1.0)] * count)
+    np.testing.assert_allclose(parts.min(-1), wider[..., 0], atol=1e-5)
+    far = fitted.barrier.along(rows, [(60.0,)] * count), fitted.barrier.along(rows, [(61.0,)] * count)
+    assert (far[1] < far[0] - 0.01).all(), "deep in danger there is still a way out"
+
+
+def test_an_entry_that_few_steps_show_has_the_edges_of_another():
+    """Pairs in a row: those in front hardly ever touch, and where they do is told by those behind."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-3, 3, (40_000, 1, 2))
+    episode = np.repeat(np.arange(400), 100)
+    touch = np.abs(x[:, 0]) < 0.3
+    rare = np.flatnonzero(touch[:, 1])
+    x[rare, 0, 1] += np.where(np.arange(len(rare)) % 300, 1.0, 0.0)
+    touch = np.abs(x[:, 0]) < 0.3
+    assert touch[:, 1].sum() < 20
+    found, cells = cause_search.find(x, touch.any(1), episode, ["e0", "e1"])
+    assert [one.name for one in found.causes] == ["e0", "e1"] and len(cells) == 2
+    assert [pytest.approx(edge.bounds[1:3], abs=0.03) for edge in found.edges] == [(-0.3, 0.3)] * 2
+    alone, _ = cause_search.find(x, touch[:, 1], episode, ["e0", "e1"])
+    assert not alone.causes, "too few by themselves"
+    safe = touch.any(1) & ~(touch[:, 1] & (np.cumsum(touch[:, 1]) % 3 == 0))
+    assert [one.name for one in cause_search.find(x, safe, episode, ["e0", "e1"])[0].causes] == ["e0"]
 
 
 def test_foresight_is_of_what_the_barrier_reads(fitted):
@@ -511,3 +576,15 @@ def test_a_guard_looks_as_far_as_the_card_asks(fitted):
     assert seen(10, (0.1, 0.4, 0.9), 0.1) == {"horizon": 10}
     assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
     assert seen(10, (0.1, 0.4, 0.9), 0.8) == {}, "rows that are predicted badly see nothing"
+
+    def foreseen(*errors, wide=((0.0,), (0.0,))):
+        read = [Foresight(str(error), (4, 10, 20), error, error, 1.0) for error in errors]
+        error = PredictionError(steps_ahead=(8,), error_of_change=(0.8,), by_entry={}, read=tuple(read))
+        card = Card(data=Data("walks", {}), barrier=BarrierScores(widening=wide), prediction_error=error)
+        return by_card(dataclasses.replace(fitted, card=card), "shield", {}).get("horizon")
+
+    assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.3)) == 15
+    assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.4)) == 10, "as far as all that is read is foreseen"
+    assert foreseen((0.1, 0.5, 0.6)) == 4
+    assert foreseen((0.4, 0.5, 0.6)) is None
+    assert foreseen((0.1, 0.1, 0.2), wide=()) is None, "Worlds of before do not say what rows ahead ask for"

@@ -15,7 +15,7 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import BarrierSource, Guard, GuardOptions
-from ringfence.guards.correction import fixed_plans
+from ringfence.guards.correction import ASKED, Corrector, continuations, fixed_plans
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.loading import run_worlds
@@ -101,6 +101,26 @@ def test_every_agent_begins_from_every_fixed_plan(dim):
     if dim <= 3:  # into each direction by all that an agent can do, for all rows
         for corner in ([1.0] * dim, [-1.0] * dim):
             assert (plans[0, :, :, 0] == np.array(corner)).all((1, 2)).any()
+
+
+@pytest.mark.parametrize("speed, kept", [(0.0, True), (0.25, False)])
+def test_what_was_asked_for_is_held_for_a_few_rows_and_not_for_all(speed, kept):
+    """Pushed for 15 rows everybody is too fast: that is no reason not to push now, as long as there is a way out."""
+
+    def missing(speed, plans, margin):  # (B, S, K, N) of agents that may not be faster than 0.5
+        fast = speed + 0.1 * jnp.cumsum(plans[..., 0], 2)
+        return jnp.minimum(0.5 - jnp.abs(fast), 0.0)
+
+    def within(plan):
+        return -jnp.ones_like(plan), jnp.ones_like(plan)
+
+    correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
+    asked = jnp.ones((1, 15, 2, 1))
+    found = correct(jnp.full((1, 1, 1, 1), speed), asked, jnp.ones((1, 1)))
+    assert (missing(speed, found[:, None], None) >= -1e-3).all()
+    assert ((found[:, :ASKED] == 1.0).all()) == kept
+    plans = continuations(rows=12, agents=2, dim=2)
+    assert plans.shape == (1 + 8 * 2, 12, 2, 2) and (plans[:, 6:] == 0).all((1, 2, 3)).sum() < len(plans) // 2
 
 
 def test_many_plans_are_corrected_as_few_are(small_world, bound, present):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
 
@@ -62,10 +64,9 @@ class BarrierSource(eqx.Module):
         after = rows[..., 1:, :, :]
         if self.source == "analytic":
             return self._within(self._analytic(after), after)
-        barrier = self._barrier
-        score = barrier.apart(rows[..., :-1, :, :], after)
+        score = self._barrier.along(rows, self._widening)
         if self.terminal_value:
-            last = jnp.minimum(score[..., -1:, :, :], barrier.ahead_apart(after[..., -1:, :, :]))
+            last = jnp.minimum(score[..., -1:, :, :], self._barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
         score = score - jnp.maximum(spread / self.world.ood_threshold - 1.0, 0.0)[..., None]
         return self._within(self._with_analytic(score, after), after)
@@ -84,7 +85,7 @@ class BarrierSource(eqx.Module):
         after = rows[..., 1:, :, :]
         found: list[Array] = []
         if self.source != "analytic":
-            found.append(self._barrier.parts(rows[..., :-1, :, :], after))
+            found.append(self._barrier.parts(rows, self._widening))
         if self.terminal_value:
             ahead = self._barrier.ahead_apart(after).min(-1)
             last = jnp.arange(after.shape[-3])[:, None] == after.shape[-3] - 1
@@ -114,6 +115,16 @@ class BarrierSource(eqx.Module):
     def limits(self) -> dict[str, float]:
         """Limit per episode of each constraint that has a barrier of its own; empty where danger is one."""
         return {} if self.source == "analytic" else self.world.limits
+
+    @property
+    def _widening(self) -> tuple[Any, ...]:
+        """What rows ahead ask for beyond the margin, as the World's card says; of several constraints each."""
+        card = self.world.card
+        barrier = self._barrier
+        if not isinstance(barrier, MinBarrier):
+            return () if card.barrier is None else card.barrier.widening
+        of_each = card.constraints or {}
+        return tuple(of_each[name].widening if name in of_each else () for name in barrier.names)
 
     @property
     def _barrier(self) -> Barrier | MinBarrier:

@@ -1,9 +1,15 @@
-"""How a shield finds actions that meet its condition: by slope, and where a slope leads nowhere from fixed plans."""
+"""How a shield finds actions that meet its condition: by what follows the actions that were asked for, by slope, and
+where a slope leads nowhere from fixed plans.
+
+A policy says what it does now. A guard that looks far ahead may not take that for what it does all the time: pushed for
+long enough anything leaves every limit. So what was asked for is held for a few rows, and after these the plan may do
+whatever is safe, as a predictive safety filter has it (Wabersich and Zeilinger 2021).
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,6 +23,7 @@ from ringfence.types import Array, PyTree
 TOGETHER = 32  # teams whose plans are corrected at once
 AGAIN = 8  # teams for which a correction is begun again at once
 DIRECTIONS = 26  # of fixed plans, where actions have more than three numbers
+ASKED = 3  # rows for which a plan is what was asked for, before it may do something else
 TOLERANCE = 1e-3  # of the condition, in margins: less is not counted as infeasible
 
 
@@ -43,7 +50,10 @@ class Corrector:
 
     def __call__(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """Where nothing is missing a plan is kept as it is."""
-        found = self._where_short(self._by_slope, TOGETHER, 0.0, (present, plan, plan, margin))
+        begun = plan
+        if plan.shape[1] > ASKED and self.steps:
+            begun = self._where_short(self._continued, AGAIN, 0.0, (present, plan, plan, margin))
+        found = self._where_short(self._by_slope, TOGETHER, 0.0, (present, plan, begun, margin))
         if not self.restarts:
             return found
         return self._where_short(self._again, AGAIN, TOLERANCE, (present, plan, found, margin))
@@ -75,6 +85,31 @@ class Corrector:
     def shortfall(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
         return team_sum(self.missing(present, plan[:, None], margin)[:, 0], (1,), self.alone)
+
+    def _continued(self, present: PyTree, asked: Array, plan: Array, margin: Array) -> Array:
+        """Plans that go on after ASKED rows as they did, or by the fixed plans that miss least: all of a team by the
+        same start, or each agent by its own best, whatever the others did by it."""
+        _, rows, agents, dim = plan.shape
+        tails = jnp.asarray(continuations(rows - ASKED, agents, dim), plan.dtype)  # (S, K - ASKED, N, A)
+        low, high = self.within(asked)
+        begun = jnp.broadcast_to(plan[:, None, :ASKED], (len(plan), len(tails), ASKED, agents, dim))
+        other = jnp.concatenate([begun, jnp.broadcast_to(tails, (len(plan), *tails.shape))], 2)
+        other = jnp.clip(other, low[:, None], high[:, None])
+        unmet = self.missing(present, plan[:, None], margin)[:, 0].sum(1) < 0
+        other = jnp.where(unmet[:, None, None, :, None], other, plan[:, None])
+        other = jnp.concatenate([plan[:, None], other], 1)
+        missing = self.missing(present, other, margin)
+        if not self.alone:
+            own = missing.sum(2).argmax(1)  # (B, N)
+            own = jnp.take_along_axis(other, own[:, None, None, :, None], 1)
+            other = jnp.concatenate([other, own], 1)
+            missing = jnp.concatenate([missing, self.missing(present, own, margin)], 1)
+        index = self._of_team(missing, (1,)).argmax(1)
+        return jnp.take_along_axis(other, index[:, None, None, :, None], 1)[:, 0]
+
+    def _of_team(self, x: Array, axes: tuple[int, ...]) -> Array:
+        """(B, S, 1) of numbers (B, S, ...) of plans, or (B, S, N) of agents who are alone."""
+        return jax.vmap(lambda x: team_sum(x, axes, self.alone), 1, 1)(x)
 
     def _by_slope(self, present: PyTree, asked: Array, plan: Array, margin: Array) -> Array:
         """Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖². The best
@@ -136,12 +171,8 @@ class Corrector:
         starts = jnp.clip(starts, low[:, None], high[:, None])
         unmet = missing.sum(1) < -TOLERANCE
         starts = jnp.where(unmet[:, None, None, :, None], starts, found[:, None])
-
-        def of_team(x: Array, axes: tuple[int, ...]) -> Array:  # (B, S, 1), or (B, S, N) of agents who are alone
-            return jax.vmap(lambda x: team_sum(x, axes, self.alone), 1, 1)(x)
-
-        short = of_team(self.missing(present, starts, margin), (1,))
-        far = of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
+        short = self._of_team(self.missing(present, starts, margin), (1,))
+        far = self._of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
         fine = short >= short.max(1, keepdims=True) - TOLERANCE
         index = jnp.where(fine, -far, -jnp.inf).argmax(1)
         return jnp.take_along_axis(starts, index[:, None, None, :, None], 1)[:, 0]
@@ -155,6 +186,21 @@ def fixed_plans(rows: int, agents: int, dim: int, rounds: int) -> np.ndarray:
     for direction, first, size in itertools.product(directions(dim), sorted({1, (rows + 1) // 2, rows}), (0.5, 1.0)):
         active = np.arange(rows)[:, None] < first
         plans.append(size * direction * active)
+    return _in_orders(plans, agents, rounds)
+
+
+def continuations(rows: int, agents: int, dim: int) -> np.ndarray:
+    """(S, K, N, A) what may follow the rows that were asked for: nothing by anybody, or all that an agent can do, into
+    each direction, for half of the rows or for all of them, by every agent in an order of its own."""
+    plans = []
+    for direction, first in itertools.product(directions(dim), sorted({(rows + 1) // 2, rows})):
+        plans.append(direction * (np.arange(rows)[:, None] < first))
+    moved = _in_orders(plans, agents, 1)[0]
+    return np.concatenate([np.zeros_like(moved[:1]), moved])
+
+
+def _in_orders(plans: Sequence[np.ndarray], agents: int, rounds: int) -> np.ndarray:
+    """(R, S, K, N, A) of plans (K, A): for every agent and round all of them, in an order of its own."""
     random = np.random.default_rng(0)
     orders = [[random.permutation(len(plans)) for _ in range(agents)] for _ in range(rounds)]
     return np.stack(plans)[np.array(orders)].transpose(0, 2, 3, 1, 4)

@@ -28,11 +28,11 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
-from ringfence.world.card import FARTHEST, Avoidable
+from ringfence.world.card import FARTHEST, Avoidable, Foresight
 from ringfence.world.verdict import require
 
 LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
-BEARABLE = 0.3  # error of predictions as a share of what changes, up to which more rows are looked at
+BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
 KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
 BY_CARD = ("shield", "adapt", "full")  # guards that do what the card asks for
@@ -304,8 +304,11 @@ def by_card(world: World, name: str, changes: Mapping[str, Any]) -> dict[str, An
 
 
 def _far_sighted(world: World, least: int) -> dict[str, Any]:
-    """As many rows as avoiding takes, and at least so many, where they are predicted well, or the value of danger after
-    the last row, where that leaves nearly all safe steps their margin."""
+    """As many rows as what the barrier reads is predicted well for; else as many as avoiding takes, and at least so
+    many, where all that changes is, or the value of danger after the last row, where that leaves nearly all safe steps
+    their margin."""
+    if (foreseen := _rows_foreseen_well(world)) > least:
+        return {"horizon": foreseen}
     scores = world.card.barrier
     if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
         return {}
@@ -313,6 +316,26 @@ def _far_sighted(world: World, least: int) -> dict[str, Any]:
     if error is not None and error.error_of_change[-1] <= BEARABLE:
         return {"horizon": max(min(scores.avoidable.rows, FARTHEST), least)}
     return {"terminal_value": True} if scores.ahead_kept >= KEPT else {}
+
+
+def _rows_foreseen_well(world: World) -> int:
+    """Rows, FARTHEST at most, for which all that the barrier reads is predicted well; margins widen along them."""
+    error = world.card.prediction_error
+    read = () if error is None else error.read
+    if not read or world.card.barrier is None or not _widens(world):
+        return 0
+    steps = [k for at, k in enumerate(read[0].steps_ahead) if all(_is_foreseen(one, at) for one in read)]
+    return min(max(steps, default=0), FARTHEST)
+
+
+def _is_foreseen(one: Foresight, at: int) -> bool:
+    return one.error[at] <= BEARABLE * one.deviation
+
+
+def _widens(world: World) -> bool:
+    """Whether the World says what rows ahead ask for; those of before do not."""
+    card = world.card
+    return all(one.widening for one in (card.constraints or {"": card.barrier}).values() if one is not None)
 
 
 def _too_late(avoidable: Avoidable) -> bool:

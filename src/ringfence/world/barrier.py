@@ -18,6 +18,7 @@ Sources: gradient penalty, LatentCBF (L4DC 2026), `_margin_gp_step`; in-sample b
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -35,6 +36,7 @@ from ringfence.types import Array, Key
 from ringfence.world.cause_nets import Score, blank, scores, worst
 from ringfence.world.causes import Found
 
+Widening = tuple[float, ...]  # by row ahead, in margins
 Loss = Literal["cross-entropy", "hinges", "gradient-penalty"]
 DANGEROUS = ("other", "obstacle", "wall")  # kinds of things that names may tell of, each with a pair network of its own
 FARTHEST = 15.0  # scores end softly there: log-odds that no data can tell apart
@@ -78,14 +80,20 @@ class Barrier(eqx.Module):
         value = soft(_score(self.future, _still(self.shape), (x - self.mean) / self.scale, x.shape[:-1]))
         return jnp.minimum(value, soft(worst(self.causes, x))) if self.causes else value
 
-    def parts(self, before: Array, after: Array) -> Array:
-        """(..., N, M) the scores that ℓ is the least of, in units of the margin; `part_names` says of what."""
-        if self.causes:
-            each = jnp.concatenate([scores(net, after) for net in self.causes], -1)
-        else:
-            z = self.standardised(before, after)
-            each = _scores(self.label, self.shape, z, after.shape[:-1])
-        return soft(each) / self.unit
+    def parts(self, rows: Array, widening: Sequence[Widening] = ()) -> Array:
+        """(..., K, N, M) the scores that ℓ is the least of along predicted rows (..., K+1, N, D), as `along` has them;
+        `part_names` says of what."""
+        after = rows[..., 1:, :, :]
+        asked = [_by_row(one, after.shape[-3])[:, None, None] for one in widening]  # each (K, 1, 1)
+        if not self.causes:
+            z = self.standardised(rows[..., :-1, :, :], after)
+            each = soft(_scores(self.label, self.shape, z, after.shape[:-1])) / self.unit
+            return each - asked[0] if asked else each
+        each = [scores(net, after) for net in self.causes]
+        if not asked:
+            return soft(jnp.concatenate(each, -1)) / self.unit
+        each = [one - self.unit * more for one, more in zip(each, asked)]
+        return _sloped(jnp.concatenate(each, -1)) / self.unit
 
     @property
     def part_names(self) -> tuple[tuple[str, str], ...]:
@@ -107,6 +115,18 @@ class Barrier(eqx.Module):
     def apart(self, before: Array, after: Array) -> Array:
         """ℓ (..., N, 1) in units of the margin, with an axis of constraints."""
         return (self.of_steps(before, after) / self.unit)[..., None]
+
+    def along(self, rows: Array, widening: Sequence[Widening] = ()) -> Array:
+        """ℓ (..., K, N, 1) of predicted rows (..., K+1, N, D), the present first, less what rows ahead ask for beyond
+        the margin: by cause, or once."""
+        after = rows[..., 1:, :, :]
+        if not widening:
+            return self.apart(rows[..., :-1, :, :], after)
+        asked = [_by_row(one, after.shape[-3])[:, None] for one in widening]  # each (K, 1)
+        if not self.causes:
+            return self.apart(rows[..., :-1, :, :], after) - asked[0][..., None]
+        each = [worst([net], after) - self.unit * more for net, more in zip(self.causes, asked)]
+        return (_sloped(lowest(jnp.stack(each, -1))) / self.unit)[..., None]
 
     def ahead_apart(self, x: Array) -> Array:
         """V (..., N, 1) likewise."""
@@ -140,9 +160,9 @@ class MinBarrier(eqx.Module):
     def ahead(self, x: Array) -> Array:
         return lowest(self.ahead_apart(x))
 
-    def parts(self, before: Array, after: Array) -> Array:
-        """(..., N, M) of all constraints' barriers."""
-        return jnp.concatenate([b.parts(before, after) for b in self.each], -1)
+    def parts(self, rows: Array, widening: Sequence[Sequence[Widening]]) -> Array:
+        """(..., K, N, M) of all constraints' barriers, each with its own widening."""
+        return jnp.concatenate([b.parts(rows, w) for b, w in zip(self.each, widening)], -1)
 
     @property
     def part_names(self) -> tuple[tuple[str, str], ...]:
@@ -154,14 +174,29 @@ class MinBarrier(eqx.Module):
         """ℓ (..., N, C) of each constraint."""
         return jnp.concatenate([b.apart(before, after) for b in self.each], -1)
 
+    def along(self, rows: Array, widening: Sequence[Sequence[Widening]]) -> Array:
+        """ℓ (..., K, N, C) of predicted rows by each constraint, with its own widening."""
+        return jnp.concatenate([b.along(rows, w) for b, w in zip(self.each, widening)], -1)
+
     def ahead_apart(self, x: Array) -> Array:
         """V (..., N, C) of each constraint."""
         return jnp.concatenate([b.ahead_apart(x) for b in self.each], -1)
 
 
+def _by_row(widening: Widening, rows: int) -> np.ndarray:
+    """(K,) of so many rows; the last number goes on."""
+    return np.array(widening, np.float32)[np.minimum(np.arange(rows), len(widening) - 1)]
+
+
 def soft(score: Array) -> Array:
     """Scores bounded smoothly by ±FARTHEST, with slope 1 around 0: what is climbed never goes flat where it matters."""
     return FARTHEST * jnp.tanh(score / FARTHEST)
+
+
+def _sloped(score: Array) -> Array:
+    """The same, but of what is dangerous: rows far ahead may lie deep in danger, and a search has to find out of it."""
+    deep = -FARTHEST * jnp.log1p(jnp.maximum(-score, 0.0) / FARTHEST)
+    return jnp.where(score < 0, deep, soft(score))
 
 
 # --- what is read ---

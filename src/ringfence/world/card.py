@@ -18,6 +18,8 @@ from ringfence.world.settings import Settings, settings_named
 FARTHEST = 15  # rows that a guard looks ahead by itself (benchmarks/proving.py plays more of them)
 JUDGED = 3  # steps ahead that the margin is calibrated for
 NO_ERROR = 0.01  # of the deviation of what is predicted: less is exact enough
+WIDENED = (5, 10, 15)  # rows ahead of which its words say what they ask for
+LITTLE = 0.05  # margins, of which they say nothing
 SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
@@ -40,7 +42,7 @@ class Data(Part, frozen=True):
     unsafe_costs: dict[str, float] | None = None  # what a step that costs anything costs on average, of each; None: 1
     observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
     state_origins: list[float] | None = None
-    ranges: dict[str, tuple[float, float]] | None = None  # least and most that the logs show of own entries and lengths
+    ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
 
 
 class HeldOut(Part, frozen=True):
@@ -151,6 +153,8 @@ class BarrierScores(Part, frozen=True):
     calibration: tuple[MarginScores, ...] = ()
     ahead_kept: float = UNKNOWN  # share of the safe steps that keep the margin by V
     avoidable: Avoidable | None = None
+    # by cause, or one for all entries: what rows ahead ask for beyond the margin, in margins; the first row first
+    widening: tuple[tuple[float, ...], ...] = ()
     entries: float = UNKNOWN  # held-out steps that entered danger
     margin_kept: float = UNKNOWN  # share of the safe steps that have the default margin
     probed: float = UNKNOWN  # share of held-out states that are called unsafe with somebody put inside the radius
@@ -320,6 +324,7 @@ def _of_barrier(card: Card) -> Iterator[str]:
             f"Default margin {scores.margin:.2g} (--margin 1 stands for it): of 1000 steps that entered danger, "
             f"predicted from up to {JUDGED} steps before, {significant(1000 * scores.miscoverage)} looked as safe."
         )
+        yield from _of_widening(scores.widening, card.causes.get("", Found()))
         return
     for name, found in card.constraints.items():
         yield _of_constraint(name, (card.data.constraints or {}).get(name, UNKNOWN), found)
@@ -363,6 +368,18 @@ def _of_horizon(avoidable: Avoidable, kept: float) -> str:
     if math.isnan(kept):
         return line + "."
     return f"{line}, or V, which leaves {percent(kept, 3)} of the safe steps their margin."
+
+
+def _of_widening(widening: tuple[tuple[float, ...], ...], found: Found) -> Iterator[str]:
+    """What rows ahead ask for beyond the margin, where that is anything."""
+    names = [cause.name for cause in found.causes] or ["all entries"]
+    asked = []
+    for name, one in zip(names, widening):
+        rows = [k for k in WIDENED if k <= len(one)]
+        if any(one[k - 1] >= LITTLE for k in rows):
+            asked.append(f"{name} {', '.join(f'{one[k - 1]:.2g} at {k}' for k in rows)}")
+    if asked:
+        yield f"Margins that are added for rows ahead, which are predicted worse: {'; '.join(asked)}."
 
 
 def _of_constraint(name: str, limit: float, scores: BarrierScores) -> str:

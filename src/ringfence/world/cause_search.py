@@ -20,10 +20,11 @@ from msgspec.structs import replace
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
 from ringfence.world.cause_edges import refined, within
+from ringfence.world.cause_siblings import siblings
 from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, wider
 from ringfence.world.cells import Cells
 
-VERSION = 12  # of the search: what was found by another is looked for again
+VERSION = 14  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -46,6 +47,9 @@ def find(
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
     edges = [refined(steps, one.cells.edge, one.cause, _without(steps, chosen, one)) for one in chosen]
+    alike = siblings(steps, chosen, edges, names)[: MOST - len(chosen)]
+    chosen += [one for one, _ in alike]
+    edges += [edge for _, edge in alike]
     return replace(_summary(steps, chosen), edges=tuple(edges)), [one.cells for one in chosen]
 
 

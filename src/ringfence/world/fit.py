@@ -185,10 +185,12 @@ def _data(store: EpisodeStore, logged: Logged) -> Data:
 
 
 def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
-    """What the logs show of every entry of an agent itself, or of all where names tell no things, and of how far
-    things are away."""
+    """What the logs show to be safe of every entry of an agent itself, or of all where names tell no things, and of how
+    far things are away: danger that is too rare to have a cause is no place to go to, either."""
     names = logged.map.names
     x = np.asarray(logged.arrays["features"])
+    if logged.labels and not logged.unsafe.all():
+        x = x[np.asarray(logged.arrays["row"])[~logged.unsafe] + 1]
     own = [d for d, name in enumerate(names) if name.startswith("own.")]
     found = {names[d]: (float(x[..., d].min()), float(x[..., d].max())) for d in own or range(len(names))}
     for cause in offsets(names):

@@ -11,6 +11,7 @@ import numpy as np
 
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
+from ringfence.world.barrier import Barrier
 from ringfence.world.card import JUDGED
 from ringfence.world.cause_nets import Score, least_margin, with_margin, worst
 from ringfence.world.dynamics import Dynamics
@@ -21,6 +22,8 @@ WINDOWS = 3000  # entries, and safe steps, that margins are read from
 ENTRIES = 30  # into danger: fewer say nothing, and all unsafe steps stand for them
 BEARABLE = 0.8  # share of safe steps that should have the margin
 OUTLIERS = 3  # entries that may look safe however few there are: one bad prediction is not to set the margin
+AHEAD = (5, 7, 10, 15, 20, 30)  # steps ahead whose own margins are read
+FORESEEN = 1000  # entries that these are read from
 MISSED = 0.001  # share of entries that may look as safe as a cause's own margin
 
 
@@ -96,6 +99,56 @@ def predicted_ends(dynamics: Dynamics, logged: Logged, ends: np.ndarray) -> list
         before = logged.before(start) if back == 0 else rows[:, -2]
         found.append((jnp.asarray(before), jnp.asarray(rows[:, -1])))
     return found
+
+
+def widening(
+    barrier: Barrier, dynamics: Dynamics, logged: Logged, rng: np.random.Generator
+) -> tuple[tuple[float, ...], ...]:
+    """By cause, or once where there are none, how many margins more rows ahead ask for: by so much farther from danger
+    the steps that entered it looked, predicted from so many steps before."""
+    steps = logged.fitted_steps
+    bad = entries(logged, steps[logged.unsafe[steps]])
+    bad = rng.choice(bad, min(FORESEEN, len(bad)), replace=False)
+    fine = steps[~logged.unsafe[steps]]
+    fine = rng.choice(fine, min(FORESEEN, len(fine)), replace=False)
+    if not len(bad) or not len(fine):
+        return ()
+    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
+
+    def scored(before: np.ndarray, after: np.ndarray) -> np.ndarray:  # (W, causes) in margins
+        return np.asarray(_by_cause(barrier, jnp.asarray(before), jnp.asarray(after)))
+
+    of_ends = scored(logged.before(bad), logged.after(bad))
+    of_safe = scored(logged.before(fine), logged.after(fine))
+    blamed = (of_ends.argmin(-1)[:, None] == np.arange(of_ends.shape[1])) & (of_ends < 1.0)
+    bearable = np.quantile(of_safe, 1 - BEARABLE, axis=0)
+    asked = [np.zeros(of_ends.shape[1])]
+    for back in AHEAD:
+        known = row[bad] - (back - 1) >= first[bad]
+        if known.sum() < ENTRIES:
+            break
+        rows = np.asarray(rolled(dynamics, logged, bad[known] - (back - 1), back)[0])
+        ends = scored(rows[:, -2], rows[:, -1])
+        wanted = asked[-1].copy()
+        for k in range(len(wanted)):
+            mine = ends[blamed[known, k], k]
+            if len(mine) >= ENTRIES:
+                missed = max(MISSED, OUTLIERS / len(mine))
+                wanted[k] = max(wanted[k], min(conformal(mine, 1 - missed), bearable[k]) - 1.0)
+        asked.append(wanted)
+    at = np.array([JUDGED, *AHEAD][: len(asked)])
+    every = np.arange(1, at[-1] + 1)
+    found = [np.interp(every, at, np.array(asked)[:, k]) for k in range(of_ends.shape[1])]
+    return tuple(tuple(round(float(w), 3) for w in one) for one in found)
+
+
+@jax.jit
+def _by_cause(barrier: Barrier, before: Array, after: Array) -> Array:
+    """(W, C) ℓ of the agent in most danger by each cause, or once, in margins."""
+    if not barrier.causes:
+        return (lowest(barrier.of_steps(before, after)) / barrier.unit)[..., None]
+    each = [lowest(worst([net], after)) for net in barrier.causes]
+    return jnp.stack(each, -1) / barrier.unit
 
 
 def in_own_margins(

@@ -36,11 +36,12 @@ from ringfence.world.margins import (
     entries,
     predicted_ends,
     rolled,
+    widening,
 )
 from ringfence.world.model import World
 from ringfence.world.values import Values
 
-VERSION = 16  # of the validation: cached cards of another are made again
+VERSION = 18  # of the validation: cached cards of another are made again
 AHEAD = 8  # steps that predictions are validated over
 STEPS = 60_000  # held-out steps that are scored
 SCORED = 20_000  # of them at once
@@ -94,12 +95,21 @@ def validate(
             found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss])
             constraints[name] = found
             each[name] = _in_units(one, unit)
+            constraints[name] = _with_widening(found, each[name], world.dynamics, logged.by(name))
         barrier = MinBarrier(tuple(each.values()), barrier.names)
         scores, _ = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, 1.0, 1.0)
     elif barrier is not None:
         scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss])
         barrier = _in_units(barrier, unit)
+        scores = _with_widening(scores, barrier, world.dynamics, logged)
     return Validation(held_out, prediction_error, explained, ood, barrier, scores, constraints)
+
+
+def _with_widening(scores: BarrierScores, barrier: Barrier, dynamics: Dynamics, logged: Logged) -> BarrierScores:
+    """The scores with what rows ahead ask for beyond the margin, where it was judged at all."""
+    if scores.warning:
+        return scores
+    return replace(scores, widening=widening(barrier, dynamics, logged, np.random.default_rng(2)))
 
 
 def _in_units(barrier: Barrier, unit: float) -> Barrier:
