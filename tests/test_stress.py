@@ -380,8 +380,8 @@ def test_a_quantile_of_few_episodes_is_none():
 
 
 def test_what_was_foreseen_is_compared_with_the_state_that_it_was_of(run, few):
-    """Of a guard that knows its delay, so many steps later."""
-    resolved = resolve(PolicySpec.of(run, guard="shield", delay=2, **LIGHT))
+    """Of a guard that knows its delay, so many steps later; it corrects nothing, so that it foresees what it knows."""
+    resolved = resolve(PolicySpec.of(run, guard="shield", delay=2, margin=-50.0, **LIGHT))
     task = resolved.job.task
     policy = under_faults(resolved.team, Faults(delay=2), task)
     played = rollout(policy, task.simulator, 4, foreseen=True)

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
-from ringfence.guards.shown import Shown
+from ringfence.guards.shown import STEEP, Shown
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
 from ringfence.utils import renamed
@@ -25,8 +25,9 @@ class BarrierSource(eqx.Module):
     """Scores in units of a margin that is right for each source: the constraint's own safe margin for an analytic
     one, the calibrated one for what is learned. So a margin means the same to both, and the smaller can be taken.
 
-    What is learned is lowered out of distribution, where the ensemble disagrees by more than it did on held-out
-    episodes: by one margin for every time that it does.
+    What is learned keeps no margin out of distribution, where the ensemble disagrees by more than it did on held-out
+    episodes: a search for a way out finds the actions whose effect nobody has logged, such as braking at rest, and a
+    World that is wrong about them.
     """
 
     world: World
@@ -68,7 +69,7 @@ class BarrierSource(eqx.Module):
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], self._barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
-        score = score - jnp.maximum(spread / self.world.ood_threshold - 1.0, 0.0)[..., None]
+        score = jnp.minimum(score, _known(spread / self.world.ood_threshold)[..., None])
         return self._within(self._with_analytic(score, after), after)
 
     def now(self, before: Array, present: Array) -> Array:
@@ -141,3 +142,9 @@ class BarrierSource(eqx.Module):
     def _analytic(self, x: Array) -> Array:
         assert self.hazard is not None and self.hazard.clearance is not None, "checked when it was made"
         return (self.hazard.clearance(x) / self.hazard.safe_margin)[..., None]
+
+
+def _known(apart: Array) -> Array:
+    """In margins, of disagreements as shares of the threshold: 1 at it, any margin soon below it, and never below 0, so
+    that danger that is known counts for more."""
+    return jnp.where(apart < 1.0, 1.0 + STEEP * (1.0 - apart), 1.0 / jnp.maximum(apart, 1.0))

@@ -42,7 +42,7 @@ class Decision(NamedTuple):
     chosen: Array  # (B,) index of the proposal, or (B, N) of agents that are alone
     rows: Array  # (B, P, K+1, N, D) where the proposals lead
     safety: Array  # (B, N) least score along the plan, of any constraint
-    first: Array  # (B, N) the same of its first row alone
+    first: Array  # (B, N) score of its first row, as it is judged once it has come
     short: Array  # (B, N) bool: the condition is not met along it
     ood: Array  # (B, N) bool: the first action leads out of distribution
 
@@ -74,14 +74,15 @@ class Guard(eqx.Module):
         if self.options.correction_steps:
             plan = self.shielded(present, plan, margin, unseen)
         ahead, spread = self.predict(present, plan[:, None])
-        scores = self.barrier.along(self.nearer(ahead, unseen), spread)[:, 0]
+        seen = self.nearer(ahead, unseen)
+        scores = self.barrier.along(seen, spread)[:, 0]
         missing = self.missing(present, self.clear(ahead, spread, margin, unseen)[:, 0], margin)
         return Decision(
             plan=plan,
             chosen=chosen,
             rows=rows,
             safety=scores.min((1, 3)),
-            first=scores[:, 0].min(-1),
+            first=self.barrier.now(seen[:, 0, 0], seen[:, 0, 1]).min(-1),
             short=(missing < -TOLERANCE).any(1),
             ood=spread[:, 0, 0] > self.world.ood_threshold,
         )
