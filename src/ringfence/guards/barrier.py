@@ -145,6 +145,6 @@ class BarrierSource(eqx.Module):
 
 
 def _known(apart: Array) -> Array:
-    """In margins, of disagreements as shares of the threshold: 1 at it, any margin soon below it, and never below 0, so
-    that danger that is known counts for more."""
-    return jnp.where(apart < 1.0, 1.0 + STEEP * (1.0 - apart), 1.0 / jnp.maximum(apart, 1.0))
+    """In margins, of disagreements as shares of the threshold: 1 at it, any margin soon below it, and one less for every
+    time that it is exceeded."""
+    return jnp.where(apart < 1.0, 1.0 + STEEP * (1.0 - apart), 2.0 - apart)
