@@ -18,6 +18,7 @@ from ringfence.guards import BarrierSource, Guard, GuardOptions
 from ringfence.guards.correction import ASKED, Corrector, continuations, fixed_plans
 from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
+from ringfence.guards.shown import Shown
 from ringfence.loading import run_worlds
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
@@ -301,6 +302,15 @@ def test_a_controller_that_has_warmed_up_acts_as_it_would_have(small_world, smal
 
 def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, present):
     barrier = BarrierSource(small_world, "learned", None, False)
+    rows = jnp.stack([present, present], 1)[:, None]
+    spread = jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold)
+    near, far = barrier.along(rows, 0.0 * spread), barrier.along(rows, spread)
+    np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
+
+
+def test_nothing_has_its_margin_out_of_distribution_where_a_guard_stays_within_the_logs(small_world, present):
+    anywhere = Shown((-1e3,), (1e3,), (0,), ())
+    barrier = BarrierSource(small_world, "learned", None, False, anywhere)
     rows = jnp.stack([present, present], 1)[:, None]
     near = barrier.along(rows, jnp.zeros((64, 1, 1, 3)))
     far = barrier.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold))

@@ -25,9 +25,10 @@ class BarrierSource(eqx.Module):
     """Scores in units of a margin that is right for each source: the constraint's own safe margin for an analytic
     one, the calibrated one for what is learned. So a margin means the same to both, and the smaller can be taken.
 
-    What is learned keeps no margin out of distribution, where the ensemble disagrees by more than it did on held-out
-    episodes: a search for a way out finds the actions whose effect nobody has logged, such as braking at rest, and a
-    World that is wrong about them.
+    What is learned is lowered out of distribution, where the ensemble disagrees by more than it did on held-out
+    episodes: by one margin for every time that it does. Nothing has its margin there where rows are to stay within what
+    the logs have shown: a search for a way out finds actions whose effect nobody has logged, such as braking at rest,
+    and a World that is wrong about them.
     """
 
     world: World
@@ -69,7 +70,7 @@ class BarrierSource(eqx.Module):
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], self._barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
-        score = jnp.minimum(score, _known(spread / self.world.ood_threshold)[..., None])
+        score = self._where_known(score, spread / self.world.ood_threshold)
         return self._within(self._with_analytic(score, after), after)
 
     def now(self, before: Array, present: Array) -> Array:
@@ -136,15 +137,16 @@ class BarrierSource(eqx.Module):
         """Scores (..., K, N, C), no larger than those of staying within what the logs have shown."""
         return score if self.shown is None else jnp.minimum(score, self.shown.along(rows)[..., None])
 
+    def _where_known(self, score: Array, apart: Array) -> Array:
+        """Scores (..., K, N, C) where the ensemble disagrees by so many thresholds (..., K, N)."""
+        beyond = jnp.maximum(apart - 1.0, 0.0)[..., None]
+        if self.shown is None:
+            return score - beyond
+        return jnp.minimum(score, 1.0 + STEEP * jnp.maximum(1.0 - apart, 0.0)[..., None] - beyond)
+
     def _with_analytic(self, score: Array, x: Array) -> Array:
         return score if self.source == "learned" else jnp.minimum(score, self._analytic(x))
 
     def _analytic(self, x: Array) -> Array:
         assert self.hazard is not None and self.hazard.clearance is not None, "checked when it was made"
         return (self.hazard.clearance(x) / self.hazard.safe_margin)[..., None]
-
-
-def _known(apart: Array) -> Array:
-    """In margins, of disagreements as shares of the threshold: 1 at it, any margin soon below it, and one less for every
-    time that it is exceeded."""
-    return jnp.where(apart < 1.0, 1.0 + STEEP * (1.0 - apart), 2.0 - apart)
