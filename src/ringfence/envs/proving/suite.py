@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from ringfence.envs.proving.system import System
 
-# No setting of the library is chosen on any of these.
+# No setting of the library is chosen on any of these but one: `drones` told how fast scores fall out of distribution
+# where a guard stays within the logs (guards/barrier.py).
 TEST: dict[str, System] = {
     "discs": System("integrator", ("mover", "pairs"), 3, mover=(0.35, 1.0, 16.0)),
     "posts": System("integrator", ("pairs", "posts"), 4, drag=0.3),
