@@ -41,10 +41,7 @@ def main() -> None:
     for name in given.systems:
         task = f"proving-other-{name}"
         TASKS[task] = dataclasses.replace(TASKS["proving-dev-room"], name=task, env=SYSTEMS[name])
-        found = proving.system(task, given.runs, given.episodes, given.rows, given.out / f"{name}.json")
-        print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
-        for label, row in found["rows"].items():
-            print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
+        proving.tell(proving.system(task, given.runs, given.episodes, given.rows, given.out / f"{name}.json"))
 
 
 if __name__ == "__main__":

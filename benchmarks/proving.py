@@ -119,6 +119,13 @@ def rows_of(file: Path, card) -> dict:
     return {name: row for name, row in kept["rows"].items() if same or name.partition(" ")[2] in OF_NO_WORLD}
 
 
+def tell(found: dict) -> None:
+    """What was found of a system, on the terminal."""
+    print(found["task"], found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
+    for label, row in found["rows"].items():
+        print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
+
+
 def main() -> None:
     reader = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     reader.add_argument("out", type=Path)
@@ -129,10 +136,7 @@ def main() -> None:
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     for task in given.tasks:
-        found = system(task, given.runs, given.episodes, given.rows, given.out / f"{task}.json")
-        print(task, found["verdict"], found["causes"], f"recall {found['recall']:.3f}", flush=True)
-        for label, row in found["rows"].items():
-            print("   ", label, {name: round(value, 3) for name, value in row.items() if isinstance(value, float)})
+        tell(system(task, given.runs, given.episodes, given.rows, given.out / f"{task}.json"))
 
 
 if __name__ == "__main__":

@@ -91,21 +91,23 @@ class Corrector:
         same start, or each agent by its own best, whatever the others did by it."""
         _, rows, agents, dim = plan.shape
         tails = jnp.asarray(continuations(rows - ASKED, agents, dim), plan.dtype)  # (S, K - ASKED, N, A)
-        low, high = self.within(asked)
         begun = jnp.broadcast_to(plan[:, None, :ASKED], (len(plan), len(tails), ASKED, agents, dim))
         other = jnp.concatenate([begun, jnp.broadcast_to(tails, (len(plan), *tails.shape))], 2)
-        other = jnp.clip(other, low[:, None], high[:, None])
-        unmet = self.missing(present, plan[:, None], margin)[:, 0].sum(1) < 0
-        other = jnp.where(unmet[:, None, None, :, None], other, plan[:, None])
-        other = jnp.concatenate([plan[:, None], other], 1)
+        missing = self.missing(present, plan[:, None], margin)[:, 0]
+        other = jnp.concatenate([plan[:, None], self._of_unmet(other, asked, plan, missing, 0.0)], 1)
         missing = self.missing(present, other, margin)
         if not self.alone:
-            own = missing.sum(2).argmax(1)  # (B, N)
-            own = jnp.take_along_axis(other, own[:, None, None, :, None], 1)
+            own = _picked(other, missing.sum(2).argmax(1))[:, None]
             other = jnp.concatenate([other, own], 1)
             missing = jnp.concatenate([missing, self.missing(present, own, margin)], 1)
-        index = self._of_team(missing, (1,)).argmax(1)
-        return jnp.take_along_axis(other, index[:, None, None, :, None], 1)[:, 0]
+        return _picked(other, self._of_team(missing, (1,)).argmax(1))
+
+    def _of_unmet(self, plans: Array, asked: Array, kept: Array, missing: Array, bearable: float) -> Array:
+        """Plans (B or 1, S, K, N, A) within bounds of what was asked for; agents of whose plans `kept` (B, K, N, A) no
+        more than is bearable is `missing` (B, K, N) keep these."""
+        low, high = self.within(asked)
+        unmet = missing.sum(1) < -bearable
+        return jnp.where(unmet[:, None, None, :, None], jnp.clip(plans, low[:, None], high[:, None]), kept[:, None])
 
     def _of_team(self, x: Array, axes: tuple[int, ...]) -> Array:
         """(B, S, 1) of numbers (B, S, ...) of plans, or (B, S, N) of agents who are alone."""
@@ -167,15 +169,16 @@ class Corrector:
     ) -> Array:
         """(B, K, N, A) the one of starts (S, K, N, A) that misses least, and among equals the one whose first action is
         nearest to what was asked. Agents of whose plans found nothing is `missing` (B, K, N) keep these."""
-        low, high = self.within(asked)
-        starts = jnp.clip(starts, low[:, None], high[:, None])
-        unmet = missing.sum(1) < -TOLERANCE
-        starts = jnp.where(unmet[:, None, None, :, None], starts, found[:, None])
+        starts = self._of_unmet(starts, asked, found, missing, TOLERANCE)
         short = self._of_team(self.missing(present, starts, margin), (1,))
         far = self._of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
         fine = short >= short.max(1, keepdims=True) - TOLERANCE
-        index = jnp.where(fine, -far, -jnp.inf).argmax(1)
-        return jnp.take_along_axis(starts, index[:, None, None, :, None], 1)[:, 0]
+        return _picked(starts, jnp.where(fine, -far, -jnp.inf).argmax(1))
+
+
+def _picked(plans: Array, index: Array) -> Array:
+    """(B, K, N, A) of plans (B, S, K, N, A), those at the index (B, 1) of a team or (B, N) of each agent."""
+    return jnp.take_along_axis(plans, index[:, None, None, :, None], 1)[:, 0]
 
 
 def fixed_plans(rows: int, agents: int, dim: int, rounds: int) -> np.ndarray:

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError
+from ringfence.guards.correction import ASKED
 from ringfence.types import Array
 from ringfence.world import World, causes
 from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
-SOON = 3  # rows that are judged: a proposal that is held for longer comes to speeds that nobody means to reach
 FAR = 1e3  # score of the others
 
 
@@ -51,9 +51,9 @@ class Shown(eqx.Module):
         return cls(low, high, tuple(names.index(name) for name in known), nearest)
 
     def along(self, x: Array) -> Array:
-        """(..., K, N) of predicted rows (..., K, N, D): the first ones count."""
-        soon = self.score(x[..., :SOON, :, :])
-        later = max(x.shape[-3] - SOON, 0)
+        """(..., K, N) of predicted rows (..., K, N, D): those for which a proposal is held count."""
+        soon = self.score(x[..., :ASKED, :, :])
+        later = max(x.shape[-3] - ASKED, 0)
         return jnp.concatenate([soon, jnp.full((*x.shape[:-3], later, x.shape[-2]), FAR)], -2)
 
     @staticmethod

@@ -190,7 +190,7 @@ def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
     names = logged.map.names
     x = np.asarray(logged.arrays["features"])
     if logged.labels and not logged.unsafe.all():
-        x = x[np.asarray(logged.arrays["row"])[~logged.unsafe] + 1]
+        x = logged.after(np.flatnonzero(~logged.unsafe))
     own = [d for d, name in enumerate(names) if name.startswith("own.")]
     found = {names[d]: (float(x[..., d].min()), float(x[..., d].max())) for d in own or range(len(names))}
     for cause in offsets(names):

@@ -87,18 +87,34 @@ def entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
 def predicted_ends(dynamics: Dynamics, logged: Logged, ends: np.ndarray) -> list[tuple[Array, Array]]:
     """Steps that entered danger, (before, after) each (W, N, D), as they are predicted from up to `JUDGED` steps
     before."""
-    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
     found = []
     for back in range(JUDGED):
-        start = ends - back
-        start = start[(start >= 0) & (row[ends] - back >= first[ends])]
-        if not len(start):
-            continue
-        rows, _ = rolled(dynamics, logged, start, back + 1)
-        rows = np.asarray(rows)
-        before = logged.before(start) if back == 0 else rows[:, -2]
-        found.append((jnp.asarray(before), jnp.asarray(rows[:, -1])))
+        some = ends[_begun(logged, ends, back)]
+        if len(some):
+            found.append(_predicted(dynamics, logged, some, back))
     return found
+
+
+def _begun(logged: Logged, ends: np.ndarray, back: int) -> np.ndarray:
+    """(W,) bool: whether the episodes of steps had begun so many steps before."""
+    row, first = (np.asarray(logged.arrays[name])[ends] for name in ("row", "first_row"))
+    return (ends >= back) & (row - back >= first)
+
+
+def _predicted(dynamics: Dynamics, logged: Logged, ends: np.ndarray, back: int) -> tuple[Array, Array]:
+    """(before, after) of steps, each (W, N, D), as they are predicted from so many steps before."""
+    rows = np.asarray(rolled(dynamics, logged, ends - back, back + 1)[0])
+    before = logged.before(ends) if back == 0 else rows[:, -2]
+    return jnp.asarray(before), jnp.asarray(rows[:, -1])
+
+
+def _ends_and_safe(logged: Logged, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Steps that entered danger, and safe ones, of those that are learned from, each so many at most."""
+    steps = logged.fitted_steps
+    bad = entries(logged, steps[logged.unsafe[steps]])
+    bad = rng.choice(bad, min(count, len(bad)), replace=False)
+    fine = steps[~logged.unsafe[steps]]
+    return bad, rng.choice(fine, min(count, len(fine)), replace=False)
 
 
 def widening(
@@ -106,16 +122,11 @@ def widening(
 ) -> tuple[tuple[float, ...], ...]:
     """By cause, or once where there are none, how many margins more rows ahead ask for: by so much farther from danger
     the steps that entered it looked, predicted from so many steps before."""
-    steps = logged.fitted_steps
-    bad = entries(logged, steps[logged.unsafe[steps]])
-    bad = rng.choice(bad, min(FORESEEN, len(bad)), replace=False)
-    fine = steps[~logged.unsafe[steps]]
-    fine = rng.choice(fine, min(FORESEEN, len(fine)), replace=False)
+    bad, fine = _ends_and_safe(logged, FORESEEN, rng)
     if not len(bad) or not len(fine):
         return ()
-    row, first = (np.asarray(logged.arrays[name]) for name in ("row", "first_row"))
 
-    def scored(before: np.ndarray, after: np.ndarray) -> np.ndarray:  # (W, causes) in margins
+    def scored(before: np.ndarray | Array, after: np.ndarray | Array) -> np.ndarray:  # (W, causes) in margins
         return np.asarray(_by_cause(barrier, jnp.asarray(before), jnp.asarray(after)))
 
     of_ends = scored(logged.before(bad), logged.after(bad))
@@ -123,12 +134,11 @@ def widening(
     blamed = (of_ends.argmin(-1)[:, None] == np.arange(of_ends.shape[1])) & (of_ends < 1.0)
     bearable = np.quantile(of_safe, 1 - BEARABLE, axis=0)
     asked = [np.zeros(of_ends.shape[1])]
-    for back in AHEAD:
-        known = row[bad] - (back - 1) >= first[bad]
+    for ahead in AHEAD:
+        known = _begun(logged, bad, ahead - 1)
         if known.sum() < ENTRIES:
             break
-        rows = np.asarray(rolled(dynamics, logged, bad[known] - (back - 1), back)[0])
-        ends = scored(rows[:, -2], rows[:, -1])
+        ends = scored(*_predicted(dynamics, logged, bad[known], ahead - 1))
         wanted = asked[-1].copy()
         for k in range(len(wanted)):
             mine = ends[blamed[known, k], k]
@@ -156,11 +166,7 @@ def in_own_margins(
 ) -> tuple[Score, ...]:
     """The scores of causes, each in units of the margin that its own entries into danger ask for, so that a margin of
     one is as safe as the same of another: of a distance it is a length."""
-    steps = logged.fitted_steps
-    bad = entries(logged, steps[logged.unsafe[steps]])
-    bad = rng.choice(bad, min(WINDOWS, len(bad)), replace=False)
-    fine = steps[~logged.unsafe[steps]]
-    fine = rng.choice(fine, min(WINDOWS, len(fine)), replace=False)
+    bad, fine = _ends_and_safe(logged, WINDOWS, rng)
     features = logged.arrays["features"]
     row = np.asarray(logged.arrays["row"])
     by_each = np.stack([np.asarray(lowest(worst([net], features[row[bad] + 1]))) for net in nets], -1)

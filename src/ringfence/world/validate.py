@@ -93,7 +93,6 @@ def validate(
         constraints = {}
         for name, one in zip(barrier.names, barrier.each):
             found, unit = _barrier_scores(world.dynamics, one, logged.by(name), rng, miscoverage, LEAST[loss])
-            constraints[name] = found
             each[name] = _in_units(one, unit)
             constraints[name] = _with_widening(found, each[name], world.dynamics, logged.by(name))
         barrier = MinBarrier(tuple(each.values()), barrier.names)
