@@ -92,13 +92,24 @@ def of_systems() -> tuple[bool, str]:
     found = [json.loads(file.read_text()) for file in sorted((ROOT / PROVING).glob("proving-*.json"))]
     rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found}
     clone = {name: r["bc shield learned"]["violation_rate"] for name, r in rows.items()}
-    bad = [name for name, r in rows.items() if r["naive shield learned"]["violation_rate"] <= 0.02]
+    naive = {name: r["naive shield learned"]["violation_rate"] for name, r in rows.items()}
     kept = {n: r["bc shield learned"]["return_mean"] / r["bc shield oracle"]["return_mean"] for n, r in rows.items()}
     fine = [name for name in rows if clone[name] <= 0.01 and kept[name] >= 0.9]
     refused = [one["task"].removeprefix("proving-") for one in found if one["verdict"] == "unfit"]
     most = max(rate for name, rate in clone.items() if name in fine)
-    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 14 and len(bad) == 10 and refused == ["arms"]
-    return holds, f"{most:.3f} at most on {len(fine)}, at nine tenths of the return; naive {len(bad)}"
+    more = [name for name in fine if naive[name] > 0.01]
+    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 14 and len(more) == 3 and refused == ["arms"]
+    return holds, f"{most:.3f} at most on {len(fine)}, at nine tenths of the return; naive more on {', '.join(more)}"
+
+
+def of_bad_driving() -> tuple[bool, str]:
+    """Systems on which the guard leaves the naive driver at most 2 %, as it is and by three rows."""
+    files = sorted((ROOT / PROVING).glob("proving-*.json"))
+    rows = [json.loads(file.read_text())["rows"] for file in files]
+    kept = [r["naive shield learned"]["return_mean"] / r["naive shield oracle"]["return_mean"] for r in rows]
+    far = [r["naive shield learned"]["violation_rate"] <= 0.02 and share >= 0.9 for r, share in zip(rows, kept)]
+    near = [r["naive shield learned, 3 rows"]["violation_rate"] <= 0.02 for r in rows]
+    return (sum(far), sum(near)) == (12, 8), f"{sum(far)} of {len(rows)}, by three rows {sum(near)}"
 
 
 def of_late_actions() -> tuple[bool, str]:
@@ -546,8 +557,8 @@ CLAIMS = (
     ),
     Claim(
         "README.md",
-        "On fourteen of sixteen systems, of which one chose a setting, a guarded clone violates in at most 1 % of its "
-        "episodes",
+        "On fourteen of sixteen systems, of which four chose something, a guarded clone violates in at most 1 % of its "
+        "episodes; on three of these a naive driver does so more often",
         PROVING,
         of_systems,
     ),
@@ -556,6 +567,13 @@ CLAIMS = (
         "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes",
         PROVING,
         of_systems,
+    ),
+    Claim(
+        "docs/proving-ground.md",
+        "On twelve systems the guard leaves it at most 2 %, at nine tenths of the oracle's return; by three rows on "
+        "eight",
+        PROVING,
+        of_bad_driving,
     ),
     Claim(
         "docs/stress.md",

@@ -74,7 +74,8 @@ SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
-    put("docs/proving-ground.md", "proving", proving())
+    put("docs/proving-ground.md", "proving", proving(RESULTS / "proving"))
+    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", short=False))
     put("docs/crossing-results.md", "tiers", tiers())
     put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing-results.md", "proposals", proposals())
@@ -207,16 +208,22 @@ def other_simulator() -> str:
     return "\n".join(out)
 
 
-def proving() -> str:
-    """Systems that chose no setting, from results/proving."""
-    ways = ("none", "shield learned", "shield oracle")
-    heads = ["system", "verdict", "causes found", "clone", "shield", "oracle", "naive", "shield", "oracle"]
+def proving(folder: Path, short: bool = True) -> str:
+    """Systems of the proving ground's kind, by their results; naive drivers also by a guard that looks three rows
+    ahead."""
+    beside = ("naive shield learned, 3 rows",) if short else ()
+    rows = ("bc none", "bc shield learned", "bc shield oracle", "naive none", "naive shield learned", *beside)
+    heads = ["system", "verdict", "causes found", "clone", "shield", "oracle", "naive", "shield"]
+    heads += ["shield, 3 rows"] * short + ["oracle"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for file in sorted((RESULTS / "proving").glob("proving-*.json")):
+    for file in sorted(folder.glob("*.json")):
         found = json.loads(file.read_text())
+        if not isinstance(found, dict) or "causes" not in found or found["task"].startswith("crossing"):
+            continue
         causes = dict.fromkeys(re.sub(" of agent.*", " of some", cause) for cause in found["causes"])
-        cells = [f"`{found['task'].removeprefix('proving-')}`", found["verdict"], "; ".join(causes) or "none"]
-        cells += [_share_and_return(found["rows"].get(f"{driver} {way}")) for driver in ("bc", "naive") for way in ways]
+        name = found["task"].removeprefix("proving-").removeprefix("other-")
+        cells = [f"`{name}`", found["verdict"], "; ".join(causes) or "none"]
+        cells += [_share_and_return(found["rows"].get(row)) for row in (*rows, "naive shield oracle")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

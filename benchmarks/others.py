@@ -2,8 +2,9 @@
 
     python benchmarks/others.py results/proving/others [--systems x1 x5] [--episodes 100] [--rows "bc none" ...]
 
-Rows as `benchmarks/proving.py` has them. Two of the systems have chosen something: `x1` that nothing has its margin out
-of distribution, `x5` that every agent has a way out of its own. The others have chosen nothing.
+Rows as `benchmarks/proving.py` has them. Three of the systems have chosen something: `x1` that nothing has its margin
+out of distribution, `x2` that names are looked for in logs, `x5` that every agent has a way out of its own. The others
+have chosen nothing.
 """
 
 import argparse
@@ -40,7 +41,9 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     for name in given.systems:
         task = f"proving-other-{name}"
-        TASKS[task] = dataclasses.replace(TASKS["proving-dev-room"], name=task, env=SYSTEMS[name])
+        system = SYSTEMS[name]
+        room = TASKS["proving-dev-room"]
+        TASKS[task] = dataclasses.replace(room, name=task, env=system, homogeneous=system.homogeneous)
         proving.tell(proving.system(task, given.runs, given.episodes, given.rows, given.out / f"{name}.json"))
 
 

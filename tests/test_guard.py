@@ -124,6 +124,22 @@ def test_what_was_asked_for_is_held_for_a_few_rows_and_not_for_all(speed, kept):
     assert plans.shape == (1 + 8 * 2, 12, 2, 2) and (plans[:, 6:] == 0).all((1, 2, 3)).sum() < len(plans) // 2
 
 
+def test_what_is_near_counts_for_more_where_no_plan_meets_all():
+    """A push now costs 0.3 in the first row, none costs 0.1 in each of the last five."""
+
+    def missing(present, plans, margin):
+        pushed = jnp.clip(plans[..., 0, :, 0], 0.0, 1.0)[..., None, :]
+        rows = jnp.arange(15)[:, None]
+        return -jnp.where(rows == 0, 0.3 * pushed, jnp.where(rows > 9, 0.1 * (1 - pushed), 0.0))
+
+    def within(plan):
+        return -jnp.ones_like(plan), jnp.ones_like(plan)
+
+    correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
+    found = correct(jnp.zeros(1), jnp.ones((1, 15, 1, 1)), jnp.ones((1, 1)))
+    assert found[0, 0, 0, 0] <= 0
+
+
 def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
     """Those who need it, a few at a time; their number is no multiple of anything."""
     guard = make(small_world, bound, correction_steps=4)

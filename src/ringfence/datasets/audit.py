@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ringfence.datasets import registry
-from ringfence.datasets.task import Task, first_rows
+from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
@@ -91,7 +91,7 @@ def _speeds(store: EpisodeStore) -> dict[str, str]:
 
 def _danger(store: EpisodeStore, task: Task) -> tuple[dict[str, str], list[str]]:
     """(facts, warnings) of what the hazard's formula says of the data; nothing where it has none."""
-    starts = _labels(store, task, first_rows(store))
+    starts = _labels(store, task, store.first_rows)
     share = disagreement(store, task)
     if starts is None or share is None:
         return {}, []

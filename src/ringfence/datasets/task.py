@@ -112,16 +112,16 @@ class Task:
         if store is None:
             raise UserError(f"Task '{self.name}' has no simulator, so its features come from data; pass the store.")
         width = 0 if store.state is None else store.state.shape[1]
-        names = store.card.observation_names or [f"obs{d}" for d in range(store.observations.shape[2])]
+        names = store.entry_names
         state_names = store.card.state_names or [f"state{d}" for d in range(width)]
         return features.from_data(
             view,
             store.observations,
             store.state,
-            tuple(names),
+            names,
             tuple(state_names),
-            first_rows=first_rows(store),
-            keep=constraints.reads(self.hazard, store.n_agents, tuple(names)),
+            first_rows=store.first_rows,
+            keep=constraints.reads(self.hazard, store.n_agents, names),
             homogeneous=self.homogeneous,
             dt=store.card.dt,
         )
@@ -151,8 +151,3 @@ class Task:
             homogeneous=self.homogeneous,
             action_sizes=tuple(action_sizes) if action_sizes else None,
         )
-
-
-def first_rows(store: EpisodeStore) -> np.ndarray:
-    """(E,) rows of `observations` that episodes begin with."""
-    return np.concatenate([[0], store.episode_ends[:-1]]) + np.arange(store.episodes)

@@ -24,6 +24,7 @@ TOGETHER = 32  # teams whose plans are corrected at once
 AGAIN = 8  # teams for which a correction is begun again at once
 DIRECTIONS = 26  # of fixed plans, where actions have more than three numbers
 ASKED = 3  # rows for which a plan is what was asked for, before it may do something else
+NEAR = 10.0  # times what is missing in these rows counts, beside later ones
 TOLERANCE = 1e-3  # of the condition, in margins: less is not counted as infeasible
 
 
@@ -42,7 +43,7 @@ class Corrector:
     """Plans (B, K, N, A) into plans that miss less of a condition, in the present (arrays) by margins (B, ...)."""
 
     # present, plans (B, S, K, N, A), margin -> (B, S, K, N), 0 or less
-    missing: Callable[[PyTree, Array, Array], Array]
+    missed: Callable[[PyTree, Array, Array], Array]
     within: Callable[[Array], tuple[Array, Array]]  # bounds of what may become of plans
     alone: bool  # agents answer for themselves
     steps: int
@@ -81,6 +82,15 @@ class Corrector:
         """(B,) bool: more than is bearable is missing of the plans found."""
         present, _, found, margin = given
         return (self.shortfall(present, found, margin) < -bearable).any(1)
+
+    def missing(self, present: PyTree, plans: Array, margin: Array) -> Array:
+        """(B, S, K, N) what is missing along plans (B, S, K, N, A), more of it in the rows that were asked for: the
+        next decisions may mend what is far ahead."""
+        rows = plans.shape[2]
+        missed = self.missed(present, plans, margin)
+        if rows <= ASKED:
+            return missed
+        return missed * np.where(np.arange(rows) < ASKED, NEAR, 1.0)[:, None]
 
     def shortfall(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""

@@ -92,6 +92,16 @@ class EpisodeStore:
         return np.diff(self.episode_ends, prepend=0)
 
     @property
+    def first_rows(self) -> np.ndarray:
+        """(E,) rows of `observations` that episodes begin with."""
+        return np.concatenate([[0], self.episode_ends[:-1]]) + np.arange(self.episodes)
+
+    @property
+    def entry_names(self) -> tuple[str, ...]:
+        """What entries of observations are called; numbers where nobody named them."""
+        return tuple(self.card.observation_names or (f"obs{d}" for d in range(self.observations.shape[2])))
+
+    @property
     def episode_of_step(self) -> np.ndarray:
         """(T,) index of the episode of every step; row of step t in `observations` is t + episode_of_step[t]."""
         return np.repeat(np.arange(self.episodes), self.lengths)

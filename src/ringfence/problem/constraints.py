@@ -212,11 +212,12 @@ def _bind_speed(hazard: SpeedLimit, names: tuple[str, ...]) -> BoundHazard:
 
 
 def reads(hazard: Hazard, n_agents: int, names: tuple[str, ...]) -> tuple[str, ...]:
-    """Entries that a hazard reads from where only the global state may tell them, given what agents observe."""
+    """Entries that a hazard reads by names that somebody gave, given what agents observe; Separation, where that tells
+    no others, reads the state's."""
     if isinstance(hazard, All):
         return tuple(name for h in hazard.hazards for name in reads(h, n_agents, names))
     if isinstance(hazard, SpeedLimit):
-        return tuple(name for name in hazard.features if name not in names)
+        return hazard.features
     if isinstance(hazard, Separation) and "other0.dx" not in names:
         return tuple(f"agent{i}.{c}" for i in range(n_agents) for c in "xy")
     return ()

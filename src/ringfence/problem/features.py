@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, TypeVar
 
@@ -22,6 +22,7 @@ import numpy as np
 
 from ringfence.errors import UserError, unknown
 from ringfence.problem.kinematics import late_share
+from ringfence.problem.told_names import told_names
 from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
@@ -124,15 +125,16 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     of the others it is about, -1: a thing that stands still).
 
     `other1.dx` is the second other's x less the own one, so it changes as `own.x` of the two do; `goal.dx` or
-    `landmark0.dx` as the own one alone does; `other1.dvx` goes with `own.vx`, or with the product of `own.v` and
-    `own.cos` (`headed`, numbered after all entries). Others are the team without oneself, in order.
+    `landmark0.dx` as the own one alone does, and so does `goal.dangle` as `own.angle`; `other1.dvx` goes with `own.vx`,
+    or with the product of `own.v` and `own.cos` (`headed`, numbered after all entries). Others are the team without
+    oneself, in order.
     """
     at = {name: d for d, name in enumerate(names)}
     for axis, number in zip("xy", range(len(names), len(names) + len(headed(names)))):
         at.setdefault(f"own.v{axis}", number)
     found = {}
     for d, name in enumerate(names):
-        match = re.fullmatch(r"([a-z_]+?)(\d*)\.d(v?[xyz])", name)
+        match = re.fullmatch(r"([a-z_]+?)(\d*)\.d(\w+)", name)
         if match is None or match[1] == "own" or f"own.{match[3]}" not in at:
             continue
         if match[1] != "other":
@@ -336,13 +338,14 @@ def from_data(
     observation_names: tuple[str, ...],
     state_names: tuple[str, ...],
     first_rows: np.ndarray | None = None,
-    keep: Iterable[str] = (),
+    keep: Collection[str] = (),
     homogeneous: bool = False,
     dt: float | None = None,
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
     so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
-    `keep`). Where names tell how entries follow from others (`derived`) and the logged steps agree, they do.
+    `keep`). Where names tell how entries follow from others (`derived`) and the logged steps agree, they do. Entries
+    without names have those that logs tell (problem/told_names.py).
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
     that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
@@ -352,6 +355,8 @@ def from_data(
         raise unknown("view", view, VIEWS)
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
+    if view != "centralized":
+        observation_names = told_names(observations, observation_names, first_rows, keep)
     plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
     if view == "centralized":
         return plain

@@ -181,7 +181,16 @@ def _data(store: EpisodeStore, logged: Logged) -> Data:
         observation_origins=store.card.observation_origins,
         state_origins=store.card.state_origins,
         ranges=_ranges(logged),
+        told_names=_told_names(store, logged.map) or None,
     )
+
+
+def _told_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, str]:
+    """Names that nobody gave, by what their entries are called."""
+    if map.reads_state:
+        return {}
+    given = [store.entry_names[d] for d in map.plus[0]]
+    return {entry: name for entry, name in zip(given, map.names) if entry != name}
 
 
 def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:

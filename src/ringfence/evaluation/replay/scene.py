@@ -12,6 +12,7 @@ from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import others
 from ringfence.problem.kinematics import late_share
+from ringfence.problem.told_names import told_names
 
 NOBODY = 1e6  # m: how far away is who is not there
 
@@ -26,7 +27,7 @@ class Names:
 
     @classmethod
     def of(cls, store: EpisodeStore) -> Names:
-        names = store.card.observation_names or ()
+        names = told_names(store.observations, store.entry_names, store.first_rows)
         states = store.card.state_names or () if store.state is not None else ()
         return cls({n: d for d, n in enumerate(names)}, {n: d for d, n in enumerate(states)}, store.n_agents)
 

@@ -1,0 +1,184 @@
+"""Names that logs tell by themselves, where nobody says what is an agent's own and what is of others.
+
+What an agent sees of another is, number for number, that other's own entry less its own; and what two see of each other
+is the same with the opposite sign. Nothing else in logs is so exact, so such entries may be named as if somebody had:
+`other0.dx` of agent 0 is minus `other0.dx` of agent 1. Their velocities, one's own place and what stands still follow.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+ROWS = 2000  # that are compared
+FEWEST = 50  # below which nothing is said
+EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
+LIKE = 0.05  # of a change: what a velocity predicts is off by less
+SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
+AXES = "xyz"
+SAID = re.compile(r"own\.|other\d+\.")
+
+
+@dataclass
+class _Field:
+    """One thing that agents see of others, e.g. how far away each of them is along x."""
+
+    entries: tuple[int, ...]  # of each of the others, in order
+    own: int | None = None  # the entry of one's own that it is the difference of
+    speed: _Field | None = field(default=None, repr=False)  # how it changes
+
+
+def told_names(
+    observations: np.ndarray,
+    names: Sequence[str],
+    first_rows: np.ndarray | None = None,
+    keep: Collection[str] = (),
+) -> tuple[str, ...]:
+    """Names (O) of entries of observations (M, N, O) where those that were given, if any were, say of none whose it is.
+    Those that logs do not tell stay as they are, and so do those to `keep`. `first_rows` (E,) are those that episodes
+    begin with."""
+    if observations.shape[1] < 2 or any(SAID.match(name) for name in names):
+        return tuple(names)
+    steps = _Steps.of(observations, first_rows)
+    if steps is None:
+        return tuple(names)
+    fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)])
+    places = [f for f in fields if not any(f is other.speed for other in fields)]
+    moving = [f for f in places if f.speed is not None] or places
+    if len(moving) > len(AXES):
+        return tuple(names)
+    told: dict[int, str] = {}
+    for axis, place in zip(AXES, moving):
+        told |= _of_axis(steps, place, axis)
+    told |= dict(_still(steps, moving, set(told)))
+    return tuple(name if name in keep else told.get(entry, name) for entry, name in enumerate(names))
+
+
+@dataclass(frozen=True, eq=False)
+class _Steps:
+    """Some logged steps, evenly spread."""
+
+    before: np.ndarray  # (W, N, O)
+    after: np.ndarray
+    deviation: np.ndarray  # (O,)
+
+    @classmethod
+    def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> _Steps | None:
+        """None where there are too few."""
+        rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), ROWS).astype(int))
+        if first_rows is not None:
+            rows = rows[~np.isin(rows + 1, first_rows)]
+        if len(rows) < FEWEST:
+            return None
+        before, after = (np.asarray(observations[some], np.float64) for some in (rows, rows + 1))
+        return cls(before, after, before.std(0).min(0))
+
+    def varies(self, entry: int) -> bool:
+        return self.deviation[entry] > 0
+
+    def equal(self, one: np.ndarray, two: np.ndarray, entry: int) -> bool:
+        """Whether (W,) and (W,) are the same numbers, as far as `entry` is told."""
+        return bool((np.abs(one - two) <= EXACT * self.deviation[entry]).mean() >= SHARE)
+
+    def change(self, entries: Sequence[int]) -> np.ndarray:
+        """(W, N, k) of entries in a step."""
+        return (self.after - self.before)[..., list(entries)]
+
+
+def _fields(steps: _Steps) -> Iterator[_Field]:
+    """What agents 0 and 1 see of each other with opposite signs, where the others do so, too."""
+    x = steps.before
+    _, agents, width = x.shape
+    for first in range(width):
+        if not steps.varies(first) or not steps.equal(x[:, 0, first], -x[:, 1, first], first):
+            continue
+        # agent 0 sees agent k + 1 in its k-th place, and is seen by it in the first
+        entries = [first]
+        for k in range(1, agents - 1):
+            mirrored = -x[:, k + 1, first]
+            entries += [e for e in range(width) if e not in entries and steps.equal(x[:, 0, e], mirrored, first)][:1]
+        if len(entries) == agents - 1 and _mirrored(steps, entries):
+            yield _Field(tuple(entries))
+
+
+def _pairs(agents: int) -> Iterator[tuple[int, int]]:
+    return ((i, j) for i in range(agents) for j in range(i + 1, agents))
+
+
+def _mirrored(steps: _Steps, entries: list[int]) -> bool:
+    """Whether any two agents see each other with opposite signs; others are the team without oneself, in order."""
+    x = steps.before
+    return all(steps.equal(x[:, i, entries[j - 1]], -x[:, j, entries[i]], entries[i]) for i, j in _pairs(x.shape[1]))
+
+
+def _with_own(steps: _Steps, found: _Field) -> _Field:
+    """The field with the entry of one's own that it is the difference of, where there is one."""
+    x = steps.before
+    for own in range(x.shape[2]):
+        told = (
+            steps.equal(x[:, i, found.entries[j - 1]], x[:, j, own] - x[:, i, own], own) for i, j in _pairs(x.shape[1])
+        )
+        if steps.varies(own) and all(told):
+            return _Field(found.entries, own)
+    return found
+
+
+def _with_speeds(steps: _Steps, fields: list[_Field]) -> list[_Field]:
+    """The fields, each with the one that tells how it changes."""
+    for place in fields:
+        others = [f for f in fields if f is not place and f.speed is not place]
+        left = [_unlike(steps, place.entries, f.entries) for f in others]
+        if left and min(left) <= LIKE:
+            place.speed = others[int(np.argmin(left))]
+    return fields
+
+
+def _of_axis(steps: _Steps, place: _Field, axis: str) -> dict[int, str]:
+    """Names of what tells where others and oneself are along an axis, and how fast, by entry."""
+    own_speed = place.speed.own if place.speed else _own_speed(steps, place)
+    own = {f"own.{axis}": place.own, f"own.v{axis}": own_speed}
+    told = {entry: name for name, entry in own.items() if entry is not None}
+    told |= {entry: f"other{k}.d{axis}" for k, entry in enumerate(place.entries)}
+    if place.speed:
+        told |= {entry: f"other{k}.dv{axis}" for k, entry in enumerate(place.speed.entries)}
+    return told
+
+
+def _own_speed(steps: _Steps, place: _Field) -> int | None:
+    """The entry that tells how one's own place changes."""
+    if place.own is None:
+        return None
+    entries = [e for e in range(len(steps.deviation)) if steps.varies(e) and e not in (place.own, *place.entries)]
+    left = [_unlike(steps, [place.own], [e]) for e in entries]
+    return entries[int(np.argmin(left))] if left and min(left) <= LIKE else None
+
+
+def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int]) -> float:
+    """By what share of their changes places are off what speeds predict, in nine of ten steps; the seconds of a step
+    are those that predict best."""
+    change = steps.change(places).ravel()
+    least = np.quantile(np.abs(change), SHARE)
+    found = [1.0]
+    for rows in (steps.after, steps.before, 0.5 * (steps.after + steps.before)):
+        speed = rows[..., list(speeds)].ravel()
+        moves = np.abs(speed) > np.median(np.abs(speed))
+        if least > 0 and moves.any() and (dt := float(np.median(change[moves] / speed[moves]))) > 0:
+            found.append(float(np.quantile(np.abs(change - dt * speed), SHARE) / least))
+    return min(found)
+
+
+def _still(steps: _Steps, places: Sequence[_Field], named: set[int]) -> Iterator[tuple[int, str]]:
+    """Entries that change as one's own place does, with the opposite sign: where things are that stand still."""
+    found = []
+    for place in places:
+        if place.own is None:
+            return
+        moved = steps.change([place.own])[..., 0].ravel()
+        free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
+        found.append([e for e in free if steps.equal(steps.change([e])[..., 0].ravel(), -moved, place.own)])
+    for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*found)):
+        for axis, entry in zip(AXES, entries):
+            yield entry, f"still_{letter}.d{axis}"

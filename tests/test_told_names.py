@@ -1,0 +1,100 @@
+"""What logs without names tell of their entries."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from ringfence.envs.proving.suite import DEVELOPMENT, TEST
+from ringfence.problem import features
+from ringfence.problem.told_names import told_names
+
+DT = 0.1
+
+
+def team(agents: int = 3, episodes: int = 20, steps: int = 30) -> tuple[np.ndarray, tuple[str, ...], np.ndarray]:
+    """Observations (M, N, O) of points that are pushed about, what their entries are, and the first rows."""
+    g = np.random.default_rng(0)
+    speed = g.normal(size=(episodes, steps + 1, agents, 2)).cumsum(1) * 0.2
+    place = g.normal(size=(episodes, 1, agents, 2)) * 3 + DT * speed.cumsum(1)
+    goal = g.normal(size=(episodes, 1, agents, 2)) * 3 - place
+    who = features.others(agents)
+    seen = np.concatenate([(x[:, :, who] - x[:, :, :, None]) for x in (place, speed)], -1)
+    charge = g.random((episodes, steps + 1, agents, 1)).cumsum(1)
+    x = np.concatenate([charge, speed, goal, place, seen.reshape(*seen.shape[:3], -1)], -1)
+    names = ["obs0", "own.vx", "own.vy", "still_a.dx", "still_a.dy", "own.x", "own.y"]
+    names += [f"other{k}.{field}" for k in range(agents - 1) for field in ("dx", "dy", "dvx", "dvy")]
+    first = np.arange(episodes) * (steps + 1)
+    return x.reshape(-1, *x.shape[2:]).astype(np.float32), tuple(names), first
+
+
+def numbers(width: int) -> tuple[str, ...]:
+    return tuple(f"obs{d}" for d in range(width))
+
+
+@pytest.mark.parametrize("agents", [2, 3, 5])
+def test_what_agents_see_of_each_other_names_it(agents):
+    x, true, first = team(agents)
+    assert told_names(x, numbers(len(true)), first) == true
+
+
+def test_in_any_order_of_entries():
+    x, true, first = team()
+    order = np.random.default_rng(1).permutation(len(true))
+    found = told_names(x[..., order], numbers(len(true)), first)
+    kind = [name.rstrip("xyz") for name in found]  # which axis is the first does not matter
+    assert kind == [true[d].rstrip("xyz").replace("obs0", f"obs{k}") for k, d in enumerate(order)]
+
+
+def test_places_that_nobody_sees_of_himself():
+    x, true, first = team()
+    kept = [d for d, name in enumerate(true) if name not in ("own.x", "own.y")]
+    found = told_names(x[..., kept], numbers(len(kept)), first)
+    expected = [true[d] for d in kept]
+    assert found == ("obs0", "own.vx", "own.vy", "obs3", "obs4", *expected[5:])
+
+
+def test_speeds_that_nobody_sees_of_others():
+    x, true, first = team()
+    kept = [d for d, name in enumerate(true) if ".dv" not in name]
+    assert told_names(x[..., kept], numbers(len(kept)), first) == tuple(true[d] for d in kept)
+
+
+def test_others_by_distance_are_not_named():
+    x, true, first = team()
+    seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)
+    nearest = (seen[..., :2] ** 2).sum(-1).argsort(-1)
+    x[..., 7:] = np.take_along_axis(seen, nearest[..., None], 2).reshape(*x.shape[:2], -1)
+    assert told_names(x, numbers(len(true)), first) == numbers(len(true))
+
+
+def test_what_is_measured_has_no_names():
+    x, true, first = team()
+    noisy = x + np.random.default_rng(2).normal(size=x.shape) * 0.01
+    assert told_names(noisy, numbers(len(true)), first) == numbers(len(true))
+    assert told_names(x[:, :1], numbers(len(true)), first) == numbers(len(true))
+    assert told_names(x[:20], numbers(len(true)), first[:1]) == numbers(len(true))
+
+
+def test_a_view_without_names_is_one_with_them():
+    bare = DEVELOPMENT["room"]
+    bare, named = (dataclasses.replace(bare, names=names).feature_map("pruned") for names in ("none", "all"))
+    assert [name.replace("still_a", "goal") for name in bare.names] == list(named.names)
+    assert bare.follows == named.follows
+
+
+def test_whatever_is_told_relative_to_oneself_follows():
+    found = TEST["shafts"].feature_map("pruned")
+    assert {"goal.dangle", "other0.dangle", "other2.dspeed"} <= {found.names[d] for d in found.follows}
+
+
+def test_names_that_say_nothing_of_whose_it_is_are_told_too():
+    x, true, first = team()
+    given = tuple(f"column {d}" for d in range(len(true)))
+    expected = tuple(name.replace("obs0", "column 0") for name in true)
+    assert told_names(x, given, first) == expected
+    assert told_names(x, given, first, keep=("column 1",)) == ("column 0", "column 1", *expected[2:])
+    half = tuple("own.vx" if name == "own.vx" else entry for name, entry in zip(true, given))
+    assert told_names(x, half, first) == half
