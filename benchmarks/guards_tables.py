@@ -220,12 +220,17 @@ def proving(folder: Path, short: bool = True) -> str:
         found = json.loads(file.read_text())
         if not isinstance(found, dict) or "causes" not in found or found["task"].startswith("crossing"):
             continue
-        causes = dict.fromkeys(re.sub(" of agent.*", " of some", cause) for cause in found["causes"])
+        causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
         name = found["task"].removeprefix("proving-").removeprefix("other-")
         cells = [f"`{name}`", found["verdict"], "; ".join(causes) or "none"]
         cells += [_share_and_return(found["rows"].get(row)) for row in (*rows, "naive shield oracle")]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _in_short(cause: str) -> str:
+    """A cause without the agents that it is of, and a distance by its name."""
+    return re.sub(r"^length of (\w+)\.d\w, (?:\w+\.)?d\w", r"distance to \1", re.sub(" of agent.*", " of some", cause))
 
 
 def _share_and_return(row: dict | None) -> str:

@@ -28,10 +28,8 @@ ROW = ("faults", "guard", "compensated", "episodes")  # what tells rows apart
 RATES = ("violation_rate", "violation_upper", "infeasible_rate")
 FIELDS = (*ROW, "return", *RATES)
 RUN = "crossing-hasty/bc"
-LESS = {"others_acceleration": 0.7}  # m/s², where the World says 1.0
-AS_WORLD = {"others_acceleration": 1.0}
-LEAST = {"others_acceleration": 0.4}
-FARTHER = {"margin": 1.5, "horizon": 5}  # chosen on 50 validation episodes with three late steps
+AS_WORLD = {"others_acceleration": 1.0}  # m/s²
+WIDER = {"margin": 1.5}
 MIDDLE = {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5}
 FAULTS: tuple[dict[str, Any], ...] = (
     {},
@@ -65,13 +63,9 @@ def trials() -> dict[str, Trial]:
         if not faults.keys() & set(KNOWN):
             continue
         found[f"{name}/compensated"] = faults, True, {}
-        if faults.keys() & {"delay", "drop"}:
-            found[f"{name}/compensated/less"] = faults, True, LESS
-            found[f"{name}/compensated/least"] = faults, True, LEAST
-    found["delay3/compensated/farther"] = {"delay": 3}, True, FARTHER
-    found["drop0.6/compensated/farther"] = {"drop": 0.6}, True, FARTHER | LEAST
-    found["asynchrony0.667/compensated/farther"] = {"asynchrony": 0.667}, True, FARTHER | {"horizon": 6}
-    found["all/compensated/farther"] = MIDDLE, True, FARTHER | LESS
+    for faults in ({"delay": 3}, {"drop": 0.6}, {"asynchrony": 0.667}, MIDDLE):
+        name = "all" if faults is MIDDLE else name_of(faults)
+        found[f"{name}/compensated/wider"] = faults, True, WIDER
     for known in (1, 2):  # and two more steps that it was not told of, which the monitor should find out
         found[f"delay{known + 2}/knows{known}"] = {"delay": known + 2}, False, {"delay": known, **AS_WORLD}
     return found

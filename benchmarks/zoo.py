@@ -2,6 +2,7 @@
 
 ringfence bench guards --tasks simple_spread-expert --out A       # likewise guards-mujoco, crossing-guards
 python benchmarks/zoo.py --pack A B C     # writes src/ringfence/zoo/TASK
+python benchmarks/zoo.py --fit crossing-hasty    # has a World that is fitted by this version guard the task's policies
 python benchmarks/zoo.py                  # plays them; writes results/zoo.csv and docs/start.md's table
 """
 
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import shutil
 import tempfile
 from pathlib import Path
 
@@ -30,6 +32,7 @@ CELLS = {
     "crossing-hasty/bc": "bc",
     "crossing-hasty/icbf": "icbf-split",
 }
+READERS = [name for name in CELLS if name.endswith("/icbf")]  # whose training read a World
 EPISODES = {"simple_spread-expert": 200, "halfcheetah_2x3-good": 20, "crossing-hasty": 200}
 GUARDS = {"simple_spread-expert": "shield", "halfcheetah_2x3-good": "adapt", "crossing-hasty": "shield"}
 HEAD = ("policy", "guard", "episodes", "return", "cost", "violation_rate", "return_before", "cost_before", "kib")
@@ -38,7 +41,9 @@ HEAD = ("policy", "guard", "episodes", "return", "cost", "violation_rate", "retu
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--pack", type=Path, nargs="*", default=[])
-    folders = parser.parse_args().pack
+    parser.add_argument("--fit", nargs="*", default=[], help="tasks whose guards' Worlds are fitted anew")
+    given = parser.parse_args()
+    folders = given.pack
     before = {(r["policy"], r["guard"]): r for r in csv.DictReader(OUT.open())} if OUT.exists() else {}
     for name, cell in CELLS.items():
         task = name.split("/")[0]
@@ -53,6 +58,14 @@ def main() -> None:
                 }
     rows = []
     with tempfile.TemporaryDirectory() as there:
+        for task in given.fit:
+            run = zoo.pretrained(f"{task}/bc", there)
+            alone = run.config["spec"].get("homogeneous", False)
+            guards = run_worlds.of_data(run, "decentralized" if alone else "centralized")
+            print(zoo.renew(task, guards, [name.split("/")[1] for name in READERS if name.startswith(task)]))
+            for name in CELLS:  # what was played before was under another guard
+                before.pop((name, GUARDS[task]), None)
+            shutil.rmtree(run.path)
         for name in zoo.names():
             task, run = name.split("/")[0], zoo.pretrained(name, there)
             planner = "low_temperature" if (task, name[-4:]) == ("halfcheetah_2x3-good", "icbf") else "default"

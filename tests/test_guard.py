@@ -428,7 +428,7 @@ def test_all_proposals_of_a_task_are_judged_by_the_same_world(small_store, tmp_p
     )
     assert run_worlds.for_guard(far).values.discount == 0.8  # data that cannot be regenerated has no other World
     monkeypatch.setattr(run_worlds, "_made_here", lambda run: True)
-    monkeypatch.setattr(run_worlds, "_of_data", lambda run, execution, quiet: "the task's")
+    monkeypatch.setattr(run_worlds, "of_data", lambda run, execution, quiet: "the task's")
     assert run_worlds.for_guard(far) == "the task's"
     assert run_worlds.for_guard(usual).values.discount == 0.9
     assert run_worlds.of_run(far).values.discount == 0.8

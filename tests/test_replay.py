@@ -198,7 +198,9 @@ def test_replays_show_their_progress_unless_they_are_quiet(capsys):
 def test_what_cannot_be_replayed_is_refused_in_a_sentence():
     store = walkers()
     unnamed = store.card.updated(observation_names=None)
-    assert Names.of(dataclasses.replace(store, card=unnamed)).slots == Names.of(store).slots, "they are told by the logs"
+    assert Names.of(dataclasses.replace(store, card=unnamed)).slots == Names.of(store).slots, (
+        "they are told by the logs"
+    )
     noise = np.random.default_rng(0).normal(size=store.observations.shape)
     blind = dataclasses.replace(store, card=unnamed, observations=(store.observations + noise).astype(np.float32))
     with pytest.raises(UserError, match="hold no places"):

@@ -20,7 +20,7 @@ from ringfence.training.runs import Run
 @pytest.mark.parametrize("name", zoo.names())
 def test_every_one_is_loaded_with_the_world_that_guards_it(name, tmp_path, monkeypatch):
     """Nothing is regenerated, fitted or trained for it."""
-    monkeypatch.setattr(run_worlds, "_of_data", lambda *_: pytest.fail("asked for its data"))
+    monkeypatch.setattr(run_worlds, "of_data", lambda *_: pytest.fail("asked for its data"))
     run = zoo.pretrained(name, tmp_path)
     job, policy = load(run, guard="shield")
     assert (job.task.name, job.algorithm.name) == tuple(name.split("/"))

@@ -16,7 +16,7 @@ from ringfence.world import Settings, World
 def of_run(run: Run, quiet: bool = True) -> World:
     """The World that a run's training read, in its folder; of runs that read none, that of their data (`for_guard`)."""
     kept = run.path / WORLD
-    return _kept(run, kept) if kept.exists() else _of_data(run, None, quiet)
+    return _kept(run, kept) if kept.exists() else of_data(run, None, quiet)
 
 
 def _kept(run: Run, file: Path) -> World:
@@ -58,7 +58,7 @@ def for_guard(
         same = wanted is None or (wanted.view, wanted.discount) == (settings.view, settings.discount)
         if same and found.alone == (execution == "decentralized"):
             return found
-    return _of_data(run, execution, quiet)
+    return of_data(run, execution, quiet)
 
 
 def _made_here(run: Run) -> bool:
@@ -66,8 +66,8 @@ def _made_here(run: Run) -> bool:
     return regenerated(run.config["data"]) and run.config["task"] in registry.TASKS
 
 
-def _of_data(run: Run, execution: str | None, quiet: bool) -> World:
-    """The World of a run's data and seed, where that is regenerated."""
+def of_data(run: Run, execution: str | None, quiet: bool = True) -> World:
+    """The World of a run's data and seed, fitted by this version, where these data are regenerated."""
     config = run.config
     if not _made_here(run):
         flag = " --execution decentralized" if execution == "decentralized" else ""

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
+from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
-from ringfence.problem.told_names import told_names
 from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
@@ -345,7 +345,7 @@ def from_data(
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
     so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
     `keep`). Where names tell how entries follow from others (`derived`) and the logged steps agree, they do. Entries
-    without names have those that logs tell (problem/told_names.py).
+    without names have those that follow from logs (problem/inferred_names.py).
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
     that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
@@ -356,7 +356,7 @@ def from_data(
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
     if view != "centralized":
-        observation_names = told_names(observations, observation_names, first_rows, keep)
+        observation_names = inferred_names(observations, observation_names, first_rows, keep)
     plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
     if view == "centralized":
         return plain

@@ -43,7 +43,7 @@ class Data(Part, frozen=True):
     observation_origins: list[float] | None = None  # what was taken from each entry of the logs (problem/origins.py)
     state_origins: list[float] | None = None
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
-    told_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/told_names.py)
+    inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
 
 
 class HeldOut(Part, frozen=True):
@@ -254,9 +254,9 @@ def _of_data(card: Card) -> Iterator[str]:
         yield line + "judged on none."
         return
     yield f"{line}judged on {held_out.episodes} that nothing was fitted to ({held_out.steps} steps)."
-    if told := card.data.told_names:
-        named = ", ".join(f"{name} ({entry})" for entry, name in told.items())
-        yield f"Nobody named these entries, but what agents see of each other tells what they are: {named}."
+    if inferred := card.data.inferred_names:
+        named = ", ".join(f"{name} ({entry})" for entry, name in inferred.items())
+        yield f"Nobody named these entries; what agents see of each other says what they are: {named}."
 
 
 def _of_prediction(card: Card) -> Iterator[str]:

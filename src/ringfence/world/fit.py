@@ -181,11 +181,11 @@ def _data(store: EpisodeStore, logged: Logged) -> Data:
         observation_origins=store.card.observation_origins,
         state_origins=store.card.state_origins,
         ranges=_ranges(logged),
-        told_names=_told_names(store, logged.map) or None,
+        inferred_names=_inferred_names(store, logged.map) or None,
     )
 
 
-def _told_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, str]:
+def _inferred_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, str]:
     """Names that nobody gave, by what their entries are called."""
     if map.reads_state:
         return {}

@@ -11,6 +11,7 @@ without training anything.
 from __future__ import annotations
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -96,6 +97,17 @@ def put(run: Run, name: str, read: World | None, guards: World, folder: Path = F
     if read is not None and _content(read) != _content(guards):
         made += [_put_world(read, folder / f"{name}-world.safetensors")]
     return made
+
+
+def renew(task: str, guards: World, readers: Collection[str], folder: Path = FOLDER) -> Path:
+    """Have another World guard a task's policies. `readers` are the algorithms whose training read the one of before;
+    they keep it."""
+    file = folder / task / "world.safetensors"
+    for algorithm in readers:
+        own = folder / task / f"{algorithm}-world.safetensors"
+        if not own.exists():
+            own.write_bytes(file.read_bytes())
+    return _put_world(guards, file)
 
 
 def half(x: np.ndarray, name: str) -> np.ndarray:

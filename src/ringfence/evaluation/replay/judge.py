@@ -203,9 +203,9 @@ def check_view(world: World, store: EpisodeStore) -> None:
         raise UserError("The logs were moved by other origins than those of the World; fit a World to these logs.")
     names = store.card.observation_names
     if names and not world.map.reads_state:
-        called = {name: entry for entry, name in (world.card.data.told_names or {}).items()}
-        for told, entry in zip(world.map.names, world.map.plus[0]):
-            if names[int(entry)] != (name := called.get(told, told)):
+        called = {name: entry for entry, name in (world.card.data.inferred_names or {}).items()}
+        for inferred, entry in zip(world.map.names, world.map.plus[0]):
+            if names[int(entry)] != (name := called.get(inferred, inferred)):
                 raise UserError(
                     f"The World reads '{name}' where these logs hold '{names[int(entry)]}'; fit a World to these logs."
                 )

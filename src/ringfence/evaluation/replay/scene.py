@@ -11,8 +11,8 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import others
+from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
-from ringfence.problem.told_names import told_names
 
 NOBODY = 1e6  # m: how far away is who is not there
 
@@ -27,7 +27,7 @@ class Names:
 
     @classmethod
     def of(cls, store: EpisodeStore) -> Names:
-        names = told_names(store.observations, store.entry_names, store.first_rows)
+        names = inferred_names(store.observations, store.entry_names, store.first_rows)
         states = store.card.state_names or () if store.state is not None else ()
         return cls({n: d for d, n in enumerate(names)}, {n: d for d, n in enumerate(states)}, store.n_agents)
 

@@ -1,4 +1,4 @@
-"""Names that logs tell by themselves, where nobody says what is an agent's own and what is of others.
+"""Names that follow from logs, where nobody says what is an agent's own and what is of others.
 
 What an agent sees of another is, number for number, that other's own entry less its own; and what two see of each other
 is the same with the opposite sign. Nothing else in logs is so exact, so such entries may be named as if somebody had:
@@ -31,14 +31,14 @@ class _Field:
     speed: _Field | None = field(default=None, repr=False)  # how it changes
 
 
-def told_names(
+def inferred_names(
     observations: np.ndarray,
     names: Sequence[str],
     first_rows: np.ndarray | None = None,
     keep: Collection[str] = (),
 ) -> tuple[str, ...]:
     """Names (O) of entries of observations (M, N, O) where those that were given, if any were, say of none whose it is.
-    Those that logs do not tell stay as they are, and so do those to `keep`. `first_rows` (E,) are those that episodes
+    Those that do not follow stay as they are, and so do those to `keep`. `first_rows` (E,) are those that episodes
     begin with."""
     if observations.shape[1] < 2 or any(SAID.match(name) for name in names):
         return tuple(names)
@@ -50,11 +50,11 @@ def told_names(
     moving = [f for f in places if f.speed is not None] or places
     if len(moving) > len(AXES):
         return tuple(names)
-    told: dict[int, str] = {}
+    found: dict[int, str] = {}
     for axis, place in zip(AXES, moving):
-        told |= _of_axis(steps, place, axis)
-    told |= dict(_still(steps, moving, set(told)))
-    return tuple(name if name in keep else told.get(entry, name) for entry, name in enumerate(names))
+        found |= _of_axis(steps, place, axis)
+    found |= dict(_still(steps, moving, set(found)))
+    return tuple(name if name in keep else found.get(entry, name) for entry, name in enumerate(names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class _Steps:
         return self.deviation[entry] > 0
 
     def equal(self, one: np.ndarray, two: np.ndarray, entry: int) -> bool:
-        """Whether (W,) and (W,) are the same numbers, as far as `entry` is told."""
+        """Whether (W,) and (W,) are the same numbers, as far as `entry` is known."""
         return bool((np.abs(one - two) <= EXACT * self.deviation[entry]).mean() >= SHARE)
 
     def change(self, entries: Sequence[int]) -> np.ndarray:
@@ -118,16 +118,16 @@ def _with_own(steps: _Steps, found: _Field) -> _Field:
     """The field with the entry of one's own that it is the difference of, where there is one."""
     x = steps.before
     for own in range(x.shape[2]):
-        told = (
+        same = (
             steps.equal(x[:, i, found.entries[j - 1]], x[:, j, own] - x[:, i, own], own) for i, j in _pairs(x.shape[1])
         )
-        if steps.varies(own) and all(told):
+        if steps.varies(own) and all(same):
             return _Field(found.entries, own)
     return found
 
 
 def _with_speeds(steps: _Steps, fields: list[_Field]) -> list[_Field]:
-    """The fields, each with the one that tells how it changes."""
+    """The fields, each with the one that is its rate of change."""
     for place in fields:
         others = [f for f in fields if f is not place and f.speed is not place]
         left = [_unlike(steps, place.entries, f.entries) for f in others]
@@ -137,18 +137,18 @@ def _with_speeds(steps: _Steps, fields: list[_Field]) -> list[_Field]:
 
 
 def _of_axis(steps: _Steps, place: _Field, axis: str) -> dict[int, str]:
-    """Names of what tells where others and oneself are along an axis, and how fast, by entry."""
+    """Names, by entry, of the places and speeds of others and of oneself along an axis."""
     own_speed = place.speed.own if place.speed else _own_speed(steps, place)
     own = {f"own.{axis}": place.own, f"own.v{axis}": own_speed}
-    told = {entry: name for name, entry in own.items() if entry is not None}
-    told |= {entry: f"other{k}.d{axis}" for k, entry in enumerate(place.entries)}
+    found = {entry: name for name, entry in own.items() if entry is not None}
+    found |= {entry: f"other{k}.d{axis}" for k, entry in enumerate(place.entries)}
     if place.speed:
-        told |= {entry: f"other{k}.dv{axis}" for k, entry in enumerate(place.speed.entries)}
-    return told
+        found |= {entry: f"other{k}.dv{axis}" for k, entry in enumerate(place.speed.entries)}
+    return found
 
 
 def _own_speed(steps: _Steps, place: _Field) -> int | None:
-    """The entry that tells how one's own place changes."""
+    """The entry that is the rate of change of one's own place."""
     if place.own is None:
         return None
     entries = [e for e in range(len(steps.deviation)) if steps.varies(e) and e not in (place.own, *place.entries)]

@@ -9,7 +9,9 @@ import pytest
 
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
 from ringfence.problem import features
-from ringfence.problem.told_names import told_names
+from ringfence.problem.inferred_names import inferred_names
+from ringfence.training import worlds
+from tests.quick import QUICK_WORLD
 
 DT = 0.1
 
@@ -37,13 +39,13 @@ def numbers(width: int) -> tuple[str, ...]:
 @pytest.mark.parametrize("agents", [2, 3, 5])
 def test_what_agents_see_of_each_other_names_it(agents):
     x, true, first = team(agents)
-    assert told_names(x, numbers(len(true)), first) == true
+    assert inferred_names(x, numbers(len(true)), first) == true
 
 
 def test_in_any_order_of_entries():
     x, true, first = team()
     order = np.random.default_rng(1).permutation(len(true))
-    found = told_names(x[..., order], numbers(len(true)), first)
+    found = inferred_names(x[..., order], numbers(len(true)), first)
     kind = [name.rstrip("xyz") for name in found]  # which axis is the first does not matter
     assert kind == [true[d].rstrip("xyz").replace("obs0", f"obs{k}") for k, d in enumerate(order)]
 
@@ -51,7 +53,7 @@ def test_in_any_order_of_entries():
 def test_places_that_nobody_sees_of_himself():
     x, true, first = team()
     kept = [d for d, name in enumerate(true) if name not in ("own.x", "own.y")]
-    found = told_names(x[..., kept], numbers(len(kept)), first)
+    found = inferred_names(x[..., kept], numbers(len(kept)), first)
     expected = [true[d] for d in kept]
     assert found == ("obs0", "own.vx", "own.vy", "obs3", "obs4", *expected[5:])
 
@@ -59,7 +61,7 @@ def test_places_that_nobody_sees_of_himself():
 def test_speeds_that_nobody_sees_of_others():
     x, true, first = team()
     kept = [d for d, name in enumerate(true) if ".dv" not in name]
-    assert told_names(x[..., kept], numbers(len(kept)), first) == tuple(true[d] for d in kept)
+    assert inferred_names(x[..., kept], numbers(len(kept)), first) == tuple(true[d] for d in kept)
 
 
 def test_others_by_distance_are_not_named():
@@ -67,15 +69,15 @@ def test_others_by_distance_are_not_named():
     seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)
     nearest = (seen[..., :2] ** 2).sum(-1).argsort(-1)
     x[..., 7:] = np.take_along_axis(seen, nearest[..., None], 2).reshape(*x.shape[:2], -1)
-    assert told_names(x, numbers(len(true)), first) == numbers(len(true))
+    assert inferred_names(x, numbers(len(true)), first) == numbers(len(true))
 
 
 def test_what_is_measured_has_no_names():
     x, true, first = team()
     noisy = x + np.random.default_rng(2).normal(size=x.shape) * 0.01
-    assert told_names(noisy, numbers(len(true)), first) == numbers(len(true))
-    assert told_names(x[:, :1], numbers(len(true)), first) == numbers(len(true))
-    assert told_names(x[:20], numbers(len(true)), first[:1]) == numbers(len(true))
+    assert inferred_names(noisy, numbers(len(true)), first) == numbers(len(true))
+    assert inferred_names(x[:, :1], numbers(len(true)), first) == numbers(len(true))
+    assert inferred_names(x[:20], numbers(len(true)), first[:1]) == numbers(len(true))
 
 
 def test_a_view_without_names_is_one_with_them():
@@ -85,16 +87,27 @@ def test_a_view_without_names_is_one_with_them():
     assert bare.follows == named.follows
 
 
-def test_whatever_is_told_relative_to_oneself_follows():
+def test_whatever_is_relative_to_oneself_follows():
     found = TEST["shafts"].feature_map("pruned")
     assert {"goal.dangle", "other0.dangle", "other2.dspeed"} <= {found.names[d] for d in found.follows}
 
 
-def test_names_that_say_nothing_of_whose_it_is_are_told_too():
+def test_names_that_say_nothing_of_whose_an_entry_is_give_way():
     x, true, first = team()
     given = tuple(f"column {d}" for d in range(len(true)))
     expected = tuple(name.replace("obs0", "column 0") for name in true)
-    assert told_names(x, given, first) == expected
-    assert told_names(x, given, first, keep=("column 1",)) == ("column 0", "column 1", *expected[2:])
+    assert inferred_names(x, given, first) == expected
+    assert inferred_names(x, given, first, keep=("column 1",)) == ("column 0", "column 1", *expected[2:])
     half = tuple("own.vx" if name == "own.vx" else entry for name, entry in zip(true, given))
-    assert told_names(x, half, first) == half
+    assert inferred_names(x, half, first) == half
+
+
+def test_the_card_says_which_names_were_inferred_and_a_formula_reads_them(own_store):
+    bare = dataclasses.replace(own_store, card=own_store.card.updated(observation_names=None))
+    world = worlds.fit(bare, labels="formula", **QUICK_WORLD)
+    given = own_store.card.observation_names
+    for entry, name in world.card.data.inferred_names.items():
+        true = given[int(entry.removeprefix("obs"))]
+        assert name == true or (name.startswith("still_") and true.startswith("landmark"))
+    assert "Nobody named these entries" in str(world.card) and "other0.dx (obs" in str(world.card)
+    assert worlds.fit(own_store, **QUICK_WORLD).card.data.inferred_names is None
