@@ -64,6 +64,12 @@ def test_speeds_that_nobody_sees_of_others():
     assert inferred_names(x[..., kept], numbers(len(kept)), first) == tuple(true[d] for d in kept)
 
 
+def test_what_is_there_twice_is_named_once():
+    x, true, first = team()
+    twice = np.concatenate([x, x[..., 7:9]], -1)
+    assert inferred_names(twice, numbers(len(true) + 2), first)[: len(true)] == true
+
+
 def test_others_by_distance_are_not_named():
     x, true, first = team()
     seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)

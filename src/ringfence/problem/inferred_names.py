@@ -15,6 +15,7 @@ import numpy as np
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
+MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
@@ -68,7 +69,8 @@ class _Steps:
     @classmethod
     def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> _Steps | None:
         """None where there are too few."""
-        rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), ROWS).astype(int))
+        many = min(ROWS, MOST // (observations[0].size or 1))
+        rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), many).astype(int))
         if first_rows is not None:
             rows = rows[~np.isin(rows + 1, first_rows)]
         if len(rows) < FEWEST:
@@ -94,6 +96,8 @@ def _fields(steps: _Steps) -> Iterator[_Field]:
     _, agents, width = x.shape
     for first in range(width):
         if not steps.varies(first) or not steps.equal(x[:, 0, first], -x[:, 1, first], first):
+            continue
+        if any(np.array_equal(x[..., first], x[..., earlier]) for earlier in range(first)):
             continue
         # agent 0 sees agent k + 1 in its k-th place, and is seen by it in the first
         entries = [first]
