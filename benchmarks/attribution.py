@@ -6,17 +6,11 @@ python benchmarks/attribution.py
 
 from __future__ import annotations
 
-import json
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import dataclass
 
-import numpy as np
-from evidence import RESULTS, Difference, Row, difference, family, mean, of, tasks_of, variant
+from evidence import Difference, Row, difference, family, mean, of, tasks_of, variant
 from readme import put
-
-from ringfence.bench import make_grid, unpack
-from ringfence.bench.suites import COLLECTIONS
-from ringfence.datasets import registry
 
 # Proposals that the page shows: their words, and their row without a guard. `ringfence bench results
 # results/guards` prints all others, too.
@@ -170,7 +164,6 @@ def main() -> None:
     put("docs/attribution.md", "questions", questions("guards"))
     put("docs/attribution.md", "robots", robots("guards-mujoco"))
     put("docs/attribution.md", "robot-questions", counted("guards-mujoco"))
-    put("docs/attribution.md", "hours", hours(COLLECTIONS["attribution"]))
 
 
 def cell(suite: str, task: str, row: Row, keys: tuple[str, str], digits: tuple[int, int]) -> tuple[str, int]:
@@ -270,29 +263,6 @@ def counted(suite: str) -> str:
         some = "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))
         out.append(f"| {q.words} | {key} | {len(ds)} | {some} | {counts[0]} | {counts[1]} |")
     return "\n".join(out)
-
-
-def hours(suites: tuple[str, ...]) -> str:
-    """A line per suite: what its cells took on two cores, and what five seeds of every entry on every task would take
-    at that rate. Who was not yet judged by a task's other limit is counted as long as it played under the first."""
-    out = ["| suite | cells here | hours | with five seeds everywhere | hours |", "|---|---:|---:|---:|---:|"]
-    total = np.zeros(2)
-    for suite in suites:
-        unpack(RESULTS / suite)
-        took = defaultdict(list)
-        for file in sorted((RESULTS / suite / "cells").glob("*/*/*/status.json")):
-            status, name = json.loads(file.read_text()), file.parent.parent.name
-            if status["state"] == "done":
-                played = status.get("eval_seconds", 0.0)
-                took[name, bool(registry.paired(file.parts[-4]))].append(status.get("train_seconds", 0.0) + played)
-                took[name, "played"].append(played)
-        made = [seconds for (_, how), times in took.items() if how != "played" for seconds in times]
-        cells = make_grid(suite, RESULTS / suite, seeds=5).cells
-        wanted = [(c.folder(RESULTS / suite).parent.name, bool(registry.paired(c.task))) for c in cells]
-        whole = sum(np.mean(took[cell] or took[cell[0], "played"] or made) for cell in wanted)
-        out.append(f"| `{suite}` | {len(made)} | {sum(made) / 7200:.1f} | {len(wanted)} | {whole / 7200:.1f} |")
-        total += sum(made) / 7200, whole / 7200
-    return "\n".join([*out, f"| all | | **{total[0]:.1f}** | | **{total[1]:.1f}** |"])
 
 
 def shown(d: Difference, key: str) -> str:

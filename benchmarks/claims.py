@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import textwrap
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ SPREAD = "results/guards/table.csv"
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 PROVING = "results/proving"
 STRESS = "results/stress/crossing.csv"
+SHOWN = 80  # letters of a sentence in the table
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ def of_late_actions() -> tuple[bool, str]:
     rows = {(r["faults"], r["guard"], r["compensated"]): r for r in stored.table(ROOT / STRESS)}
     known = [float(rows[f"delay{k}", "shield", "True"]["violation_rate"]) for k in (1, 2, 3)]
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
-    holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and max(unknown) >= 0.9
+    holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and 0.93 <= max(unknown) < 0.95
     return holds, f"{known} of {unknown}"
 
 
@@ -577,7 +579,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/stress.md",
-        "leaves contact in at most 2 % of the episodes. One that does not know leaves it in up to 90 %",
+        "leaves contact in at most 2 % of the episodes. One that does not know leaves it in up to 94 %",
         STRESS,
         of_late_actions,
     ),
@@ -597,7 +599,8 @@ def main() -> None:
             page = claim.page
             lines.append(f"| **{page}** | | |")
         file = claim.file.removeprefix("results/").removesuffix("/table.csv")
-        lines.append(f"| {claim.words} | {file} | {'' if holds else '**wrong**: '}{found} |")
+        words = textwrap.shorten(claim.words, SHOWN, placeholder=" …")
+        lines.append(f"| {words} | {file} | {'' if holds else '**wrong**: '}{found} |")
     put("docs/claims.md", "claims", "\n".join(lines))
     sys.exit(f"{wrong} claims do not hold" if wrong else 0)
 

@@ -237,7 +237,7 @@ def _share_and_return(row: dict | None) -> str:
     if row is None or "refused" in row:
         return "–"
     share = 100 * row["violation_rate"]
-    return f"{share:.{int(0 < share < 10)}f} %, {row['return_mean']:.2f}"
+    return f"{share:.{int(0 < share < 10)}f}, {row['return_mean']:.2f}"
 
 
 if __name__ == "__main__":

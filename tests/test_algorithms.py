@@ -629,13 +629,15 @@ def test_options_of_eval_that_contradict_are_refused(trained, words, said, capsy
 
 @pytest.fixture(scope="module")
 def absolute(played):
-    """Logs whose danger is about positions in the global state, which no agent observes; and as they are, no costs."""
+    """Logs whose danger is about positions in the global state, which no agent observes well enough to name them; and
+    as they are, no costs."""
     from ringfence.envs import SimpleSpread
     from ringfence.logs.store import EpisodeStore
     from ringfence.problem.constraints import Separation
 
     card = {"task": "yard", "state_names": list(SimpleSpread().state_names), "hazard": Separation(0.3)}
-    arrays = played["observations"], played["actions"], played["rewards"]
+    noise = 0.01 * np.random.default_rng(0).normal(size=played["observations"].shape)
+    arrays = played["observations"] + noise, played["actions"], played["rewards"]
     return lambda costs: EpisodeStore.from_episodes(*arrays, costs, state=played["state"], card=card)
 
 

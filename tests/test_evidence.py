@@ -122,7 +122,8 @@ def test_a_controller_keeps_evidence_of_every_step(run, tmp_path, capsys):
         asked = action.copy()
         for one in record["corrected"]:
             asked[one["agent"]] = one["requested"]
-            assert one["constraint"] == "entries of other" and one["thing"].startswith("other") and one["row"] == 1
+            assert one["constraint"] == "length of other.dx, other.dy" and one["thing"].startswith("other")
+            assert one["row"] == 1
             assert one["score"] < 1.0  # the margin
         np.testing.assert_allclose(asked, wanted, atol=1e-5)
         corrected += len(record["corrected"])
@@ -131,7 +132,7 @@ def test_a_controller_keeps_evidence_of_every_step(run, tmp_path, capsys):
     main(["log", "verify", str(file)])
     assert "44 records are what was written; its writer ended it" in capsys.readouterr().out
     main(["log", "show", str(file), "--number", "50"])
-    assert "since entries of other of other" in " ".join(capsys.readouterr().out.split())
+    assert "since length of other.dx, other.dy of other" in " ".join(capsys.readouterr().out.split())
     file.write_bytes(file.read_bytes().replace(b'"corrected":[]', b'"corrected":[ ]', 1))
     with pytest.raises(SystemExit):
         main(["log", "verify", str(file)])

@@ -45,7 +45,7 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
 
 def test_a_world_of_0_1_0_opens(tmp_path):
     """Its settings, its card and its arrays have names of before, and are written under today's."""
-    file = zoo.FOLDER / "crossing-hasty" / "world.safetensors"
+    file = zoo.FOLDER / "crossing-hasty" / "icbf-world.safetensors"
     with safe_open(file, "numpy") as opened:
         before = json.loads(opened.metadata()["ringfence_world"])["card"]
         threshold = opened.get_tensor("strange")
