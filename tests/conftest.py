@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import os
 import shutil
@@ -40,6 +41,7 @@ import pytest
 
 from ringfence.datasets.behaviour import collect
 from ringfence.envs import SimpleSpread
+from ringfence.guards import searched
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.world import validate
@@ -47,6 +49,8 @@ from ringfence.world import validate
 # A card asks of a hundred entries into danger, from nine times before each, whether actions could have avoided them:
 # more than half of what a small World's fit takes. Tests ask of fewer.
 validate.ENTERED = 20
+# Nor do they let the search that judges a World begin again: compiling that takes as long as the rest of a small fit.
+searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
 
 # Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(50_000, 20, 20)

@@ -157,7 +157,7 @@ def test_callables_and_unguarded_runs_are_logged_too(run, tmp_path):
     env = Crossing()
     seen = np.asarray(env.observe(env.reset(jax.random.key(0), 1)))[0]
     world = load(run, guard="shield")[1].one.guard.world
-    given = dict(world=world, agents=8, correction_steps=1, horizon=1)
+    given = dict(world=world, agents=8, correction_steps=1, correction_restarts=0, horizon=1)
     controller = Controller(lambda seen, state: np.ones((len(seen), 2)), log=tmp_path / "a", **given)
     action = controller.act(seen)
     controller.close()

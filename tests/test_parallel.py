@@ -252,7 +252,9 @@ def test_what_needs_a_simulator_from_here_says_what_to_do_without(run, command, 
 
 def test_anybodys_function_under_guard_is_played(small_world):
     """With what the guard could not do; there is no run to keep results in."""
-    still = guard(lambda seen, state: np.zeros((3, 2)), small_world, horizon=1, correction_steps=1)
+    still = guard(
+        lambda seen, state: np.zeros((3, 2)), small_world, horizon=1, correction_steps=1, correction_restarts=0
+    )
     result = play(still, SimpleSpreadParallel, episodes=2)
     assert result["episodes"] == 2 and 0 <= result["infeasible_rate"] <= 1 and 0 <= result["ood_rate"] <= 1
     with pytest.raises(UserError, match="a function under guard has none"):

@@ -88,7 +88,7 @@ def test_one_checkpoint_plays_teams_of_another_size(logs, tmp_path):
     world = worlds.fit(logs, **QUICK_WORLD)
     assert world.map.decentralized
     for agents in (2, 6):
-        quick = {"correction_steps": 1, "horizon": 1}
+        quick = {"correction_steps": 1, "correction_restarts": 0, "horizon": 1}
         found = evaluate(run, episodes=4, agents=agents, guard="shield", world=world, **quick)
         assert found["agents"] == agents and found["episodes"] == 4
     found = play(run, lambda: SpreadAlikeParallel(n_agents=4), episodes=1, agents=4)

@@ -197,7 +197,7 @@ def test_what_proposes_is_shown_that_state_and_what_was_sent_is_remembered(run):
             return {"shown": observations}, PolicyStep(jnp.zeros((*observations.shape[:2], 2)), {})
 
     world = load(run, guard="shield")[1].one.guard.world
-    late = build(Shows(), world, None, "shield", "learned", delay=1, correction_steps=1, horizon=1)
+    late = build(Shows(), world, None, "shield", "learned", delay=1, **LIGHT)
     env = Crossing()
     observations = env.observe(env.reset(jax.random.key(0), 1))[0][:, None]
     carry = late.initial_state(8)
@@ -208,7 +208,7 @@ def test_what_proposes_is_shown_that_state_and_what_was_sent_is_remembered(run):
     np.testing.assert_allclose(carry["sent"][:, -1], step.action, atol=1e-6)
     other = jnp.full((8, 1, 2), 0.5)
     np.testing.assert_allclose(late.observe_sent(carry, other)["sent"][:, -1], other)
-    usual = build(Shows(), world, None, "shield", "learned", correction_steps=1, horizon=1)
+    usual = build(Shows(), world, None, "shield", "learned", **LIGHT)
     assert "sent" not in usual.initial_state(8)
     assert usual.observe_sent({}, other) == usual.observe_age({}, jnp.zeros((8, 1))) == {}
 

@@ -43,7 +43,10 @@ def test_a_run_is_packed_and_comes_back(small_store, small_world, tmp_path):
         patch.setattr(zoo, "FOLDER", tmp_path)
         back = zoo.pretrained("mine/bc", tmp_path / "got")
     seen, state = small_store.observations[0], small_store.state[0]
-    was, now = (Controller(r, guard="shield", horizon=1, correction_steps=1, world=small_world) for r in (run, back))
+    was, now = (
+        Controller(r, guard="shield", horizon=1, correction_steps=1, correction_restarts=0, world=small_world)
+        for r in (run, back)
+    )
     np.testing.assert_allclose(now.act(seen, state), was.act(seen, state), atol=0.02)
     assert run_worlds.of_run(back).ood_threshold == 2 * run_worlds.for_guard(back).ood_threshold
     assert back.checkpoints()[0][0] == 4 and back.config == run.config

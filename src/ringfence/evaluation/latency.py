@@ -28,12 +28,12 @@ def _first(env: Env | NativeEnv) -> tuple[Array, Array]:
 def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
     """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
     seen = _first(task.simulator)
-    act = jax.jit(lambda policy, carry, seen, key: policy.act(carry, *seen, key)[1].action)
+    act = jax.jit(lambda policy, carry, seen, key: policy.act(carry, *seen, key)[1])  # with all that it says beside it
     carry = policy.initial_state(1)
     took = []
     for key in jax.random.split(jax.random.key(1), calls + WARM_UP):
         begun = time.perf_counter()
-        act(policy, carry, seen, key).block_until_ready()
+        jax.block_until_ready(act(policy, carry, seen, key))
         took.append((time.perf_counter() - begun) * 1e3)
     p50, p99 = np.percentile(took[WARM_UP:], [50, 99])
     return {"plan_ms_p50": float(p50), "plan_ms_p99": float(p99)}

@@ -97,7 +97,7 @@ def regress(
 
         return jax.lax.fori_loop(start, stop, step, carry)
 
-    carry = (net, adam.init(net))
+    carry = (net, jax.jit(adam.init)(net))  # one program, and not one for each shape
     chunk = max(1, updates // CHUNKS)
     with Progress(label, updates, quiet=not label) as bar:
         for start in range(0, updates, chunk):
