@@ -288,3 +288,10 @@ def test_the_driven_agent_has_faults_and_the_others_none():
     assert np.abs(np.diff(plain[:, :3], 2, axis=1)).max() > 1e-3
     gained = [np.linalg.norm(np.diff(place, axis=1), axis=-1) for place in (late[:, 3:5], plain[:, :2])]
     np.testing.assert_allclose(*gained, atol=1e-5)
+
+
+def test_whatever_is_relative_to_a_driven_agent_moves_with_it_and_what_no_name_explains_is_said():
+    names = ("own.vx", "own.vy", "other0.dx", "other0.dy", "still_a.dx", "still_a.dy", "wall0.dx", "own.charge", "obs8")
+    found = Names({name: d for d, name in enumerate(names)}, {}, 2)
+    assert found.things == ["still_a", "wall0"]
+    assert found.as_logged == ["own.charge", "obs8"]

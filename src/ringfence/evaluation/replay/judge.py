@@ -39,6 +39,7 @@ from ringfence.world.logged import held_out, labels_of, unsafe_of
 SECONDS = 8.0  # of a window, by default
 LONG = 2.0  # s that the formula looks ahead
 TELLS = 0.75  # balanced accuracy below which distances do not tell costs
+SHOWN = 6  # names in a note
 FILMS = 3
 
 
@@ -105,6 +106,14 @@ def replay(
     stage = dataclasses.replace(stage, faults=faults)
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
     notes: list[str] = [f"Behind faults: {faults.name}; a brake is not behind them."] if faults.given else []
+    if guarded is not None and store.n_agents > 1 and not guarded.guard.world.alone:
+        notes.append(
+            "This guard corrects the whole team's actions and counts on others to follow, which they do not do here: "
+            "fit a World with --execution decentralized to judge a guard of one agent."
+        )
+    if names.as_logged:
+        kept = ", ".join(names.as_logged[:SHOWN]) + (", ..." if len(names.as_logged) > SHOWN else "")
+        notes.append(f"Of a driven agent {kept} stay as logged: no name says how they follow from its motion.")
     if baselines and known_world is not None:
         formula = _formula(known_world, radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}

@@ -65,6 +65,18 @@ class Names:
         return count
 
     @cached_property
+    def things(self) -> list[str]:
+        """What else is observed relative to an agent, e.g. goal and landmark0."""
+        found = [m[1] for name in self.observation if (m := re.fullmatch(r"(\w+)\.d[xyz]", name))]
+        return [name for name in dict.fromkeys(found) if not re.fullmatch(r"own|other\d+", name)]
+
+    @cached_property
+    def as_logged(self) -> list[str]:
+        """Entries of a driven agent that stay as they were logged: no name says how they follow from its motion."""
+        known = re.compile(r"own\.(v?[xyz]|v|speed|cos|sin|heading|yaw|theta)|other\d+\.(dv?[xyz]|seen)|\w+\.dv?[xyz]")
+        return [name for name in self.observation if not known.fullmatch(name)]
+
+    @cached_property
     def placed(self) -> bool:
         """Whether everybody's place is known."""
         named = self.pair("own.{}") is not None and self.agents > 1
@@ -224,7 +236,10 @@ class Windows:
         return x.astype(np.float32), self._whole(t, moved, faster)
 
     def _own(self, mine, moved, faster, velocity, heading) -> None:
-        for pattern, change in (("own.{}", moved), ("own.v{}", faster), ("goal.d{}", -moved)):
+        changes = [("own.{}", moved), ("own.v{}", faster)]
+        for thing in self.names.things:  # that move or stand still as they did
+            changes += [(f"{thing}.d{{}}", -moved), (f"{thing}.dv{{}}", -faster)]
+        for pattern, change in changes:
             if pair := self.names.pair(pattern):
                 mine[:, pair] += change
         along = (velocity[:, :2] * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)
