@@ -74,8 +74,8 @@ SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
-    put("docs/proving-ground.md", "proving", proving(RESULTS / "proving"))
-    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", short=False))
+    put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
+    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", short=False))
     put("docs/crossing-results.md", "tiers", tiers())
     put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing-results.md", "proposals", proposals())
@@ -208,7 +208,7 @@ def other_simulator() -> str:
     return "\n".join(out)
 
 
-def proving(folder: Path, short: bool = True) -> str:
+def proving(folder: Path, files: str, short: bool = True) -> str:
     """Systems of the proving ground's kind, by their results; naive drivers also by a guard that looks three rows
     ahead."""
     beside = ("naive shield learned, 3 rows",) if short else ()
@@ -216,10 +216,8 @@ def proving(folder: Path, short: bool = True) -> str:
     heads = ["system", "verdict", "causes found", "clone", "shield", "oracle", "naive", "shield"]
     heads += ["shield, 3 rows"] * short + ["oracle"]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for file in sorted(folder.glob("*.json")):
+    for file in sorted(folder.glob(files)):
         found = json.loads(file.read_text())
-        if not isinstance(found, dict) or "causes" not in found or found["task"].startswith("crossing"):
-            continue
         causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
         name = found["task"].removeprefix("proving-").removeprefix("other-")
         cells = [f"`{name}`", found["verdict"], "; ".join(causes) or "none"]

@@ -189,8 +189,8 @@ def _inferred_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, 
     """Names that nobody gave, by what their entries are called."""
     if map.reads_state:
         return {}
-    given = [store.entry_names[d] for d in map.plus[0]]
-    return {entry: name for entry, name in zip(given, map.names) if entry != name}
+    given = store.entry_names
+    return {given[d]: name for d, name in zip(map.plus[0], map.names) if given[d] != name}
 
 
 def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
