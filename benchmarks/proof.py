@@ -11,17 +11,14 @@ import argparse
 import json
 import os
 import tempfile
-import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
+from crossing import acting
 
 from ringfence.deploy import zoo
-from ringfence.evaluation.latency import WARM_UP
 from ringfence.evaluation.stress import stress
-from ringfence.loading.resolve import load
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "stress" / "proof.json"
 KEPT = ("return_mean", "violation_rate", "violation_upper", "infeasible_rate", "proved_rate", "agent_proved_rate")
@@ -54,26 +51,13 @@ def main() -> None:
     print(json.dumps(rows, indent=1))
 
 
-def timed(run: Any, episodes: int = 3) -> dict[str, float]:
+def timed(run: Any) -> dict[str, float]:
     """Milliseconds of a joint action of eight agents, and of all that is said of it, along episodes; with and without
     a proof."""
     found = {}
     for name, options in (("shield", {}), ("shield and proof", {"proof": 0.02})):
-        job, policy = load(run, guard="shield", **options)
-        env = job.task.simulator
-        act = jax.jit(lambda policy, carry, seen, state, key: policy.act(carry, seen, state, key))
-        step, observe, whole = jax.jit(env.step), jax.jit(env.observe), jax.jit(env.global_state)
-        took = []
-        for episode in range(episodes):
-            state, carry = env.reset(jax.random.key(episode), 1), policy.initial_state(1)
-            for key in jax.random.split(jax.random.key(100 + episode), env.episode_length):
-                seen = jax.block_until_ready((observe(state), whole(state)))
-                begun = time.perf_counter()
-                carry, out = jax.block_until_ready(act(policy, carry, *seen, key))
-                took.append(1e3 * (time.perf_counter() - begun))
-                state, _ = step(state, out.action)
-        for q in (50, 99):
-            found[f"{name}, p{q}"] = round(float(np.percentile(took[WARM_UP:], q)), 2)
+        took = acting(run, None, 8, {"guard": "shield", **options})
+        found |= {f"{name}, p{q}": round(float(np.percentile(took, q)), 2) for q in (50, 99)}
     return found
 
 
