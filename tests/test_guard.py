@@ -112,7 +112,7 @@ def test_what_was_asked_for_is_held_for_a_few_rows_and_not_for_all(speed, kept):
         fast = speed + 0.1 * jnp.cumsum(plans[..., 0], 2)
         return jnp.minimum(0.5 - jnp.abs(fast), 0.0)
 
-    def within(plan):
+    def within(present, plan):
         return -jnp.ones_like(plan), jnp.ones_like(plan)
 
     correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
@@ -132,7 +132,7 @@ def test_what_is_near_counts_for_more_where_no_plan_meets_all():
         rows = jnp.arange(15)[:, None]
         return -jnp.where(rows == 0, 0.3 * pushed, jnp.where(rows > 9, 0.1 * (1 - pushed), 0.0))
 
-    def within(plan):
+    def within(present, plan):
         return -jnp.ones_like(plan), jnp.ones_like(plan)
 
     correct = Corrector(missing, within, alone=False, steps=10, restarts=1)
@@ -231,6 +231,18 @@ def test_the_shield_stays_within_its_bound(small_world, bound, present):
     assert 0.05 < moved.max() <= 0.1 + 1e-6 and jnp.abs(kept).max() <= 1
     far = make(small_world, bound, correction_steps=10).shielded(present, plan, jnp.full((64, 1), 9.0))
     assert jnp.abs(far - plan).max() > 0.2
+
+
+def test_who_is_not_driven_does_what_is_proposed(small_world, bound, present):
+    """All of the correction is left to the one who is."""
+    guard = make(small_world, bound, correction_steps=10, correction_restarts=1, horizon=5)
+    asked = jax.random.uniform(jax.random.key(1), (64, 1, 1, 3, 2), minval=-1, maxval=1)
+    plan = jnp.broadcast_to(asked, (64, 1, 5, 3, 2))
+    driven = jnp.asarray(np.arange(3) == np.arange(64)[:, None] % 3)
+    last, margin, key = jnp.zeros((64, 5, 3, 2)), jnp.full((64, 1), 3.0), jax.random.key(0)
+    found = eqx.filter_jit(guard.decide)(present, plan, last, margin, key, None, driven)
+    moved = (jnp.abs(found.plan - plan[:, 0]) > 0).any((1, 3))
+    assert moved.any() and not (moved & ~driven).any()
 
 
 def test_the_best_of_the_safe_ones_is_taken():

@@ -53,8 +53,9 @@ def walkers(reach=2.0, late=0.5, **card) -> EpisodeStore:
 
 
 def stage_of(store: EpisodeStore) -> Stage:
-    motion = motion_of(store, Names.of(store))
-    cut, _ = windows_of(store, np.arange(store.episodes), STEPS, 300, RADIUS, DT, store.card.homogeneous)
+    names = Names.of(store)
+    motion = motion_of(store, names)
+    cut, _ = windows_of(store, names, motion, np.arange(store.episodes), STEPS, 300, RADIUS, DT)
     return Stage(cut, kinematics_of(None, store, motion, None, DT, 2.7), RADIUS, 0)
 
 

@@ -44,7 +44,8 @@ class Corrector:
 
     # present, plans (B, S, K, N, A), margin -> (B, S, K, N), 0 or less
     missed: Callable[[PyTree, Array, Array], Array]
-    within: Callable[[Array], tuple[Array, Array]]  # bounds of what may become of plans
+    # present, plans (B, K, N, A) that were asked for -> bounds of what may become of them
+    within: Callable[[PyTree, Array], tuple[Array, Array]]
     alone: bool  # agents answer for themselves
     steps: int
     restarts: int
@@ -104,7 +105,7 @@ class Corrector:
         begun = jnp.broadcast_to(plan[:, None, :ASKED], (len(plan), len(tails), ASKED, agents, dim))
         other = jnp.concatenate([begun, jnp.broadcast_to(tails, (len(plan), *tails.shape))], 2)
         missing = self.missing(present, plan[:, None], margin)[:, 0]
-        other = jnp.concatenate([plan[:, None], self._of_unmet(other, asked, plan, missing, 0.0)], 1)
+        other = jnp.concatenate([plan[:, None], self._of_unmet(present, other, asked, plan, missing, 0.0)], 1)
         missing = self.missing(present, other, margin)
         if not self.alone:
             own = _picked(other, missing.sum(2).argmax(1))[:, None]
@@ -112,10 +113,12 @@ class Corrector:
             missing = jnp.concatenate([missing, self.missing(present, own, margin)], 1)
         return _picked(other, self._of_team(missing, (1,)).argmax(1))
 
-    def _of_unmet(self, plans: Array, asked: Array, kept: Array, missing: Array, bearable: float) -> Array:
+    def _of_unmet(
+        self, present: PyTree, plans: Array, asked: Array, kept: Array, missing: Array, bearable: float
+    ) -> Array:
         """Plans (B or 1, S, K, N, A) within bounds of what was asked for; agents of whose plans `kept` (B, K, N, A) no
         more than is bearable is `missing` (B, K, N) keep these."""
-        low, high = self.within(asked)
+        low, high = self.within(present, asked)
         unmet = missing.sum(1) < -bearable
         return jnp.where(unmet[:, None, None, :, None], jnp.clip(plans, low[:, None], high[:, None]), kept[:, None])
 
@@ -127,7 +130,7 @@ class Corrector:
         """Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖². The best
         plan on the way, within bounds around the one that was asked for. Where the condition cannot be met, larger
         actions throw robots over."""
-        low, high = self.within(asked)
+        low, high = self.within(present, asked)
 
         def shortfall(plan: Array) -> Array:
             return self.shortfall(present, plan, margin)
@@ -179,7 +182,7 @@ class Corrector:
     ) -> Array:
         """(B, K, N, A) the one of starts (S, K, N, A) that misses least, and among equals the one whose first action is
         nearest to what was asked. Agents of whose plans found nothing is `missing` (B, K, N) keep these."""
-        starts = self._of_unmet(starts, asked, found, missing, TOLERANCE)
+        starts = self._of_unmet(present, starts, asked, found, missing, TOLERANCE)
         short = self._of_team(self.missing(present, starts, margin), (1,))
         far = self._of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
         fine = short >= short.max(1, keepdims=True) - TOLERANCE

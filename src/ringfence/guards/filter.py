@@ -35,6 +35,10 @@ MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
 
 
+# The present (B, N, D), for how long others were not seen, and who is driven (B, N).
+Given = tuple[Array, Array | None, Array | None]
+
+
 class Decision(NamedTuple):
     """What a guard made of proposals."""
 
@@ -59,20 +63,28 @@ class Guard(eqx.Module):
         return self.barrier.world
 
     def decide(
-        self, present: Array, proposals: Array, last: Array, margin: Array, key: Key, unseen: Array | None = None
+        self,
+        present: Array,
+        proposals: Array,
+        last: Array,
+        margin: Array,
+        key: Key,
+        unseen: Array | None = None,
+        driven: Array | None = None,
     ) -> Decision:
         """From the present (B, N, D), proposals, the last plan (B, K, N, A) and margins to a plan. Margins are
         (B, C), of each constraint, or (B, N, C) of agents who are alone. `unseen` (B, N) are the steps for which an
-        agent has not seen others, or (B, N, J) each of them."""
+        agent has not seen others, or (B, N, J) each of them. `driven` (B, N) are agents who do what is decided; of the
+        others what is proposed stays as it is."""
         proposals = self.held(self.world.spec.own(proposals))
         if self.options.optimizer_steps:
-            proposals = self.refined(present, *self.started(proposals, last, key), margin)
+            proposals = self.refined(present, *self.started(proposals, last, key, driven), margin)
         rows, spread = self.predict(present, proposals)
         chosen = self.selected(rows, proposals, self.clear(rows, spread, margin, unseen))
         index = jnp.expand_dims(chosen, (1, 2, 4) if self.world.alone else (1, 2, 3, 4))
         plan = jnp.take_along_axis(proposals, index, 1)[:, 0]
         if self.options.correction_steps:
-            plan = self.shielded(present, plan, margin, unseen)
+            plan = self.shielded(present, plan, margin, unseen, driven)
         ahead, spread = self.predict(present, plan[:, None])
         seen = self.nearer(ahead, unseen)
         scores = self.barrier.along(seen, spread)[:, 0]
@@ -152,7 +164,9 @@ class Guard(eqx.Module):
         before = jnp.concatenate([now, clear[:, :-1]], 1)
         return jnp.minimum(clear - (1.0 - self.options.alpha) * before, 0.0)
 
-    def started(self, proposals: Array, last: Array, key: Key) -> tuple[Array, Array, Array]:
+    def started(
+        self, proposals: Array, last: Array, key: Key, driven: Array | None = None
+    ) -> tuple[Array, Array, Array]:
         """(B, S, K, N, A) thrice: what is refined (the proposals, the last plan moved on by a step, and noisy copies of
         these), and the bounds of each, `trust_radius` around the proposal that it belongs to."""
         many = proposals.shape[1]
@@ -164,13 +178,18 @@ class Guard(eqx.Module):
         starts = known[:, source]
         noise = self.options.noise * jax.random.normal(key, starts[:, copied:].shape)
         starts = starts.at[:, copied:].add(noise)
-        low, high = self._within(proposals[:, jnp.where(source < many, source, 0)], self.options.trust_radius)
+        around = proposals[:, jnp.where(source < many, source, 0)]
+        low, high = self._within(around, self.options.trust_radius, driven)
         return jnp.clip(starts, low, high), low, high
 
-    def _within(self, actions: Array, distance: float) -> tuple[Array, Array]:
-        """The bounds of what lies no farther than that from actions (..., N, A)."""
-        low = jnp.maximum(actions - distance, -1.0)
-        high = jnp.minimum(actions + distance, 1.0)
+    def _within(self, actions: Array, distance: float, driven: Array | None) -> tuple[Array, Array]:
+        """The bounds of what lies no farther than that from actions (B, ..., N, A); whoever is not `driven` (B, N) does
+        what is proposed."""
+        far: Array | float = distance
+        if driven is not None:
+            far = distance * driven.reshape(len(driven), *[1] * (actions.ndim - 3), -1, 1)
+        low = jnp.maximum(actions - far, -1.0)
+        high = jnp.minimum(actions + far, 1.0)
         return self.world.spec.own(low), self.world.spec.own(high)
 
     def refined(self, present: Array, actions: Array, low: Array, high: Array, margin: Array) -> Array:
@@ -204,19 +223,26 @@ class Guard(eqx.Module):
         clear = clear.min(2)
         return pick(clear if self.world.alone else clear.min(-1), value, 0.0)
 
-    def shielded(self, present: Array, plan: Array, margin: Array, unseen: Array | None = None) -> Array:
+    def shielded(
+        self,
+        present: Array,
+        plan: Array,
+        margin: Array,
+        unseen: Array | None = None,
+        driven: Array | None = None,
+    ) -> Array:
         """Plans (B, K, N, A) corrected until the condition holds along the predicted rows, and the best found
         otherwise, within `max_correction` of what they were."""
         options = self.options
 
-        def missing(given: tuple[Array, Array | None], plans: Array, margin: Array) -> Array:
-            return _missing_along(self, given, plans, margin)
+        def missing(given: Given, plans: Array, margin: Array) -> Array:
+            return _missing_along(self, given[:2], plans, margin)
 
-        def within(plan: Array) -> tuple[Array, Array]:
-            return self._within(plan, options.max_correction)
+        def within(given: Given, plan: Array) -> tuple[Array, Array]:
+            return self._within(plan, options.max_correction, given[2])
 
         correct = Corrector(missing, within, self.world.alone, options.correction_steps, options.correction_restarts)
-        return self.held(correct((present, unseen), plan, margin))
+        return self.held(correct((present, unseen, driven), plan, margin))
 
     def adapted(self, margin: Array, unsafe: Array) -> Array:
         """Margins (..., C) after a step: m ← m + η (1[unsafe] − rate), between 0 and MAX_MARGIN. A named constraint has

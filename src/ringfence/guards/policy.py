@@ -51,6 +51,7 @@ class Guarded(HadStart, eqx.Module):
     proposal: Any
     guard: Guard
     explains: bool = eqx.field(static=True, default=False)  # say of every step what was requested, and what was amiss
+    driven: Array | None = None  # (B, N) bool: who does what is decided; others do what is proposed. None: all do
 
     def initial_state(self, batch: int) -> PyTree:
         options = self.guard.options
@@ -131,7 +132,7 @@ class Guarded(HadStart, eqx.Module):
         if "sent" in carry:
             acting = self.when_it_acts(carry, present)
             unseen = guard.options.delay + carry["observed_age"]
-        found = guard.decide(acting, actions, carry["last"], margin, key, unseen)
+        found = guard.decide(acting, actions, carry["last"], margin, key, unseen, self.driven)
         action = found.plan[:, 0]
         proof = {}
         if guard.options.proof:

@@ -101,15 +101,15 @@ def replay(
     radius, source = radius_of(store, motion, radius, {} if known_world is None else known_world.card.causes)
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     stage, left_out = _stage(
-        store, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
+        store, names, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
     )
     stage = dataclasses.replace(stage, faults=faults)
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
     notes: list[str] = [f"Behind faults: {faults.name}; a brake is not behind them."] if faults.given else []
     if guarded is not None and store.n_agents > 1 and not guarded.guard.world.alone:
         notes.append(
-            "This guard corrects the whole team's actions and counts on others to follow, which they do not do here: "
-            "fit a World with --execution decentralized to judge a guard of one agent."
+            "This guard is of a team and decides for the driven agent alone. Of others it expects what they do now, or "
+            "what the run would do in their place."
         )
     if names.as_logged:
         kept = ", ".join(names.as_logged[:SHOWN]) + (", ..." if len(names.as_logged) > SHOWN else "")
@@ -233,6 +233,7 @@ def check_view(world: World, store: EpisodeStore) -> None:
 
 def _stage(
     store: EpisodeStore,
+    names: Names,
     motion: Motion,
     world: World | None,
     kinematics: str | None,
@@ -250,7 +251,7 @@ def _stage(
     chosen = np.arange(store.episodes) if every_episode else _unlearned(world, store)
     longest = int(np.median(store.lengths[chosen]))
     steps = steps or max(1, min(round(SECONDS / dt), longest))
-    cut, left_out = windows_of(store, chosen, steps, most, radius, dt, store.card.homogeneous)
+    cut, left_out = windows_of(store, names, motion, chosen, steps, most, radius, dt)
     body = kinematics_of(kinematics, store, motion, world, dt, wheelbase)
     return Stage(cut, body, radius, seed), left_out
 

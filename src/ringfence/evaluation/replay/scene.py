@@ -296,12 +296,17 @@ class Windows:
 
 
 def windows_of(
-    store: EpisodeStore, episodes: np.ndarray, steps: int, most: int, radius: float, dt: float, homogeneous: bool
+    store: EpisodeStore,
+    names: Names,
+    motion: Motion,
+    episodes: np.ndarray,
+    steps: int,
+    most: int,
+    radius: float,
+    dt: float,
 ) -> tuple[Windows, int]:
     """Windows of `steps` in the episodes (E,) that do not overlap, each agent driven in turn, at most `most` drawn
     evenly; and how many were left out because they begin in contact."""
-    names = Names.of(store)
-    motion = motion_of(store, names)
     first = np.concatenate([[0], store.episode_ends[:-1]])
     found = [(e, s) for e in episodes for s in range(0, int(store.lengths[e]) - steps + 1, steps)]
     if not found:
@@ -326,7 +331,7 @@ def windows_of(
         goal = place[:, 0] + store.observations[rows[:, 0], driven][:, pair]
     made = Windows(
         names=names,
-        sorted=homogeneous,
+        sorted=store.card.homogeneous,
         driven=driven,
         episode=episode,
         start=start,

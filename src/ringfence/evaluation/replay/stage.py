@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import jax
@@ -95,8 +95,10 @@ class Stage:
         if {"own.cos", "own.sin"} <= set(w.names.observation):
             first = w.observations[np.arange(w.count), 0, w.driven]
             heading = np.arctan2(first[:, w.names.observation["own.sin"]], first[:, w.names.observation["own.cos"]])
+        if guard is not None:
+            guard = self._of_one(guard)
         if guard is not None and not isinstance(driver, str):
-            driver = Guarded(driver, guard.guard)
+            driver = replace(guard, proposal=driver)
         bad = _Bad(guard) if isinstance(driver, str) else None
         actor: Any = self._behind(bad or driver)
         memory = actor.initial_state(w.count)
@@ -130,6 +132,13 @@ class Stage:
                 bar.advance(1)
         return Driven(np.stack(places, 1), contact, {k: np.stack(v, 1) for k, v in info.items()})
 
+    def _of_one(self, guard: Guarded) -> Guarded:
+        """A team's guard, which is told whose actions it decides; agents who are alone decide their own anyway."""
+        if guard.guard.world.alone:
+            return guard
+        w = self.windows
+        return replace(guard, driven=jnp.asarray(np.arange(w.actions.shape[2]) == w.driven[:, None]))
+
     def _now(self, t: int, place: np.ndarray, velocity: np.ndarray, heading: np.ndarray) -> Now:
         w = self.windows
         away = w.others_at[:, t] - place[:, None]
@@ -158,7 +167,13 @@ class Stage:
         acted = np.asarray(step.action, np.float64)[np.arange(w.count), w.driven]
         if not np.isfinite(acted).all():
             raise UserError("The policy gave actions that are not finite; it has diverged: train or fit it again.")
-        return memory, acted, {n: np.asarray(step.info[n]) for n in TOLD if n in step.info}
+        return memory, acted, {name: self._told(step.info, name) for name in TOLD if name in step.info}
+
+    def _told(self, info: dict[str, Any], name: str) -> np.ndarray:
+        """(W,) what a guard says of the driven agents, where it says it of each."""
+        w = self.windows
+        own = info.get(f"agent_{name}")
+        return np.asarray(info[name]) if own is None else np.asarray(own)[np.arange(w.count), w.driven]
 
     def _in_world(self, world: World, t: int, seen: Seen, action: np.ndarray) -> tuple[Array, Array]:
         """What a World sees (W, N, D), and everybody's actions (W, N, A) in its units."""
