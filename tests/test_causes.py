@@ -297,6 +297,23 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
         guard(lambda seen, state: out, older, guard="shield", within_logs=True)
 
 
+def test_a_way_out_by_going_backwards_is_none_where_nobody_went_backwards(fitted):
+    """Nobody brakes at rest in logs of cars, so a World does not know that they stay where they are."""
+    names = list(NAMES)
+    at = [names.index(name) for name in ("own.x", "own.y")]
+    heading = causes.Heading(velocity=(at[0], at[1]), direction=(5, 6))
+    assert causes.Heading.of(["own.cos", "own.vx", "own.vy", "own.sin"]) == causes.Heading((1, 2), (0, 3))
+    assert causes.Heading.of(["own.speed", "own.cos", "own.sin"]) == causes.Heading((0,))
+    assert causes.Heading.of(["own.vx", "own.vy"]) is None
+    seen = shown.Shown((), (), (), (), (heading, 0.0, 2.0))
+    row = np.zeros((15, N, len(NAMES)), np.float32)
+    row[..., at] = [0.6, 0.8]
+    row[..., 5:7] = [0.6, 0.8]  # speed 1 ahead
+    row[10, 1, 5:7] *= -1
+    score = np.asarray(seen.along(jnp.asarray(row)))
+    assert score[10, 1] < 0.8 and (np.delete(score.ravel(), 10 * N + 1) > 10).all()
+
+
 def test_answers_are_drawn_on_the_page_of_a_fit(fitted, tmp_path):
     answers = {probe.name: probe for probe in fitted.card.barrier.probes}
     near = answers["length of other.dx, other.dy, put into held-out states"]

@@ -306,7 +306,10 @@ def test_others_who_were_not_seen_are_taken_to_be_nearer(run):
 
 def test_a_guard_is_told_of_all_that_it_can_be_told(run):
     told = compensated(run, Faults(delay=1, jitter=2, drop=0.3, asynchrony=0.667), {"guard": "shield"})
-    assert (told["delay"], told["max_age"], told["hold"]) == (2, 6, 3)
+    assert (told["delay"], told["max_age"], told["hold"], told["horizon"]) == (2, 6, 3, 8)
+    assert compensated(run, Faults(drop=0.3), {"guard": "shield", "horizon": 4})["horizon"] == 4
+    assert compensated(run, Faults(drop=0.3), {"guard": "shield"})["horizon"] == 5
+    assert "horizon" not in compensated(run, Faults(delay=2), {"guard": "shield"})
     assert told["others_acceleration"] == pytest.approx(1.0, abs=0.1)
     assert compensated(run, Faults(noise=0.1, gain=0.5), {"guard": "shield"}) == {"guard": "shield"}
 

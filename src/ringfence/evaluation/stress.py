@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -14,6 +15,7 @@ from ringfence.evaluation.evaluate import Split, about
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.faults import Faults
 from ringfence.faults.certificate import digest
+from ringfence.guards.correction import ASKED
 from ringfence.guards.policy import rows_foreseen
 from ringfence.loading.resolve import load_job, resolve
 from ringfence.loading.spec import PolicySpec
@@ -118,15 +120,25 @@ def _missing_options(spec: PolicySpec, faults: Faults) -> dict[str, Any]:
     """Options of a spec's guard that it lacks to know of faults, for the World that it reads."""
     given = dict(spec.guard_options)
     found = compensation(faults, {"guard": spec.guard, **given})
-    if not {"delay", "max_age"} & {*found, *given}:
+    late = bool({"delay", "max_age"} & {*found, *given})
+    seldom = _steps_between(faults) > 1 and not {"horizon", "horizon_seconds"} & {*given}
+    if not late and not seldom:
         return found
     guard = resolve(spec).guard
     assert guard is not None, "checked before"
     if "max_age" in found:
         found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", 0), 0))
-    if "others_acceleration" not in given:
+    if late and "others_acceleration" not in given:
         found["others_acceleration"] = own_acceleration(guard.world)
+    rows = min(math.ceil(ASKED * _steps_between(faults) - 1e-9), rows_foreseen(guard.world))
+    if seldom and rows > guard.options.horizon:
+        found["horizon"] = rows
     return found
+
+
+def _steps_between(faults: Faults) -> float:
+    """Steps from one decision to the next that is another, or from one observation to the next, in the mean."""
+    return max(1 / (1 - faults.asynchrony), 1 / (1 - faults.drop))
 
 
 def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:

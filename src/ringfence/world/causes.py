@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -12,6 +13,7 @@ from msgspec.structs import replace
 from ringfence.problem.features import numbered
 
 WIDEST = 4  # entries of one cause
+AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -105,6 +107,31 @@ def offsets(names: Sequence[str]) -> list[Cause]:
             things = tuple(tuple(thing[a] for a in axes) for thing in each)
             found.append(Cause(f"length of {kind}.{', '.join(axes)}", things, length=True))
     return found
+
+
+class Heading(msgspec.Struct, frozen=True):
+    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity and that direction, or its
+    speed."""
+
+    velocity: tuple[int, ...]
+    direction: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, names: Sequence[str]) -> Heading | None:
+        """None where names tell of none."""
+        at = {name: d for d, name in enumerate(names)}
+        if not {"own.cos", "own.sin"} <= set(at):
+            return None
+        if {"own.vx", "own.vy"} <= set(at):
+            return cls((at["own.vx"], at["own.vy"]), (at["own.cos"], at["own.sin"]))
+        speed = next((at[name] for name in ("own.v", "own.speed") if name in at), None)
+        return None if speed is None else cls((speed,))
+
+    def speed(self, x: Any) -> Any:
+        """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
+        if not self.direction:
+            return x[..., self.velocity[0]]
+        return sum(x[..., v] * x[..., d] for v, d in zip(self.velocity, self.direction))
 
 
 def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:

@@ -35,7 +35,7 @@ from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, margins, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
-from ringfence.world.causes import Found, offsets
+from ringfence.world.causes import AHEAD, Found, Heading, offsets
 from ringfence.world.cells import Cells
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World
@@ -105,6 +105,7 @@ def fit_view(
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
+    content += [AHEAD] if Heading.of(map.names) else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
@@ -205,6 +206,9 @@ def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:
     for cause in offsets(names):
         length = cause.of(x)
         found[cause.name] = (float(length.min()), float(length.max()))
+    if (heading := Heading.of(names)) is not None:
+        speed = heading.speed(x)
+        found[AHEAD] = (float(speed.min()), float(speed.max()))
     return found
 
 
