@@ -15,7 +15,7 @@ from ringfence.errors import UserError
 from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.report.ope_page import build_ope
-from ringfence.world import cause_counts, cause_search, causes, foresight, margins, probes, verdict
+from ringfence.world import cause_counts, cause_search, causes, foresight, load, margins, probes, save, verdict
 from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
 from ringfence.world.causes import Cause, Edge, Found
@@ -297,21 +297,39 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
         guard(lambda seen, state: out, older, guard="shield", within_logs=True)
 
 
-def test_a_way_out_by_going_backwards_is_none_where_nobody_went_backwards(fitted):
-    """Nobody brakes at rest in logs of cars, so a World does not know that they stay where they are."""
-    names = list(NAMES)
-    at = [names.index(name) for name in ("own.x", "own.y")]
-    heading = causes.Heading(velocity=(at[0], at[1]), direction=(5, 6))
-    assert causes.Heading.of(["own.cos", "own.vx", "own.vy", "own.sin"]) == causes.Heading((1, 2), (0, 3))
+def test_who_never_went_backwards_is_not_predicted_to():
+    """Nobody brakes at rest in logs of cars, so networks do not learn that they stay where they are."""
+    heading = causes.Heading((0, 1), (2, 3))
+    assert causes.Heading.of(["own.vx", "own.vy", "own.cos", "own.sin"]) == heading
     assert causes.Heading.of(["own.speed", "own.cos", "own.sin"]) == causes.Heading((0,))
     assert causes.Heading.of(["own.vx", "own.vy"]) is None
-    seen = shown.Shown((), (), (), (), (heading, 0.0, 2.0))
-    row = np.zeros((15, N, len(NAMES)), np.float32)
-    row[..., at] = [0.6, 0.8]
-    row[..., 5:7] = [0.6, 0.8]  # speed 1 ahead
-    row[10, 1, 5:7] *= -1
-    score = np.asarray(seen.along(jnp.asarray(row)))
-    assert score[10, 1] < 0.8 and (np.delete(score.ravel(), 10 * N + 1) > 10).all()
+    back = jnp.array([[-0.6, -0.8, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]])
+    np.testing.assert_allclose(heading.no_slower(back, 0.0), [[0, 0, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]], atol=1e-6)
+    np.testing.assert_allclose(heading.no_slower(back, -0.5)[0, :2], [-0.3, -0.4], atol=1e-6)
+    np.testing.assert_allclose(causes.Heading((0,)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
+
+
+def test_a_car_that_brakes_at_rest_stays(tmp_path):
+    """In logs of who never does so. What a file holds is the same World."""
+    rng = np.random.default_rng(0)
+    turn = rng.uniform(-np.pi, np.pi, (12, 1, N)).repeat(31, 1)
+    action = rng.uniform(-1, 1, (12, 30, N, 2)).astype(np.float32)
+    speed = np.zeros((12, 31, N))
+    for t in range(30):
+        action[:, t, :, 0] = np.where(speed[:, t] < 0.3, np.abs(action[:, t, :, 0]), action[:, t, :, 0])
+        speed[:, t + 1] = np.maximum(speed[:, t] + 0.2 * action[:, t, :, 0], 0.0)
+    seen = np.stack([speed * np.cos(turn), speed * np.sin(turn), np.cos(turn), np.sin(turn)], -1)
+    names = ["own.vx", "own.vy", "own.cos", "own.sin"]
+    card = {"task": "cars", "observation_names": names, "dt": 0.2, "homogeneous": True}
+    store = EpisodeStore.from_episodes(seen, action, np.zeros((12, 30)), (speed[:, 1:] > 1.5) * 1.0, card=card)
+    made = fit(store, **QUICK_WORLD)
+    assert made.dynamics.ahead == (causes.Heading((0, 1), (2, 3)), pytest.approx(0.0))
+    rest = jnp.array([[[0.0, 0.0, 1.0, 0.0]]])
+    brake = jnp.array([[[-1.0, 0.0]]])
+    free = dataclasses.replace(made.dynamics, ahead=None)
+    assert free.step(rest, brake)[0][0, 0, 0] < -0.02 and made.dynamics.step(rest, brake)[0][0, 0, 0] > -1e-5
+    again = load(save(made, tmp_path / "w.safetensors"))
+    assert again.dynamics.ahead == made.dynamics.ahead
 
 
 def test_answers_are_drawn_on_the_page_of_a_fit(fitted, tmp_path):

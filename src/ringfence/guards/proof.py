@@ -59,10 +59,12 @@ class Prover(eqx.Module):
         barrier = self.world.barrier
         shared = all(len(net.weights[0]) == 1 for net in ([] if barrier is None else _networks(barrier)))
         known = isinstance(barrier, Barrier) and not barrier.shape.use_transition and not barrier.shape.joint
-        if self.world.map.dt is None or not known or not shared or self.world.dynamics.guesses is not None:
+        dynamics = self.world.dynamics
+        linear = dynamics.guesses is None and dynamics.ahead is None
+        if self.world.map.dt is None or not known or not shared or not linear:
             raise UserError(
-                "proof is of Worlds of homogeneous agents whose danger is one and of states, and this World is "
-                "another; leave proof out."
+                "proof is of Worlds of homogeneous agents without a heading, whose danger is one and of states, and "
+                "this World is another; leave proof out."
             )
 
     def continued(self, present: Array, plan: Array) -> Array:

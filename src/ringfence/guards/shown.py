@@ -19,7 +19,7 @@ from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
-FAR = 10.0  # ranges inside: of rows where nothing else is asked
+FAR = 1e3  # score of the others
 
 
 class Shown(eqx.Module):
@@ -29,7 +29,6 @@ class Shown(eqx.Module):
     high: tuple[float, ...] = eqx.field(static=True)
     entries: tuple[int, ...] = eqx.field(static=True)
     nearest: tuple[tuple[causes.Cause, float, float], ...] = eqx.field(static=True)  # least length, and range of it
-    heading: tuple[causes.Heading, float, float] | None = eqx.field(static=True, default=None)  # least speed, and range
 
     @classmethod
     def by(cls, world: World) -> Shown:
@@ -49,15 +48,13 @@ class Shown(eqx.Module):
                 "within_logs keeps to what varies in the logs, and no entry of an agent does; leave it out."
             )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
-        return cls(low, high, tuple(names.index(name) for name in known), nearest, _heading(world))
+        return cls(low, high, tuple(names.index(name) for name in known), nearest)
 
     def along(self, x: Array) -> Array:
-        """(..., K, N) of predicted rows (..., K, N, D): those for which a proposal is held count. A way out by going
-        backwards, which nobody did, is none in any row."""
+        """(..., K, N) of predicted rows (..., K, N, D): those for which a proposal is held count."""
         soon = self.score(x[..., :ASKED, :, :])
-        later = x[..., ASKED:, :, :]
-        free = jnp.full(later.shape[:-1], FAR)
-        return jnp.concatenate([soon, _scored(jnp.stack([free, *self._ahead(later)], -1))], -2)
+        later = max(x.shape[-3] - ASKED, 0)
+        return jnp.concatenate([soon, jnp.full((*x.shape[:-3], later, x.shape[-2]), FAR)], -2)
 
     @staticmethod
     def known(world: World) -> bool:
@@ -73,26 +70,8 @@ class Shown(eqx.Module):
         inside = [jnp.minimum(read - low, high - read) / (high - low)]
         for cause, least, width in self.nearest:
             inside.append((values_of(cause, x)[..., 0] - least) / max(width, 1e-6))
-        return _scored(jnp.concatenate([*inside, *(one[..., None] for one in self._ahead(x))], -1))
-
-    def _ahead(self, x: Array) -> list[Array]:
-        """(..., N) by how much of its range one's speed ahead is above the least; nothing of bodies without heading."""
-        if self.heading is None:
-            return []
-        heading, least, width = self.heading
-        return [(heading.speed(x) - least) / width]
-
-
-def _scored(inside: Array) -> Array:
-    """(..., N) margins, by how many ranges (..., N, M) things are inside what was shown."""
-    steps = STEEP * (inside.min(-1) + SLACK)
-    return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
-
-
-def _heading(world: World) -> tuple[causes.Heading, float, float] | None:
-    heading = causes.Heading.of(world.map.names)
-    least, most = (world.card.data.ranges or {}).get(causes.AHEAD, (0.0, 0.0))
-    return None if heading is None or most <= least else (heading, least, most - least)
+        steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
+        return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
 
 
 def _varying(world: World) -> list[str]:

@@ -6,11 +6,13 @@ import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
 from ringfence.problem.features import numbered
+from ringfence.types import Array
 
 WIDEST = 4  # entries of one cause
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
@@ -131,7 +133,18 @@ class Heading(msgspec.Struct, frozen=True):
         """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
         if not self.direction:
             return x[..., self.velocity[0]]
-        return sum(x[..., v] * x[..., d] for v, d in zip(self.velocity, self.direction))
+        cos, sin = (x[..., d] for d in self.direction)
+        vx, vy = (x[..., v] for v in self.velocity)
+        return (vx * cos + vy * sin) / (cos**2 + sin**2 + 1e-9) ** 0.5
+
+    def no_slower(self, x: Array, least: float) -> Array:
+        """Features (..., D) with that speed ahead at least."""
+        lacks = jnp.maximum(least - self.speed(x), 0.0)[..., None]
+        if not self.direction:
+            return x.at[..., np.array(self.velocity)].add(lacks)
+        direction = x[..., np.array(self.direction)]
+        length = jnp.sqrt((direction**2).sum(-1, keepdims=True) + 1e-9)
+        return x.at[..., np.array(self.velocity)].add(lacks * direction / length)
 
 
 def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:

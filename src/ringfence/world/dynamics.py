@@ -8,6 +8,7 @@ It is fitted long enough to learn contacts. A few thousand updates predict free 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from ringfence.nets.optim import regress
 from ringfence.problem.features import FeatureMap, others
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
+from ringfence.world.causes import AHEAD, Heading
 
 STATES = 20_000  # steps that features and their changes are standardised by
 BATCH = 128  # small and often: at equal time it learns contacts that 512 at half the rate does not
@@ -44,6 +46,9 @@ class Dynamics(eqx.Module):
     step_mean: Array  # (F,) of the predicted entries
     step_scale: Array  # (F,)
     map: FeatureMap = eqx.field(static=True)
+    # Bodies that look ahead go no slower than that, e.g. backwards: nobody brakes at rest in logs of cars, so networks
+    # do not learn that they stay where they are.
+    ahead: tuple[Heading, float] | None = eqx.field(static=True, default=None)
 
     @property
     def predicted(self) -> np.ndarray:
@@ -99,9 +104,19 @@ class Dynamics(eqx.Module):
         if self.map.joint:
             return (before[..., 0, :] + moved[..., 0, :])[..., _of_first(self.map)]
         after = before.at[..., self.predicted].add(moved)
+        if self.ahead is not None:
+            heading, least = self.ahead
+            after = heading.no_slower(after, least)
         if self.map.reconcile is None:
             return after
         return self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
+
+
+def slowest(map: FeatureMap, ranges: Mapping[str, tuple[float, float]] | None) -> tuple[Heading, float] | None:
+    """How slowly bodies of a view go ahead by the ranges of a World's card; None of bodies that look nowhere."""
+    heading = None if map.joint else Heading.of(map.names)
+    speeds = (ranges or {}).get(AHEAD)
+    return None if heading is None or speeds is None else (heading, min(speeds[0], 0.0))
 
 
 def fit_dynamics(

@@ -158,7 +158,8 @@ def _fitted(
         constraints=found.constraints,
     )
     threshold = jnp.asarray(found.ood.threshold, jnp.float32)
-    world = dataclasses.replace(world, barrier=found.barrier, ood_threshold=threshold, card=card)
+    acts = dataclasses.replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
+    world = dataclasses.replace(world, dynamics=acts, barrier=found.barrier, ood_threshold=threshold, card=card)
     wrong = None if search is None else search(world, logged)
     if wrong is not None and card.barrier is not None:
         card = msgspec.structs.replace(card, barrier=msgspec.structs.replace(card.barrier, searched=round(wrong, 4)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,8 @@ def blank_world(
 
     def shapes() -> World:
         acts = dynamics.blank_dynamics(map, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
+        if card is not None:
+            acts = replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
         value = values.blank_values(map, spec.action_dim, settings.discount, alone)
         causes = card.causes if card else {}
         names = tuple(constraints)
