@@ -22,7 +22,7 @@ from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import compensated, own_acceleration
+from ringfence.evaluation.stress import compensated, compensation, own_acceleration
 from ringfence.faults import Faults, Faulty, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.faults.monitor import Monitor
@@ -310,6 +310,8 @@ def test_a_guard_is_told_of_all_that_it_can_be_told(run):
     assert compensated(run, Faults(drop=0.3), {"guard": "shield", "horizon": 4})["horizon"] == 4
     assert compensated(run, Faults(drop=0.3), {"guard": "shield"})["horizon"] == 5
     assert "horizon" not in compensated(run, Faults(delay=2), {"guard": "shield"})
+    late = [compensation(Faults(jitter=j), {"guard": "shield"}).get("delay", 0) for j in range(4)]
+    assert late == [0, 0, 1, 1], "a newer action overtakes, so three steps at most are one in the mean"
     assert told["others_acceleration"] == pytest.approx(1.0, abs=0.1)
     assert compensated(run, Faults(noise=0.1, gain=0.5), {"guard": "shield"}) == {"guard": "shield"}
 
