@@ -31,6 +31,7 @@ from ringfence.guards.wrap import Nothing
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
+from ringfence.loading.stamps import Stamps
 from ringfence.types import PolicyStep
 from ringfence.utils.chained import records
 
@@ -547,6 +548,21 @@ def test_a_controller_is_told_how_old_observations_are(run):
             controller.act(seen, age=age)
     with pytest.raises(UserError, match="age is read by nothing here"):
         Controller(run).act(seen, age=1)
+
+
+def test_what_deciding_took_lately_counts_as_age():
+    """The first decision compiles, and says nothing of the next."""
+    now = [0.0]
+    stamps = Stamps(lambda: now[0])
+    ages = []
+    for took in (5.0, 0.07, 0.07, 0.07):
+        ages.append(int(stamps.ages(now[0], 1, 0.1)))
+        now[0] += took
+        stamps.acted()
+    now[0] += 0.1
+    assert ages == [0, 0, 0, 1] and int(stamps.ages(now[0] - 0.1, 1, 0.1)) == 2
+    stamps.reset()
+    assert int(stamps.ages(now[0], 1, 0.1)) == 1
 
 
 def test_ages_follow_from_times_and_clocks_that_run_backwards_are_refused(run):

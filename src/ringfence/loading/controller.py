@@ -153,7 +153,7 @@ class Controller:
         than the run's or the World's are refused, and so is what is not finite: indices beyond an array's end would be
         clipped in silence, and noise would follow NaN. `age` is how many steps old the observations are, of all or of
         each agent, for a guard with `max_age`; `observed_at` is when they were made, in seconds by the controller's
-        `clock`, from which the age follows.
+        `clock`, from which the age follows, and to which what deciding took lately is added.
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
         source = self._source
@@ -175,6 +175,8 @@ class Controller:
         if self.evidence is not None:
             self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
         self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
+        if observed_at is not None:
+            self._stamps.acted()
         return action
 
     def _age(self, age: Any, observed_at: Any) -> Any:
