@@ -421,6 +421,13 @@ def test_a_margin_is_calibrated_and_its_promise_kept_to_whom_it_was_made(run, fe
     ):
         with pytest.raises(UserError, match=words):
             Controller(run, certificate=file, **how, **wrong)
+    looks = {"horizon": 5, "terminal_value": False}  # as a guard does that is told of faults
+    farther = dataclasses.replace(made, guard=made.guard | looks).save(tmp_path / "farther.json")
+    unsaid = {name: value for name, value in how.items() if name not in looks}
+    looking = Controller(run, certificate=farther, delay=1, **unsaid).policy.one.guard.options
+    assert (looking.horizon, looking.terminal_value) == (5, False)
+    with pytest.raises(UserError, match="of a guard with horizon=5, and this one has 2"):
+        Controller(run, certificate=farther, delay=1, **(unsaid | {"horizon": 2, "terminal_value": False}))
     with pytest.raises(UserError, match="A certificate is of a guarded run"):
         Controller(run, certificate=file)
     for field, words in (("policy", "another run"), ("world", "another World")):

@@ -27,7 +27,8 @@ from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
-COMPENSATION = ("delay", "max_age", "hold", "others_acceleration")  # options by which a guard knows of faults
+# Options by which a guard knows of faults.
+COMPENSATION = ("delay", "max_age", "hold", "others_acceleration", "horizon")
 STRESSED_ELSEWHERE = (
     "so `ringfence stress` has nothing to play in; play it behind faults in a simulator of your own: `ringfence play "
     "RUN --env FILE.py:NAME --delay 2`."

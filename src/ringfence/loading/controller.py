@@ -39,6 +39,7 @@ Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,
 OneCost = np.ndarray | dict[str, np.ndarray]  # (1,), or that by constraint
 
 CALIBRATED = ("margin", "others_acceleration")  # numbers that are read off a World; a certificate brings them along
+LOOKS = ("horizon", "terminal_value")  # likewise, unless it is said otherwise how far the guard looks
 UNGUARDED = "A certificate is of a guarded run; give one with guard=, or leave certificate= out."
 
 
@@ -85,7 +86,8 @@ class Controller:
         if promised is not None:
             if options.get("guard", "none") == "none":
                 raise UserError(UNGUARDED)
-            options = {name: promised.guard[name] for name in CALIBRATED if name in promised.guard} | options
+            brought = CALIBRATED if {*LOOKS, "horizon_seconds"} & set(options) else CALIBRATED + LOOKS
+            options = {name: promised.guard[name] for name in brought if name in promised.guard} | options
         self._watch = Watch(promised, on_alarm, fallback)
         self._stamps = Stamps(clock)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
