@@ -56,7 +56,7 @@ def compared(net: MLP, centers: jax.Array, radius: float) -> dict:
         "meet": float(((low <= wide.upper) & (high >= wide.lower)).mean()),
         "samples_beyond_ours": int(((shown < low) | (shown > high)).sum()),
         "samples_beyond_theirs": int(((shown < wide.lower) | (shown > wide.upper)).sum()),
-        "width_of_theirs": round(float(np.median(ours / theirs)), 4),
+        "width_as_share_of_theirs": round(float(np.median(ours / theirs)), 4),
     }
 
 

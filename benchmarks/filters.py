@@ -1,4 +1,4 @@
-"""Crossing behind faults under a filter of before: a control barrier function that is known, and a quadratic program.
+"""Crossing behind faults under a classical filter: a control barrier function by formula, and a quadratic program.
 
     python benchmarks/filters.py --episodes 200            # writes results/stress/filters.csv
     python benchmarks/filters.py --table                   # writes the table of docs/stress.md
@@ -8,13 +8,12 @@ for double integrators: h = sqrt(4 a (d − D)) + the speed at which two part, a
 ḣ ≥ −γ h³. It is given what nobody tells a guard that learns: when discs touch (D), how they move, and what they can do
 (a). Each agent solves its own program of two unknowns exactly, from what it sees. Where there is no solution it brakes.
 With the delay compensated it decides for the state in which its action will act: its own by what it sent, that of the
-others as if they went on as they are.
+others as if they went on as they are. Its gain and what it keeps to spare were chosen on 50 of the test episodes.
 """
 
 from __future__ import annotations
 
 import argparse
-import re
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ import _rows
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from stress import FAULTS, KNOWN, RATES, name_of
+from stress import FAULTS, KNOWN, RATES, RUN, in_words, name_of
 
 from ringfence.envs.crossing import DT, PUSH, RADIUS, SPEED
 from ringfence.types import Array, Key, PolicyStep, PyTree
@@ -31,7 +30,6 @@ from ringfence.types import Array, Key, PolicyStep, PyTree
 OUT = Path(__file__).resolve().parent.parent / "results" / "stress" / "filters.csv"
 ROW = ("faults", "gamma", "compensated", "episodes")
 FIELDS = (*ROW, "return", *RATES)
-RUN = "crossing-hasty/bc"
 GAMMAS = (0.3, 1.0)
 SPARE = 0.05  # m, that is kept beyond contact: decisions are taken ten times a second
 CORNERS = 16  # sides of the polygon that stands for the disc of what can be pushed
@@ -156,11 +154,9 @@ def write_table(out: Path) -> None:
     rows = [r for r in _rows.read(out) if float(r["gamma"]) == min(GAMMAS) and r["faults"] in names]
     for r in sorted(rows, key=lambda r: (names.index(r["faults"]), r["compensated"])):
         rate, upper, infeasible = (100 * float(r[name]) for name in RATES)
-        faults = re.sub(r"([a-z])([\d.]+)", r"\1 \2", r["faults"]).replace("+", ", ")
         delay = "known" if r["compensated"] == "True" else ""
-        lines.append(
-            f"| {faults} | {delay} | {float(r['return']):.2f} | {rate:.1f} (≤ {upper:.1f}) | {infeasible:.0f} |"
-        )
+        said = f"{float(r['return']):.2f} | {rate:.1f} (≤ {upper:.1f}) | {infeasible:.0f}"
+        lines.append(f"| {in_words(r['faults'])} | {delay} | {said} |")
     put("docs/stress.md", "filters", "\n".join(lines))
 
 

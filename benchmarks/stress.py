@@ -75,6 +75,11 @@ def name_of(faults: dict[str, Any]) -> str:
     return "+".join(f"{k}{v}" for k, v in faults.items()) or "none"
 
 
+def in_words(name: str) -> str:
+    """`delay2+drop0.3` as delay 2, drop 0.3."""
+    return re.sub(r"([a-z])([\d.]+)", r"\1 \2", name).replace("+", ", ")
+
+
 def guard_of(options: dict[str, Any]) -> str:
     return ", ".join(["shield", *(f"{k} {v}" for k, v in options.items())])
 
@@ -169,10 +174,9 @@ def write_table(out: Path) -> None:
             100 * float(x)
             for x in (float(r["return"]) / base, r["violation_rate"], r["violation_upper"], r["infeasible_rate"])
         )
-        faults = re.sub(r"([a-z])([\d.]+)", r"\1 \2", r["faults"]).replace("+", ", ")
         guard = r["guard"].replace("shield", "compensated", 1) if r["compensated"] == "True" else r["guard"]
         cells = [
-            faults,
+            in_words(r["faults"]),
             guard.replace("_", " "),
             r["episodes"],
             f"{float(r['return']):.2f}",

@@ -17,6 +17,8 @@ from ringfence.evaluation.replay.result import Film
 from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
 from ringfence.faults import Faults
+from ringfence.guards.policy import build
+from ringfence.guards.wrap import Nothing
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import replay_page
 from ringfence.world import save
@@ -289,6 +291,16 @@ def test_the_driven_agent_has_faults_and_the_others_none():
     assert np.abs(np.diff(plain[:, :3], 2, axis=1)).max() > 1e-3
     gained = [np.linalg.norm(np.diff(place, axis=1), axis=-1) for place in (late[:, 3:5], plain[:, :2])]
     np.testing.assert_allclose(*gained, atol=1e-5)
+
+
+def test_a_guard_of_a_team_decides_for_the_driven_agent_alone(close):
+    store, world = close
+    stage = stage_of(store)
+    team = build(Nothing(), world, None, "shield", "learned", anyway=True)
+    assert not world.alone and team.driven is None
+    driven = np.asarray(stage._of_one(team).driven)
+    np.testing.assert_array_equal(driven.argmax(1), stage.windows.driven)
+    assert (driven.sum(1) == 1).all()
 
 
 def test_whatever_is_relative_to_a_driven_agent_moves_with_it_and_what_no_name_explains_is_said():

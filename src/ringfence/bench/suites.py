@@ -9,6 +9,8 @@ from ringfence.bench.stressed import Trial
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.envs.proving.suite import TEST
+from ringfence.evaluation.stress import known_to_guards
+from ringfence.faults import Faults
 from ringfence.loading.spec import PolicySpec
 from ringfence.proposals.options import DEFAULT
 
@@ -75,10 +77,9 @@ _FAULTS = (
     "delay2+drop0.3+noise0.005+gain0.8+asynchrony0.5",
     "delay3+drop0.6+noise0.02+gain0.6+asynchrony0.667",
 )
-_KNOWN = ("delay", "jitter", "drop", "asynchrony")
 _BEHIND = (
     *(Trial(spec, faults) for spec in _ALONE for faults in _FAULTS),
-    *(Trial("shield-learned", faults, compensated=True) for faults in _FAULTS if faults.startswith(_KNOWN)),
+    *(Trial("shield-learned", faults, compensated=True) for faults in _FAULTS if known_to_guards(Faults.parse(faults))),
 )
 _RIVALS = ("bc-best", "bc-return", "bc-safe", "ma-td3bc", "ma-td3bc-lag", "omar")  # of a planner
 

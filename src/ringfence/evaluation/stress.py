@@ -149,6 +149,11 @@ def _steps_between(faults: Faults) -> float:
     return max(1 / (1 - faults.asynchrony), 1 / (1 - faults.drop))
 
 
+def known_to_guards(faults: Faults) -> bool:
+    """Whether a guard that knows of these faults has other options than one that does not."""
+    return bool(compensation(faults, {"guard": "shield"})) or _steps_between(faults) > 1
+
+
 def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
     """What faults alone say to a guard, as its options."""
     guarded = options.get("guard", "none") != "none"
