@@ -464,6 +464,25 @@ def test_one_controller_for_a_run_or_a_callable(small_world, tmp_path):
             Controller(idle, **wrong)
 
 
+def test_a_controller_may_decide_for_some_of_a_team(small_world, small_store):
+    """The others do what is proposed of them, and what is said of a step is said of those for whom it decides."""
+    seen, state = small_store.observations[5], small_store.state[5]
+
+    def still(*_):
+        return np.zeros((3, 2))
+
+    strict = {"world": small_world, "margin": 50.0}
+    team = Controller(still, **strict)
+    moved = np.abs(team.act(seen, state)).max(1)
+    assert (moved > 1e-3).all()
+    pilot = Controller(still, driven=1, **strict)
+    np.testing.assert_array_equal(np.abs(pilot.act(seen, state)).max(1) > 1e-3, [False, True, False])
+    assert pilot.info["clearance"] == pilot.info["agent_clearance"][1]
+    for wrong in (3, [0, -1], 1.0, []):
+        with pytest.raises(UserError, match="must be agents, from 0 to 2"):
+            Controller(still, driven=wrong, **strict)
+
+
 def test_names_of_before_in_guards_say_those_of_today(small_world):
     with pytest.warns(FutureWarning, match=r"ringfence\.guards\.Pilot is called ringfence\.Controller now"):
         assert guards.Pilot is Controller

@@ -10,15 +10,20 @@ from msgspec.structs import replace
 import ringfence
 from ringfence.cli import app
 from ringfence.errors import UserError
+from ringfence.evaluation.certify import certify
 from ringfence.evaluation.replay import judge
-from ringfence.evaluation.replay.judge import Played, check_view, radius_of, rows_of
+from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film
 from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
+from ringfence.evaluation.replay.trials import Windowed
+from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults
+from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
+from ringfence.loading.controller import Controller
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import replay_page
 from ringfence.world import save
@@ -279,6 +284,81 @@ def test_a_run_is_replayed_under_every_filter(close, tmp_path):
     assert names == [(policy, filter) for policy in ("bc", "seek") for filter in filters]
     for row in result.rows:
         assert row.contacts == row.alone - row.prevented + row.caused
+
+
+@pytest.fixture(scope="module")
+def cloned(close, tmp_path_factory):
+    (run,) = ringfence.train("bc", close[0], out=tmp_path_factory.mktemp("cloned"), changes={"num_updates": 5})
+    return run
+
+
+WINDOWS = {"radius": 0.1, "steps": 20, "every_episode": True, "anyway": True, "horizon": 3, "terminal_value": False}
+
+
+def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned, tmp_path, capsys):
+    """The margin is calibrated on one half of the logs, and the bound is counted on the other."""
+    store, world = close
+    save(world, tmp_path / "world.safetensors")
+    store.save(tmp_path / "walkers.h5")
+    given = {"world": world, "quantile": 0.9, "calibration": 9, "episodes": 10, **WINDOWS}
+    made = certify(cloned, {"delay": 1}, logs=store, **given)
+    assert made.guard["delay"] == 1 and made.episodes == 10 and made.rounds[0]["episodes"] == 9
+    assert made.bound == pytest.approx(upper_bound(made.violations, 10))
+    about = {"windows": [9, 10], "seconds": 2.0, "kinematics": "double_integrator", "radius": 0.1}
+    assert about.items() <= made.replayed.items()
+    file = made.save(tmp_path / "cert.json")
+    assert Certificate.load(file) == made
+    assert any("one agent is driven" in line for line in made.summary())
+    how = {"guard": "shield", "world": world, "anyway": True, "horizon": 3, "terminal_value": False}
+    controller = Controller(cloned, certificate=file, delay=1, driven=1, **how)
+    controller.act(store.observations[0])
+    assert "covered" in controller.info
+    with pytest.raises(UserError, match="decides for 1 of 2 agents, and this one decides for 2; say for whom"):
+        Controller(cloned, certificate=file, delay=1, **how)
+    for wrong, words in (
+        ({"logs": None}, "radius is of replays; give logs="),
+        ({"logs": None, **dict.fromkeys(("radius", "steps")), "every_episode": False}, r"logs that are replayed"),
+        ({"calibration": 5}, "calibration=5 episodes tell no quantile of 0.9; give 9 or more"),
+        ({"steps": STEPS, "every_episode": False}, "The first half of these logs has . windows"),
+    ):
+        with pytest.raises(UserError, match=words):
+            certify(cloned, {}, **{"logs": store, **given, **wrong})
+    command = ["certify", str(cloned.path), "--logs", str(tmp_path / "walkers.h5"), "--out", str(file), "--anyway"]
+    command += ["--quantile", "0.9", "--calibration", "9", "--episodes", "10", "--steps", "20", "--every-episode"]
+    command += ["--world", str(tmp_path / "world.safetensors"), "--radius", "0.1", "--delay", "1", "--horizon", "3"]
+    app.main([*command, "--set", "terminal_value=false"])
+    assert "windows violate" in capsys.readouterr().out
+    assert Certificate.load(file).violations == made.violations
+
+
+def test_windows_are_halved_by_the_order_of_logs_and_what_was_foreseen_is_compared_with_what_came(close, cloned):
+    store, world = close
+    body = Body(radius=0.1, steps=20, every_episode=True)
+    windowed = Windowed.of(store, cloned, world, body, Faults(), 100, 100, 1, True)
+    first, second = (set(zip(w.episode, w.start)) for w in (windowed.calibration.windows, windowed.test.windows))
+    assert first and max(first) < min(second)
+    guard = build(Nothing(), world, None, "shield", "learned", anyway=True, horizon=3, margin=-50.0)
+    driven = windowed.test.play("straight", guard)
+    came = windowed.test.scores(guard.guard, driven)
+    foreseen = driven.info["next_clearance"]
+    assert came.shape == foreseen.shape == (windowed.test.windows.count, 20)
+    error = [np.abs(foreseen[:, : 20 - lag] - came[:, lag:]).mean() for lag in range(3)]
+    assert np.argmin(error) == 0
+
+
+def test_a_replayed_guard_that_knows_of_faults_has_the_options_for_them(close, cloned, monkeypatch):
+    store, world = close
+    guards = []
+    monkeypatch.setattr(judge, "_played", lambda stage, players, filters, *_: guards.append(filters["shield"]) or [])
+    monkeypatch.setattr(judge, "rows_of", lambda *_: [])
+    for run in (None, cloned):
+        given = {"world": world, "radius": 0.1, "baselines": False, "anyway": True, "every_episode": True}
+        result = ringfence.replay(run, store, faults={"delay": 1, "drop": 0.2}, compensate=True, **given)
+        options = guards.pop().guard.options
+        assert options.delay == 1 and options.max_age > 0
+        assert "which the guard knows" in result.notes[0]
+    with pytest.raises(UserError, match="compensate is read by nothing without a guard"):
+        ringfence.replay(None, store, radius=0.1, guard="none", faults={"delay": 1}, compensate=True)
 
 
 def test_the_driven_agent_has_faults_and_the_others_none():

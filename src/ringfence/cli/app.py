@@ -21,6 +21,7 @@ from ringfence.cli.doctor import doctor
 from ringfence.cli.faults import NO_FAULTS, Wrong
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
 from ringfence.cli.renamed import rewritten
+from ringfence.cli.replaying import AS_LOGGED, Replayed
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
 from ringfence.utils.escape import lines, terminal
@@ -366,10 +367,14 @@ def certify(
     quantile: float = 0.95,
     calibration: int = 100,
     episodes: int = 300,
+    logs: str | None = None,
+    replaying: Replayed = AS_LOGGED,
     playing: How = AS_IT_IS,
 ) -> None:
     """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
     it. The guard knows of late actions, old observations and held actions. docs/stress.md says what is promised.
+
+    Without a simulator, windows of logs are replayed in the place of episodes (--logs), and the certificate says so.
 
     Args:
         run: a run folder.
@@ -378,6 +383,7 @@ def certify(
         quantile: of episodes, whose shortfall the margin is to cover.
         calibration: episodes of each batch that the margin is calibrated on.
         episodes: fresh ones, for the bound.
+        logs: a store of its task, which is replayed: its first half calibrates the margin, its second gives the bound.
     """
     from ringfence.evaluation.certify import certify as run_certify
 
@@ -390,6 +396,7 @@ def certify(
     if len(found) > 1:
         raise UserError(f"'{run}' holds {len(found)} runs, and a certificate is of one; name it, e.g. {found[0].path}.")
     given |= {"confidence": confidence, "quantile": quantile, "calibration": calibration, "episodes": episodes}
+    given |= replaying.arguments() | {"logs": None if logs is None else _store(logs)}
     made = run_certify(found[0], faults, quiet=False, **given)
     for line in made.summary():
         out.print(lines(line), soft_wrap=True)
@@ -496,16 +503,13 @@ def ope(
 def replay(
     run: Positional[Path],
     data: Positional[str],
-    kinematics: Literal["double_integrator", "holonomic", "unicycle", "bicycle", "world"] | None = None,
-    wheelbase: float = 2.7,
-    radius: float | None = None,
     windows: int = 300,
-    steps: int | None = None,
-    every_episode: bool = False,
     seed: int = 0,
     out_file: Annotated[Path | None, tyro.conf.arg(name="out")] = None,
     report: Path | None = None,
     wrong: Wrong = NO_FAULTS,
+    compensate: bool = False,
+    replaying: Replayed = AS_LOGGED,
     playing: How = Playing(guard="shield"),  # noqa: B008
 ) -> None:
     """Judge a policy and its guard by logs alone: one agent is driven, the others do what they did. Contacts without
@@ -514,36 +518,24 @@ def replay(
     Args:
         run: folder of a trained run, or the file of a World, which then guards the bad drivers alone.
         data: a store of its task, best one that neither was trained on (or a task, whose data set is regenerated).
-        kinematics: how the driven agent moves; by default a double integrator where that explains the logs, else the
-            World's.
-        wheelbase: m, of a bicycle.
-        radius: m between two agents below which they touch; by default the task's formula, else as costs tell it, else
-            the World's causes.
         windows: at most so many, drawn evenly.
-        steps: of a window; 8 s by default.
-        every_episode: replay the episodes that the World learned from, too.
         seed: of what policies draw.
         out_file: write the result as JSON.
         report: write an HTML page.
+        compensate: tell the guard of the faults, as `ringfence stress` does.
     """
     from ringfence.evaluation.replay import replay as replayed
     from ringfence.report.replay_page import build_replay
     from ringfence.training.runs import write_json
 
-    given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults()}
+    given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults(), "compensate": compensate}
     out_file = None if out_file is None else writable(out_file)
     report = None if report is None else writable(report)
     policy = None if run.is_file() else _runs([run])[0]
     if policy is None:
         given["world"] = playing.world or run
-    how: dict[str, Any] = {
-        "kinematics": kinematics,
-        "wheelbase": wheelbase,
-        "radius": radius,
-        "windows": windows,
-        "steps": steps,
-    }
-    result = replayed(policy, _store(data), seed=seed, every_episode=every_episode, quiet=False, **how, **given)
+    given |= replaying.arguments() | {"windows": windows, "seed": seed, "quiet": False}
+    result = replayed(policy, _store(data), **given)
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if out_file is not None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import jax
@@ -21,14 +22,18 @@ import numpy as np
 from ringfence.datasets.task import Task
 from ringfence.envs.base import NativeEnv
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.replay.judge import Body
+from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator, compensated
+from ringfence.evaluation.trials import Part, Trials, shortfall
 from ringfence.faults import Faults, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
+from ringfence.logs.store import EpisodeStore
 from ringfence.problem.homogeneous import local_features
 from ringfence.training.runs import Run
 from ringfence.types import Array
@@ -38,8 +43,8 @@ from ringfence.utils.precision import in_float32
 MAX_ROUNDS = 4  # of calibration
 WIDEST = 6.0  # margin: at more a guard does little but stand
 BOUND_ELSEWHERE = (
-    "and certificates need a simulator of `ringfence tasks`; in one of your own, `violation_upper` of `ringfence play` "
-    "is the bound that can be had."
+    "and certificates need a simulator of `ringfence tasks`, or logs that are replayed (--logs); in a simulator of "
+    "your own, `violation_upper` of `ringfence play` is the bound that can be had."
 )
 
 
@@ -54,6 +59,12 @@ def certify(
     calibration: int = 100,
     episodes: int = 300,
     compensate: bool = True,
+    logs: EpisodeStore | None = None,
+    kinematics: str | None = None,
+    wheelbase: float = Body.wheelbase,
+    radius: float | None = None,
+    steps: int | None = None,
+    every_episode: bool = False,
     quiet: bool = True,
     **options: Any,
 ) -> Certificate:
@@ -62,28 +73,47 @@ def certify(
     `calibration` episodes of each batch (validation resets) give the margin: the `quantile` of their shortfalls, where
     it is above the guard's own. `episodes` fresh ones (test resets) give the bound at the given `confidence`. Other
     options are as in `load` and `stress`.
+
+    With `logs` these are windows in which the run drives one agent and the others do what they did, at most so many:
+    the margin is calibrated on the first half of the logs, and the second half gives the bound. `kinematics`,
+    `wheelbase`, `radius`, `steps` and `every_episode` are as in `replay`.
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
-    _check(confidence, quantile, calibration, episodes)
+    least = _check(confidence, quantile, calibration, episodes)
+    body = Body(kinematics, wheelbase, radius, steps, every_episode)
     options = {**options, "guard": guard}
     keep_programs()
-    check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
+    if logs is None:
+        _refuse_unread(body)
+        check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
     if compensate:
         options = compensated(run, faults, options)
     resolved = _resolved(run, options)
+    trials: Simulated | Windowed
+    if logs is None:
+        if isinstance(resolved.job.task.simulator, NativeEnv):
+            raise UserError(
+                f"'{resolved.job.task.name}' steps outside JAX, where nothing is certified yet; give logs=, which are "
+                "replayed."
+            )
+        trials = Simulated(faults, {"calibration": calibration, "test": episodes}, quiet)
+    else:
+        world = _guard(resolved).world
+        trials = Windowed.of(logs, resolved.run, world, body, faults, calibration, episodes, least, quiet)
     rounds: list[dict[str, float]] = []
     agreed = False
     while len(rounds) < MAX_ROUNDS and not agreed:
         margin = _guard(resolved).options.margin
-        played = _played(resolved, faults, calibration, "validation", len(rounds), quiet)
-        found = conformal(shortfalls(resolved, played), quantile)
-        rounds.append({"margin": margin, "quantile": found, "episodes": calibration})
+        played = trials.play(resolved, "calibration", len(rounds))
+        found = conformal(played.shortfall, quantile)
+        rounds.append({"margin": margin, "quantile": found, "episodes": len(played.violated)})
         agreed = found <= margin
         if not agreed and (len(rounds) == MAX_ROUNDS or margin >= WIDEST):
             break
         if not agreed:
             resolved = _resolved(run, {**options, "margin": round(min(found, WIDEST), 3)})
-    return _tested(resolved, faults, rounds, agreed, confidence, _played(resolved, faults, episodes, "test", 1, quiet))
+    tested = trials.play(resolved, "test", 1)
+    return _promised(resolved, faults, rounds, agreed, confidence, tested, trials.about)
 
 
 def conformal(scores: np.ndarray, quantile: float) -> float:
@@ -93,13 +123,36 @@ def conformal(scores: np.ndarray, quantile: float) -> float:
     return float(np.sort(scores)[rank - 1]) if rank <= len(scores) else math.inf
 
 
+@dataclass(frozen=True)
+class Simulated:
+    """Episodes of a run's own simulator: validation resets to calibrate on, test resets to count."""
+
+    faults: Faults
+    episodes: Mapping[Part, int]
+    quiet: bool = True
+
+    def play(self, resolved: Resolved, part: Part, batch: int) -> Trials:
+        task = resolved.job.task
+        policy = under_faults(resolved.team, self.faults, task)
+        label = f"{task.name} behind {self.faults.name}, margin {_guard(resolved).options.margin:.3g}"
+        split = "test" if part == "test" else "validation"
+        seed = resolved.run.config["seed"]
+        count = self.episodes[part]
+        played = rollout(policy, task.simulator, count, split, seed, 0, label, self.quiet, batch, foreseen=True)
+        violated = played["costs"].sum(1) > 0
+        return Trials(violated, shortfalls(resolved, played), float(played["infeasible"].mean()))
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """Nothing but episodes."""
+        return {}
+
+
 def shortfalls(resolved: Resolved, played: Played) -> np.ndarray:
     """(E,) by how much the states that actions led to scored less than was foreseen, at worst; 0 where never."""
     guard = _guard(resolved)
-    late = guard.options.delay
-    foreseen = played[FORESEEN][:, : played[FORESEEN].shape[1] - late]
-    came = judged(guard, resolved.job.task, played["states"])[:, late:]
-    return np.maximum(foreseen - came, 0.0).max(1)
+    came = judged(guard, resolved.job.task, played["states"])
+    return shortfall(played[FORESEEN], came, guard.options.delay)
 
 
 def judged(guard: Guard, task: Task, states: np.ndarray) -> np.ndarray:
@@ -117,7 +170,8 @@ def judged(guard: Guard, task: Task, states: np.ndarray) -> np.ndarray:
     return np.stack([np.asarray(of_episode(jnp.asarray(one))) for one in states])
 
 
-def _check(confidence: float, quantile: float, calibration: int, episodes: int) -> None:
+def _check(confidence: float, quantile: float, calibration: int, episodes: int) -> int:
+    """The least number of episodes that tell the quantile."""
     for name, value in (("confidence", confidence), ("quantile", quantile)):
         if not 0 < value < 1:
             raise UserError(f"{name}={value} must lie between 0 and 1; 0.95 is usual.")
@@ -126,6 +180,13 @@ def _check(confidence: float, quantile: float, calibration: int, episodes: int) 
     least = math.ceil(quantile / (1 - quantile) - 1e-9)
     if calibration < least:
         raise UserError(f"calibration={calibration} episodes tell no quantile of {quantile:g}; give {least} or more.")
+    return least
+
+
+def _refuse_unread(body: Body) -> None:
+    given = [f.name for f in dataclasses.fields(body) if getattr(body, f.name) != f.default]
+    if given:
+        raise UserError(f"{given[0]} is of replays; give logs=, the store that is replayed, or leave it out.")
 
 
 def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
@@ -134,8 +195,6 @@ def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
         raise UserError("A certificate is of a guarded run; name a guard with guard=, e.g. shield.")
     if resolved.guard.options.adapt:
         raise UserError("An adapting margin cannot be frozen; certify a guard whose margin stays, e.g. shield.")
-    if isinstance(resolved.job.task.simulator, NativeEnv):
-        raise UserError(f"'{resolved.job.task.name}' steps outside JAX, where nothing is certified yet.")
     return resolved
 
 
@@ -144,21 +203,18 @@ def _guard(resolved: Resolved) -> Guard:
     return resolved.guard
 
 
-def _played(resolved: Resolved, faults: Faults, episodes: int, split: str, batch: int, quiet: bool) -> Played:
-    task = resolved.job.task
-    policy = under_faults(resolved.team, faults, task)
-    margin = _guard(resolved).options.margin
-    label = f"{task.name} behind {faults.name}, margin {margin:.3g}"
-    seed = resolved.run.config["seed"]
-    return rollout(policy, task.simulator, episodes, split, seed, 0, label, quiet, batch, foreseen=True)
-
-
-def _tested(
-    resolved: Resolved, faults: Faults, rounds: list[dict[str, float]], agreed: bool, confidence: float, played: Played
+def _promised(
+    resolved: Resolved,
+    faults: Faults,
+    rounds: list[dict[str, float]],
+    agreed: bool,
+    confidence: float,
+    tested: Trials,
+    replayed: dict[str, Any],
 ) -> Certificate:
     guard = _guard(resolved)
-    violations = int((played["costs"].sum(1) > 0).sum())
-    episodes = len(played["costs"])
+    violations = int(tested.violated.sum())
+    episodes = len(tested.violated)
     return Certificate(
         policy=digest(resolved.proposal),
         world=digest(guard.world),
@@ -173,6 +229,7 @@ def _tested(
         violations=violations,
         rounds=tuple(rounds),
         agreed=agreed,
-        held=float((shortfalls(resolved, played) <= guard.options.margin).mean()),
-        infeasible_rate=float(played["infeasible"].mean()),
+        held=float((tested.shortfall <= guard.options.margin).mean()),
+        infeasible_rate=tested.infeasible,
+        replayed=replayed,
     )

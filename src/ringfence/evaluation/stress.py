@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from ringfence.evaluation.evaluate import Split, about
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.faults import Faults
 from ringfence.faults.certificate import digest
+from ringfence.guards import Guard
 from ringfence.guards.correction import ASKED
 from ringfence.guards.policy import rows_foreseen
 from ringfence.loading.resolve import load_job, resolve
@@ -33,6 +34,7 @@ STRESSED_ELSEWHERE = (
     "so `ringfence stress` has nothing to play in; play it behind faults in a simulator of your own: `ringfence play "
     "RUN --env FILE.py:NAME --delay 2`."
 )
+GuardOf = Callable[[PolicySpec], Guard]
 MAX_AGE = 8  # steps up to which a compensating guard makes good for observations that were lost
 
 
@@ -78,7 +80,7 @@ def stress_spec(
     resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
     kept = results(resolved.run)
-    name = f"{resolved.variant(split)} behind {faults.name}"
+    name = f"{resolved.variant(split)} behind {faults.name}" + (", which it knows" if compensate else "")
     seed = resolved.run.config["seed"]
     result, _ = evaluate_policy(
         resolved.team, resolved.job.task, episodes, split, seed, 0, f"{resolved.job.task.name} {name}", quiet, faults
@@ -106,18 +108,26 @@ def results(run: Run) -> dict[str, dict[str, Any]]:
     return schemas.read(file, dict[str, dict[str, Any]], "is damaged; delete that file") if file.exists() else {}
 
 
-def compensated(run: Run | str, faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a guard that knows of faults."""
+def compensated(
+    run: Run | str | None, faults: Faults, options: Mapping[str, Any], guard_of: GuardOf | None = None
+) -> dict[str, Any]:
+    """Options of a guard that knows of faults; `guard_of` makes that of a spec without a run."""
     compensation(faults, options)  # what cannot be is refused in these words first
-    return {**options, **_missing_options(PolicySpec.of(run, **options), faults)}
+    return {**options, **_missing_options(PolicySpec.of(run, **options), faults, guard_of or _guard_of_run)}
 
 
 def compensated_spec(spec: PolicySpec, faults: Faults) -> PolicySpec:
     """The same choices with a guard that knows of faults."""
-    return spec.with_guard_options(**_missing_options(spec, faults))
+    return spec.with_guard_options(**_missing_options(spec, faults, _guard_of_run))
 
 
-def _missing_options(spec: PolicySpec, faults: Faults) -> dict[str, Any]:
+def _guard_of_run(spec: PolicySpec) -> Guard:
+    guard = resolve(spec).guard
+    assert guard is not None, "checked before"
+    return guard
+
+
+def _missing_options(spec: PolicySpec, faults: Faults, guard_of: GuardOf) -> dict[str, Any]:
     """Options of a spec's guard that it lacks to know of faults, for the World that it reads."""
     given = dict(spec.guard_options)
     found = compensation(faults, {"guard": spec.guard, **given})
@@ -125,8 +135,7 @@ def _missing_options(spec: PolicySpec, faults: Faults) -> dict[str, Any]:
     seldom = _steps_between(faults) > 1 and not {"horizon", "horizon_seconds"} & {*given}
     if not late and not seldom:
         return found
-    guard = resolve(spec).guard
-    assert guard is not None, "checked before"
+    guard = guard_of(spec)
     if "max_age" in found:
         found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", 0), 0))
     if late and "others_acceleration" not in given:

@@ -36,19 +36,33 @@ class Certificate:
     agreed: bool  # whether the last quantile was below the margin in use
     held: float  # share of tested episodes whose shortfall was within the margin
     infeasible_rate: float
+    # where windows of logs were replayed: digest of the logs, windows (calibrated, tested), seconds, kinematics, radius
+    replayed: dict[str, Any] = dataclasses.field(default_factory=dict)
     format: int = FORMAT
 
     def summary(self) -> tuple[str, ...]:
         """What it says, a sentence each."""
         behind = ", ".join(f"{name} {value}" for name, value in self.faults.items()) or "no faults"
-        agreed = "a fresh batch agreed with it" if self.agreed else "no fresh batch agreed with it"
+        again = "the same windows" if self.replayed else "a fresh batch"
+        agreed = f"{again} agreed with it" if self.agreed else f"{again} did not agree with it"
+        what = "windows" if self.replayed else "episodes"
         return (
-            f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of episodes violate: "
+            f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of {what} violate: "
             f"{self.violations} of {self.episodes} fresh ones did.",
             f"Behind {behind}; {self.task}, {self.agents} agents, barrier {self.barrier}.",
             f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batches; {agreed}.",
-            f"In {100 * self.held:.1f} % of the fresh episodes reality fell short of foresight by no more than that.",
-            "It holds for episodes drawn as these were, not for each state, another simulator or an adversary.",
+            f"In {100 * self.held:.1f} % of the fresh {what} reality fell short of foresight by no more than that.",
+            *self._replay(),
+            f"It holds for {what} drawn as these were, not for each state, another simulator or an adversary.",
+        )
+
+    def _replay(self) -> tuple[str, ...]:
+        if not self.replayed:
+            return ()
+        return (
+            f"Logs were replayed in windows of {self.replayed['seconds']:.3g} s: one agent is driven "
+            f"({self.replayed['kinematics']}), the others do what they did and do not react, and a violation is to "
+            f"come nearer than {self.replayed['radius']:.3g} m. Windows of one log are no independent draws.",
         )
 
     def save(self, path: str | Path) -> Path:

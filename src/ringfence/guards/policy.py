@@ -140,11 +140,12 @@ class Guarded(HadStart, eqx.Module):
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
-            "clearance": found.safety.min(-1),
-            "next_clearance": found.first.min(-1),
-            "infeasible": found.short.any(-1),
-            "ood": found.ood.any(-1),
+            "clearance": self._driven(found.safety, jnp.inf).min(-1),
+            "next_clearance": self._driven(found.first, jnp.inf).min(-1),
+            "infeasible": self._driven(found.short, False).any(-1),
+            "ood": self._driven(found.ood, False).any(-1),
             "agent_clearance": found.safety,
+            "agent_next_clearance": found.first,
             "agent_infeasible": found.short,
             "agent_ood": found.ood,
             **proof,
@@ -164,6 +165,10 @@ class Guarded(HadStart, eqx.Module):
             "age": carry["age"] + 1,
         }
         return carry, PolicyStep(normalise.from_unit(action, spec.action_low, spec.action_high), info)
+
+    def _driven(self, x: Array, nothing: float | bool) -> Array:
+        """(B, N) of those for whom it is decided, and nothing of the others."""
+        return x if self.driven is None else jnp.where(self.driven, x, nothing)
 
     def _with_proof(
         self, carry: PyTree, acting: Array, plan: Array, unseen: Array | None

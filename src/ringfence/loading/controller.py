@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, cast
@@ -16,7 +16,7 @@ import numpy as np
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
-from ringfence.guards.wrap import Callback, guarded_of, under_guard
+from ringfence.guards.wrap import Callback, guarded_of, under_guard, with_guarded
 from ringfence.loading.evidence import Evidence, explaining
 from ringfence.loading.resolve import load
 from ringfence.loading.stamps import Stamps
@@ -64,6 +64,9 @@ class Controller:
     when it is not: report (`info["alarm"]`), stop (refuse to act), widen (half as much margin again), or hand_over (to
     `fallback`, a callable (observations, state) -> actions that nothing guards).
 
+    driven: who acts by this controller, where a team's guard is that of one agent among others (or some): it decides
+    for them alone, and expects of the others what is proposed for them. `info["agent_infeasible"]` is of them, too.
+
     log: a file, to which a record of every step is added before its action is returned: what was requested and what
     is executed, why, how old the observations were, whether it was covered (docs/stress.md). Each record holds a digest
     of the one before; `evidence.last` is that of the last one. `close()` ends the log.
@@ -79,6 +82,7 @@ class Controller:
         on_alarm: str = "report",
         fallback: Fallback | None = None,
         clock: Callable[[], float] = time.monotonic,
+        driven: int | Sequence[int] | None = None,
         **options: Any,
     ):
         keep_programs()
@@ -92,6 +96,8 @@ class Controller:
         self._stamps = Stamps(clock)
         self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
         self._source = _source(run, planner, options)
+        if driven is not None:
+            self._source.policy = _deciding_for(driven, self._source)
         self.policy: Policy = self._source.policy
         self.certificate = promised
         if promised is not None:
@@ -336,6 +342,20 @@ def _source(run: Any, planner: str, options: dict[str, Any]) -> _TrainedRun | _F
     return _Function(found)
 
 
+def _deciding_for(driven: int | Sequence[int], source: _TrainedRun | _Function) -> Any:
+    """The source's policy under a guard that decides for some of the agents alone."""
+    guarded = guarded_of(source.policy)
+    if guarded is None:
+        raise UserError("driven says for whom a guard decides, and there is none; give guard=, or leave driven out.")
+    if guarded.guard.world.alone:
+        raise UserError("Here every agent guards itself, whoever acts; leave driven out, and act by its row alone.")
+    who = np.atleast_1d(np.asarray(driven))
+    if who.dtype.kind not in "iu" or who.ndim > 1 or not len(who) or not ((who >= 0) & (who < source.agents)).all():
+        raise UserError(f"driven={driven!r} must be agents, from 0 to {source.agents - 1}.")
+    acts = jnp.asarray(np.isin(np.arange(source.agents), who))[None]
+    return with_guarded(source.policy, dataclasses.replace(guarded, driven=acts))
+
+
 def _require(certificate: Certificate, source: _TrainedRun | _Function) -> None:
     """Refuse a certificate of anybody else."""
     guarded = guarded_of(source.policy)
@@ -344,6 +364,13 @@ def _require(certificate: Certificate, source: _TrainedRun | _Function) -> None:
     guard = guarded.guard
     options = dataclasses.asdict(guard.options)
     certificate.require(guarded.proposal, guard.world, source.agents, options, guard.barrier.source)
+    deciding = source.agents if guarded.driven is None else int(guarded.driven.sum())
+    promised = 1 if certificate.replayed and not guard.world.alone else source.agents
+    if deciding != promised:
+        raise UserError(
+            f"This certificate is of a guard that decides for {promised} of {source.agents} agents, and this one "
+            f"decides for {deciding}; say for whom with driven=, or certify what plays."
+        )
 
 
 def _batch(seen: Seen) -> Seen:

@@ -18,8 +18,10 @@ from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film, ReplayResult, Row
 from ringfence.evaluation.replay.scene import NOBODY, Motion, Names, motion_of, windows_of
 from ringfence.evaluation.replay.stage import Driven, Stage
+from ringfence.evaluation.rollout import FORESEEN
+from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
-from ringfence.guards import GUARDS
+from ringfence.guards import GUARDS, Guard
 from ringfence.guards.policy import Guarded, build
 from ringfence.guards.wrap import Nothing
 from ringfence.loading.resolve import resolve
@@ -62,6 +64,7 @@ def replay(
     anyway: bool = False,
     seed: int = 0,
     faults: Faults | Mapping[str, Any] | None = None,
+    compensate: bool = False,
     quiet: bool = True,
     **options: Any,
 ) -> ReplayResult:
@@ -76,36 +79,33 @@ def replay(
     `baselines` adds a brake that takes everybody's velocity for constant, and a guard that knows the formula, along
     2 s.
 
-    `faults` (`ringfence.stress`) lie between the driven agent's policy or guard and its body; a brake has none.
+    `faults` lie between the driven agent's policy or guard and its body, and `compensate` tells the guard of them,
+    both as in `ringfence.stress`; a brake has none.
 
     Others do not react: what drives into a driven agent from behind counts as its contact, too. Without `quiet` each
     driver under each filter shows its progress.
     """
     keep_programs()
     _check(drivers, guard, windows, steps, seed)
-    task = registry.from_store(store)
-    store = task.logs(store)
-    names = Names.of(store)
-    names.check(store.card.task)
     run = None if policy is None else Run.of(policy)
-    if run is not None and run.config["task"] != store.card.task:
-        raise UserError(f"The run is of '{run.config['task']}', the logs are of '{store.card.task}'; replay its own.")
+    logs = Logs.of(store, run)
+    store, names = logs.store, logs.names
+    faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     given: dict[str, Any] = {"barrier": barrier} if barrier else {}
     if world is not None:
         given["world"] = world if isinstance(world, World) else worlds.load(world)
-    guarded = _guarded(run, task, guard, given | options, anyway) if guard != "none" else None
+    given |= options
+    if compensate:
+        given |= _compensated(run, logs.task, guard, given, anyway, faults)
+    guarded = _guarded(run, logs.task, guard, given, anyway) if guard != "none" else None
     known_world = guarded.guard.world if guarded is not None else given.get("world")
-    if known_world is not None:
-        check_view(known_world, store)
-    motion = motion_of(store, names)
-    radius, source = radius_of(store, motion, radius, {} if known_world is None else known_world.card.causes)
-    faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
-    stage, left_out = _stage(
-        store, names, motion, known_world, kinematics, wheelbase, radius, steps, windows, every_episode, seed
-    )
-    stage = dataclasses.replace(stage, faults=faults)
+    how = Body(kinematics, wheelbase, radius, steps, every_episode)
+    stage, source, left_out = logs.stage(known_world, how, windows, seed, faults)
     filters = {} if guarded is None else {guard: Guarded(Nothing(), guarded.guard)}
-    notes: list[str] = [f"Behind faults: {faults.name}; a brake is not behind them."] if faults.given else []
+    notes: list[str] = []
+    if faults.given:
+        known_to = ", which the guard knows" if compensate else ""
+        notes.append(f"Behind faults: {faults.name}{known_to}; a brake is not behind them.")
     if guarded is not None and store.n_agents > 1 and not guarded.guard.world.alone:
         notes.append(
             "This guard is of a team and decides for the driven agent alone. Of others it expects what they do now, or "
@@ -115,13 +115,13 @@ def replay(
         kept = ", ".join(names.as_logged[:SHOWN]) + (", ..." if len(names.as_logged) > SHOWN else "")
         notes.append(f"Of a driven agent {kept} stay as logged: no name says how they follow from its motion.")
     if baselines and known_world is not None:
-        formula = _formula(known_world, radius, stage.windows.dt)
+        formula = _formula(known_world, stage.radius, stage.windows.dt)
         filters |= {"formula": formula} if formula else {}
         notes += [] if formula else ["The World's view holds no places of others: no row by the formula."]
     shown = _played(stage, _players(run, drivers), filters, baselines, quiet)
     return ReplayResult(
         task=store.card.task,
-        radius=float(radius),
+        radius=stage.radius,
         radius_from=source,
         kinematics=stage.kinematics.name,
         steps=stage.windows.steps,
@@ -134,6 +134,48 @@ def replay(
         notes=tuple(notes),
         films=tuple(film for one in shown if guard in one.under for film in [_film(stage, one, guard)])[:FILMS],
     )
+
+
+@dataclass(frozen=True)
+class Body:
+    """How windows are cut, and how the driven agent moves in them; None: as the logs tell."""
+
+    kinematics: str | None = None
+    wheelbase: float = 2.7  # m
+    radius: float | None = None  # m
+    steps: int | None = None
+    every_episode: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Logs:
+    """What is replayed, and what its entries are called."""
+
+    task: Task
+    store: EpisodeStore
+    names: Names
+
+    @classmethod
+    def of(cls, store: EpisodeStore, run: Run | None) -> Logs:
+        """Logs that can be replayed, and are of the run's task; others are refused."""
+        task = registry.from_store(store)
+        store = task.logs(store)
+        names = Names.of(store)
+        names.check(store.card.task)
+        if run is not None and run.config["task"] != store.card.task:
+            raise UserError(
+                f"The run is of '{run.config['task']}', the logs are of '{store.card.task}'; replay its own."
+            )
+        return cls(task, store, names)
+
+    def stage(self, world: World | None, how: Body, windows: int, seed: int, faults: Faults) -> tuple[Stage, str, int]:
+        """(the stage, where its radius is from, how many windows begin in contact)."""
+        if world is not None:
+            check_view(world, self.store)
+        motion = motion_of(self.store, self.names)
+        radius, source = radius_of(self.store, motion, how.radius, {} if world is None else world.card.causes)
+        stage, left_out = _stage(self.store, self.names, motion, world, how, radius, windows, seed)
+        return dataclasses.replace(stage, faults=faults), source, left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +223,19 @@ def _guarded(run: Run | None, task: Task, guard: str, options: dict[str, Any], a
         raise UserError("Nothing says which World guards; give world=, e.g. ringfence.fit(store), or a run.")
     changes = dict(spec.guard_options)
     return build(Nothing(), spec.world, task.hazard, guard, spec.barrier, anyway=anyway, **changes)
+
+
+def _compensated(
+    run: Run | None, task: Task, guard: str, given: dict[str, Any], anyway: bool, faults: Faults
+) -> dict[str, Any]:
+    """Options of a guard that knows of faults, beside those that it is given."""
+
+    def guard_of(spec: PolicySpec) -> Guard:
+        return _guarded(run, task, guard, given, anyway).guard
+
+    choices = given | {"guard": guard, "anyway": anyway}
+    found = compensated(run, faults, choices, guard_of)
+    return {name: value for name, value in found.items() if name not in choices}
 
 
 def _verdict(world: World | None) -> str | None:
@@ -236,23 +291,20 @@ def _stage(
     names: Names,
     motion: Motion,
     world: World | None,
-    kinematics: str | None,
-    wheelbase: float,
+    how: Body,
     radius: float,
-    steps: int | None,
     most: int,
-    every_episode: bool,
     seed: int,
 ) -> tuple[Stage, int]:
     """The stage, and how many windows begin in contact."""
     if store.card.dt is None:
         raise UserError(f"The card of '{store.card.task}' does not say how long a step takes; give it dt (s).")
     dt = float(store.card.dt)
-    chosen = np.arange(store.episodes) if every_episode else _unlearned(world, store)
+    chosen = np.arange(store.episodes) if how.every_episode else _unlearned(world, store)
     longest = int(np.median(store.lengths[chosen]))
-    steps = steps or max(1, min(round(SECONDS / dt), longest))
+    steps = how.steps or max(1, min(round(SECONDS / dt), longest))
     cut, left_out = windows_of(store, names, motion, chosen, steps, most, radius, dt)
-    body = kinematics_of(kinematics, store, motion, world, dt, wheelbase)
+    body = kinematics_of(how.kinematics, store, motion, world, dt, how.wheelbase)
     return Stage(cut, body, radius, seed), left_out
 
 
@@ -375,7 +427,7 @@ def _by_agent(driven: np.ndarray, found: Driven) -> tuple[dict[str, Any], ...]:
     made = []
     for agent in np.unique(driven):
         own = driven == agent
-        info = {name: float(value[own].mean()) for name, value in found.info.items()}
+        info = {name: float(value[own].mean()) for name, value in found.info.items() if name != FORESEEN}
         made.append({"agent": int(agent), "contacts": int(found.contact[own].sum()), **info})
     return tuple(made)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -209,6 +209,11 @@ class Windows:
             return mine[..., np.array(drift)] + self.velocity[:, :, None]
         moved = np.diff(self.others_at, axis=1) / self.dt
         return np.concatenate([moved, moved[:, -1:]], 1)
+
+    def only(self, which: np.ndarray) -> Windows:
+        """Some of the windows."""
+        of_each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("names", "sorted", "dt")}
+        return replace(self, **{name: None if x is None else x[which] for name, x in of_each.items()})
 
     def distances(self, t: int, place: np.ndarray) -> np.ndarray:
         """(W, K) m from places (W, X) to the others at row t."""

@@ -13,7 +13,9 @@ from ringfence.errors import UserError
 from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
 from ringfence.evaluation.replay.scene import Windows
+from ringfence.evaluation.rollout import FORESEEN
 from ringfence.faults import Faults, Faulty, behind
+from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import act_with, held, with_cost
 from ringfence.types import Array, Policy, PolicyStep, PyTree
@@ -21,7 +23,7 @@ from ringfence.utils.progress import Progress
 from ringfence.world import World
 
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (W, N, O) and state (W, S)
-TOLD = ("infeasible", "ood", "clearance")  # of a guard's info
+TOLD = ("infeasible", "ood", "clearance", FORESEEN)  # of a guard's info
 NO_FAULTS = Faults()
 _act = jax.jit(act_with)
 
@@ -29,6 +31,11 @@ _act = jax.jit(act_with)
 @jax.jit
 def _decided(guarded: Guarded, memory: Any, present: Array, actions: Array, key: Array) -> Any:
     return guarded.decided(memory, present, actions, key)
+
+
+@jax.jit
+def _scored(guard: Guard, before: Array, after: Array) -> Array:
+    return guard.barrier.now(before, after).min(-1)
 
 
 def _present(world: World, observations: Any, state: Any) -> Array:
@@ -69,6 +76,8 @@ class Driven:
     """What came of W windows."""
 
     place: np.ndarray  # (W, L+1, X) along X axes
+    velocity: np.ndarray  # (W, L+1, X)
+    heading: np.ndarray  # (W, L+1)
     contact: np.ndarray  # (W,) bool
     info: dict[str, np.ndarray] = field(default_factory=dict)  # (W, L)
 
@@ -105,7 +114,7 @@ class Stage:
         world = self.kinematics.world if self.kinematics.name == "world" else None
         foresee = None if world is None else foreseen_velocity(world)
         key = jax.random.key(self.seed)
-        places = [place]
+        rows = [(place, velocity, heading)]
         contact = np.zeros(w.count, bool)
         info: dict[str, list[np.ndarray]] = {}
         for t in range(w.steps):
@@ -126,11 +135,20 @@ class Stage:
             place, velocity, heading = self.kinematics.moved(place, velocity, heading, action, after)
             touches = w.distances(t + 1, place).min(-1) < self.radius
             contact |= touches
-            places.append(place)
+            rows.append((place, velocity, heading))
             memory = with_cost(actor, memory, jnp.asarray(touches, jnp.float32))
             if bar is not None:
                 bar.advance(1)
-        return Driven(np.stack(places, 1), contact, {k: np.stack(v, 1) for k, v in info.items()})
+        place, velocity, heading = (np.stack(each, 1) for each in zip(*rows))
+        return Driven(place, velocity, heading, contact, {k: np.stack(v, 1) for k, v in info.items()})
+
+    def scores(self, guard: Guard, driven: Driven) -> np.ndarray:
+        """(W, L) of the steps that the driven agents took, as a guard's barrier has it."""
+        w = self.windows
+        moments = zip(*(np.moveaxis(x, 1, 0) for x in (driven.place, driven.velocity, driven.heading)))
+        x = jnp.stack([_present(guard.world, *w.observed(t, *moment)) for t, moment in enumerate(moments)], 1)
+        scores = _scored(guard, x[:, :-1], x[:, 1:])
+        return np.asarray(scores)[np.arange(w.count), :, w.driven]
 
     def _of_one(self, guard: Guarded) -> Guarded:
         """A team's guard, which is told whose actions it decides; agents who are alone decide their own anyway."""
