@@ -4,10 +4,10 @@
 
 For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
 of a clone and of the naive driver: alone, under guards by what was learned, and by the oracle, which knows dynamics
-and distances. `--rows` names some of them (`ROWS`, `BESIDE` and `HORIZONS` below, of `bc` or `naive`); by default all
-of `ROWS` are played. Rows of the same World that a file holds already, of as many episodes or more, are not played
-again. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench proving-ground`
-plays everything with 500 episodes.
+and distances. `--rows` names some of them (`ROWS`, `BESIDE`, `HORIZONS` and `FILTERED` below, of `bc` or `naive`); by
+default all of `ROWS` are played. Rows of the same World that a file holds already, of as many episodes or more, are not
+played again. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench
+proving-ground` plays everything with 500 episodes.
 """
 
 import argparse
@@ -15,6 +15,7 @@ import json
 import time
 from pathlib import Path
 
+from _cbf import CbfQp, filtered
 from _common import machine
 
 import ringfence
@@ -24,6 +25,9 @@ from ringfence.envs import System
 from ringfence.envs.proving.suite import TEST
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.loading.resolve import resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.training import worlds
 
 COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
@@ -44,15 +48,23 @@ BESIDE = {
     ALL: LEARNED | {"world": "all"},
 }
 HORIZONS = {f"shield learned, {rows} rows": LEARNED | {"horizon": rows} for rows in (3, 15, 30)}
-OPTIONS = ROWS | BESIDE | HORIZONS
+# A classical filter that knows distances and dynamics (_cbf.py), where there is one.
+FILTERED = {"cbf-qp": {}}
+OPTIONS = ROWS | BESIDE | HORIZONS | FILTERED
 NAMES = [f"{driver} {row}" for row in OPTIONS for driver in ("bc", "naive")]  # in the order in which they are played
-OF_NO_WORLD = ("none", "shield oracle")  # rows that read none
+OF_NO_WORLD = ("none", "shield oracle", "cbf-qp")  # rows that read none
 USUAL = [f"{driver} {row}" for row in ROWS for driver in ("bc", "naive")]
 
 
-def played(run, options: dict, episodes: int) -> dict:
+def played(run, row: str, options: dict, episodes: int) -> dict:
     begun = time.perf_counter()
-    found = evaluate(run, episodes=episodes, **options)
+    if row in FILTERED:
+        resolved = resolve(PolicySpec.of(run))
+        task = resolved.job.task
+        policy = CbfQp(resolved.team, task.env)
+        found, _ = evaluate_policy(policy, task, episodes, "test", run.config["seed"])
+    else:
+        found = evaluate(run, episodes=episodes, **options)
     kept = {"episodes": episodes} | {name: found[name] for name in COLUMNS if name in found}
     return kept | {"seconds": round(time.perf_counter() - begun, 1)}
 
@@ -97,12 +109,14 @@ def system(task: str, runs: Path, episodes: int, names: list[str], file: Path) -
         found["networks on all entries"] = described(every.card)
     for name in names:
         driver, _, row = name.partition(" ")
+        if row in FILTERED and not filtered(TASKS[task].env):
+            continue
         if driver not in drivers or found["rows"].get(name, {}).get("episodes", 0) >= episodes:
             continue
         options = OPTIONS[row]
         given = options | {"world": every} if "world" in options else options
         try:
-            found["rows"][name] = played(trained[driver], given, episodes)
+            found["rows"][name] = played(trained[driver], row, given, episodes)
         except UserError as error:
             found["rows"][name] = {"episodes": episodes, "refused": str(error)}
         file.write_text(json.dumps(found, indent=1) + "\n")
