@@ -75,7 +75,7 @@ def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
     put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
-    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", short=False))
+    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", filtered=False))
     put("docs/crossing-results.md", "tiers", tiers())
     put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing-results.md", "proposals", proposals())
@@ -208,20 +208,21 @@ def other_simulator() -> str:
     return "\n".join(out)
 
 
-def proving(folder: Path, files: str, short: bool = True) -> str:
-    """Systems of the proving ground's kind, by their results; naive drivers also by a guard that looks three rows
-    ahead."""
-    beside = ("naive shield learned, 3 rows",) if short else ()
-    rows = ("bc none", "bc shield learned", "bc shield oracle", "naive none", "naive shield learned", *beside)
-    heads = ["system", "verdict", "causes found", "clone", "shield", "oracle", "naive", "shield"]
-    heads += ["shield, 3 rows"] * short + ["oracle"]
+def proving(folder: Path, files: str, filtered: bool = True) -> str:
+    """Systems of the proving ground's kind, by their results; `filtered` also by a filter that knows the formula."""
+    kinds = {"none": "", "shield learned": "shield", "cbf-qp": "CBF-QP", "shield oracle": "oracle"}
+    kinds = {row: head for row, head in kinds.items() if filtered or row != "cbf-qp"}
+    drivers = {"bc": "clone", "naive": "naive"}
+    rows = [f"{driver} {row}" for driver in drivers for row in kinds]
+    heads = ["system", "verdict", "causes found"]
+    heads += [head or driver for driver in drivers.values() for head in kinds.values()]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     for file in sorted(folder.glob(files)):
         found = json.loads(file.read_text())
         causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
         name = found["task"].removeprefix("proving-").removeprefix("other-")
         cells = [f"`{name}`", found["verdict"], "; ".join(causes) or "none"]
-        cells += [_share_and_return(found["rows"].get(row)) for row in (*rows, "naive shield oracle")]
+        cells += [_share_and_return(found["rows"].get(row)) for row in rows]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 

@@ -6,6 +6,7 @@ import dataclasses
 import html
 import shutil
 
+import jax
 import numpy as np
 import pytest
 
@@ -14,9 +15,17 @@ from ringfence.cli import app
 from ringfence.envs import SimpleSpread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
+from ringfence.evaluation.certify import certify
+from ringfence.evaluation.own_trials import Foresight
+from ringfence.evaluation.play import play_tables
+from ringfence.evaluation.player import player_of_run
+from ringfence.faults import Faults
+from ringfence.faults.certificate import Certificate
 from ringfence.loading import resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.training import loop
 from ringfence.training.runs import Run
+from ringfence.utils.progress import Progress
 
 TINY = {"num_updates": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -239,7 +248,7 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     "command, said",
     [
         (["stress", "--delay", "2", "--guard", "shield"], "`ringfence play RUN --env FILE.py:NAME --delay 2`"),
-        (["certify", "--delay", "2", "--out", "c.json"], "certificates need a simulator of `ringfence tasks`"),
+        (["certify", "--delay", "2", "--out", "c.json"], "a simulator of your own (--env FILE.py:NAME), or logs"),
     ],
 )
 def test_what_needs_a_simulator_from_here_says_what_to_do_without(run, command, said, capsys):
@@ -248,6 +257,64 @@ def test_what_needs_a_simulator_from_here_says_what_to_do_without(run, command, 
         app.main([name, str(run.path), *options])
     told = capsys.readouterr().err
     assert said in told and "`ringfence eval`" not in told
+
+
+LIGHT = {
+    "guard": "shield",
+    "anyway": True,
+    "horizon": 2,
+    "terminal_value": False,
+    "correction_steps": 2,
+    "correction_restarts": 0,
+}
+
+
+@pytest.fixture(scope="module")
+def guarded_run(small_store, tmp_path_factory):
+    """Cloning of the data that the World is of."""
+    return loop.train("bc", small_store, out=tmp_path_factory.mktemp("guarded"), changes=TINY, quiet=True)[0]
+
+
+def test_a_run_is_certified_in_a_simulator_of_ones_own(guarded_run, small_world, tmp_path):
+    Watched.books = []
+    given = {"quantile": 0.5, "calibration": 2, "episodes": 3, "world": small_world, **LIGHT}
+    made = certify(guarded_run, {"delay": 1}, make_env=Watched, **given)
+    books = np.array(Watched.books)[..., 1]  # (E, L) costs: 2 episodes of each batch, then those that are counted
+    assert len(books) == 2 * len(made.rounds) + 3
+    assert made.violations == (books[-3:].sum(1) > 0).sum() and made.episodes == 3
+    assert made.guard["delay"] == 1 and made.simulator.endswith(":Watched")
+    assert any(f"in {made.simulator}." in line for line in made.summary())
+    assert Certificate.load(made.save(tmp_path / "cert.json")) == made
+    with pytest.raises(UserError, match="give one of them"):
+        certify(guarded_run, {}, make_env=Watched, logs=guarded_run, **given)
+
+
+def test_what_was_foreseen_there_is_compared_with_what_came(guarded_run, small_world):
+    resolved = resolve.resolve(PolicySpec.of(guarded_run, world=small_world, **LIGHT))
+    guard = resolved.guard
+    rows = []
+
+    class Kept(Foresight):
+        def begin(self, observations, state):
+            rows.append(small_world.map(observations, state))
+            super().begin(observations, state)
+
+        def step(self, info, counts, observations, state):
+            rows.append(small_world.map(observations, state))
+            super().step(info, counts, observations, state)
+
+    tables = []
+    seen = Kept(guard, False)
+    with Progress("", 2, 0, quiet=True) as bar:
+        player = player_of_run(resolved, "test", Faults())
+        envs = [SimpleSpreadParallel() for _ in range(2)]
+        play_tables(tables, player, envs, range(2), None, jax.random.key(0), bar, watch_of=lambda: seen)
+    expected = [guard.barrier.now(a, b).min((1, 2)) for a, b in zip(rows, rows[1:])]
+    np.testing.assert_allclose(np.stack(seen.came, 1), np.stack(expected, 1), rtol=1e-5, atol=1e-5)
+    lacking = np.maximum(np.stack(seen.foreseen, 1) - np.stack(seen.came, 1), 0).max(1)
+    np.testing.assert_array_equal(seen.shortfall(), lacking)
+    seen.step({"next_clearance": np.full(2, 99.0)}, np.zeros(2, bool), *tables[0]._seen())
+    np.testing.assert_array_equal(seen.shortfall(), lacking, "after an episode's end nothing counts")
 
 
 def test_anybodys_function_under_guard_is_played(small_world):

@@ -292,7 +292,8 @@ def cloned(close, tmp_path_factory):
     return run
 
 
-WINDOWS = {"radius": 0.1, "steps": 20, "every_episode": True, "anyway": True, "horizon": 3, "terminal_value": False}
+SMALL = {"anyway": True, "horizon": 2, "terminal_value": False, "correction_steps": 2, "correction_restarts": 0}
+WINDOWS = {"radius": 0.1, "steps": 20, "every_episode": True, **SMALL}
 
 
 def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned, tmp_path, capsys):
@@ -309,7 +310,7 @@ def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned,
     file = made.save(tmp_path / "cert.json")
     assert Certificate.load(file) == made
     assert any("one agent is driven" in line for line in made.summary())
-    how = {"guard": "shield", "world": world, "anyway": True, "horizon": 3, "terminal_value": False}
+    how = {"guard": "shield", "world": world, **SMALL}
     controller = Controller(cloned, certificate=file, delay=1, driven=1, **how)
     controller.act(store.observations[0])
     assert "covered" in controller.info
@@ -317,7 +318,7 @@ def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned,
         Controller(cloned, certificate=file, delay=1, **how)
     for wrong, words in (
         ({"logs": None}, "radius is of replays; give logs="),
-        ({"logs": None, **dict.fromkeys(("radius", "steps")), "every_episode": False}, r"logs that are replayed"),
+        ({"logs": None, **dict.fromkeys(("radius", "steps")), "every_episode": False}, "or logs that are replayed"),
         ({"calibration": 5}, "calibration=5 episodes tell no quantile of 0.9; give 9 or more"),
         ({"steps": STEPS, "every_episode": False}, "The first half of these logs has . windows"),
     ):
@@ -325,8 +326,8 @@ def test_a_run_without_a_simulator_is_certified_by_replaying_logs(close, cloned,
             certify(cloned, {}, **{"logs": store, **given, **wrong})
     command = ["certify", str(cloned.path), "--logs", str(tmp_path / "walkers.h5"), "--out", str(file), "--anyway"]
     command += ["--quantile", "0.9", "--calibration", "9", "--episodes", "10", "--steps", "20", "--every-episode"]
-    command += ["--world", str(tmp_path / "world.safetensors"), "--radius", "0.1", "--delay", "1", "--horizon", "3"]
-    app.main([*command, "--set", "terminal_value=false"])
+    command += ["--world", str(tmp_path / "world.safetensors"), "--radius", "0.1", "--delay", "1", "--horizon", "2"]
+    app.main([*command, "--set", "terminal_value=false", "correction_steps=2", "correction_restarts=0"])
     assert "windows violate" in capsys.readouterr().out
     assert Certificate.load(file).violations == made.violations
 
@@ -337,7 +338,7 @@ def test_windows_are_halved_by_the_order_of_logs_and_what_was_foreseen_is_compar
     windowed = Windowed.of(store, cloned, world, body, Faults(), 100, 100, 1, True)
     first, second = (set(zip(w.episode, w.start)) for w in (windowed.calibration.windows, windowed.test.windows))
     assert first and max(first) < min(second)
-    guard = build(Nothing(), world, None, "shield", "learned", anyway=True, horizon=3, margin=-50.0)
+    guard = build(Nothing(), world, None, "shield", "learned", margin=-50.0, **SMALL)
     driven = windowed.test.play("straight", guard)
     came = windowed.test.scores(guard.guard, driven)
     foreseen = driven.info["next_clearance"]

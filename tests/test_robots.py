@@ -106,6 +106,14 @@ class Push(eqx.Module):
         return carry, PolicyStep(jnp.ones((*observations.shape[:2], 2)), {})
 
 
+class Foresees(Push):
+    """As a guard that foresees the same score in every step."""
+
+    def act(self, carry, observations, state, key):
+        carry, step = super().act(carry, observations, state, key)
+        return carry, step._replace(info={"next_clearance": jnp.full(len(observations), 0.5)})
+
+
 class Wait(Push):
     def act(self, carry, observations, state, key):
         return carry, PolicyStep(jnp.zeros((*observations.shape[:2], 4)), {})
@@ -124,6 +132,8 @@ def test_rollouts_stop_where_the_robot_falls(monkeypatch):
     ends = [int(np.flatnonzero(r)[-1]) + 1 for r in played["rewards"]]
     assert max(ends) < 150 and len(set(ends)) > 1
     assert played["steps"].tolist() == ends and played["terminated"].all()
+    foreseen = rollout.rollout(Foresees(), env, 6, foreseen=True)["next_clearance"]
+    np.testing.assert_array_equal(foreseen, np.where(np.arange(150) < played["steps"][:, None], 0.5, -np.inf))
     told = protocol.summarise(played, registry.get("ant_4x2-good"), np.zeros(6, bool))
     assert told["termination_rate"] == 1 and told["steps_mean"] == np.mean(ends)
     assert told["cost_rate"] == pytest.approx(played["costs"].sum() / sum(ends))

@@ -367,6 +367,7 @@ def certify(
     quantile: float = 0.95,
     calibration: int = 100,
     episodes: int = 300,
+    env: str | None = None,
     logs: str | None = None,
     replaying: Replayed = AS_LOGGED,
     playing: How = AS_IT_IS,
@@ -374,7 +375,8 @@ def certify(
     """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
     it. The guard knows of late actions, old observations and held actions. docs/stress.md says what is promised.
 
-    Without a simulator, windows of logs are replayed in the place of episodes (--logs), and the certificate says so.
+    Episodes are those of a simulator of your own (--env), or windows of logs that are replayed (--logs): then the
+    certificate says so.
 
     Args:
         run: a run folder.
@@ -383,9 +385,11 @@ def certify(
         quantile: of episodes, whose shortfall the margin is to cover.
         calibration: episodes of each batch that the margin is calibrated on.
         episodes: fresh ones, for the bound.
+        env: what makes a simulator of your own, as FILE.py:NAME or MODULE:NAME. It is run.
         logs: a store of its task, which is replayed: its first half calibrates the margin, its second gives the bound.
     """
     from ringfence.evaluation.certify import certify as run_certify
+    from ringfence.evaluation.simulators import simulator
 
     faults = wrong.faults()
     given = playing.arguments()
@@ -397,6 +401,7 @@ def certify(
         raise UserError(f"'{run}' holds {len(found)} runs, and a certificate is of one; name it, e.g. {found[0].path}.")
     given |= {"confidence": confidence, "quantile": quantile, "calibration": calibration, "episodes": episodes}
     given |= replaying.arguments() | {"logs": None if logs is None else _store(logs)}
+    given |= {"make_env": None if env is None else simulator(env)}
     made = run_certify(found[0], faults, quiet=False, **given)
     for line in made.summary():
         out.print(lines(line), soft_wrap=True)

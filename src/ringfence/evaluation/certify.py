@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,9 @@ import numpy as np
 
 from ringfence.datasets.task import Task
 from ringfence.envs.base import NativeEnv
+from ringfence.envs.episode import Cost
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.own_trials import Own
 from ringfence.evaluation.replay.judge import Body
 from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
@@ -43,8 +45,8 @@ from ringfence.utils.precision import in_float32
 MAX_ROUNDS = 4  # of calibration
 WIDEST = 6.0  # margin: at more a guard does little but stand
 BOUND_ELSEWHERE = (
-    "and certificates need a simulator of `ringfence tasks`, or logs that are replayed (--logs); in a simulator of "
-    "your own, `violation_upper` of `ringfence play` is the bound that can be had."
+    "and certificates need something to play in: a simulator of your own (--env FILE.py:NAME), or logs that are "
+    "replayed (--logs)."
 )
 
 
@@ -59,6 +61,8 @@ def certify(
     calibration: int = 100,
     episodes: int = 300,
     compensate: bool = True,
+    make_env: Callable[[], Any] | None = None,
+    cost: Cost | None = None,
     logs: EpisodeStore | None = None,
     kinematics: str | None = None,
     wheelbase: float = Body.wheelbase,
@@ -74,6 +78,8 @@ def certify(
     it is above the guard's own. `episodes` fresh ones (test resets) give the bound at the given `confidence`. Other
     options are as in `load` and `stress`.
 
+    With `make_env` these are episodes of a simulator of one's own, and `cost` is of its infos, both as in `play`.
+
     With `logs` these are windows in which the run drives one agent and the others do what they did, at most so many:
     the margin is calibrated on the first half of the logs, and the second half gives the bound. `kinematics`,
     `wheelbase`, `radius`, `steps` and `every_episode` are as in `replay`.
@@ -85,19 +91,18 @@ def certify(
     keep_programs()
     if logs is None:
         _refuse_unread(body)
+    if logs is None and make_env is None:
         check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
+    if logs is not None and make_env is not None:
+        raise UserError("logs and make_env both say what is played; give one of them.")
     if compensate:
         options = compensated(run, faults, options)
     resolved = _resolved(run, options)
-    trials: Simulated | Windowed
-    if logs is None:
-        if isinstance(resolved.job.task.simulator, NativeEnv):
-            raise UserError(
-                f"'{resolved.job.task.name}' steps outside JAX, where nothing is certified yet; give logs=, which are "
-                "replayed."
-            )
-        trials = Simulated(faults, {"calibration": calibration, "test": episodes}, quiet)
-    else:
+    counts: dict[Part, int] = {"calibration": calibration, "test": episodes}
+    trials: Simulated | Windowed | Own = Simulated(faults, counts, quiet)
+    if make_env is not None:
+        trials = Own(make_env, faults, counts, cost, quiet)
+    elif logs is not None:
         world = _guard(resolved).world
         trials = Windowed.of(logs, resolved.run, world, body, faults, calibration, episodes, least, quiet)
     rounds: list[dict[str, float]] = []
@@ -210,7 +215,7 @@ def _promised(
     agreed: bool,
     confidence: float,
     tested: Trials,
-    replayed: dict[str, Any],
+    about: dict[str, Any],
 ) -> Certificate:
     guard = _guard(resolved)
     violations = int(tested.violated.sum())
@@ -231,5 +236,5 @@ def _promised(
         agreed=agreed,
         held=float((tested.shortfall <= guard.options.margin).mean()),
         infeasible_rate=tested.infeasible,
-        replayed=replayed,
+        **about,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -85,21 +85,14 @@ def play(
     player = player_of(run, planner, split, options, faults)
     if keep:
         _check_kept(player)
-    max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
-    envs = _made(make_env, min(num_envs, episodes))
-    _check_bounds(envs[0], Bounds(player.task.action_low, player.task.action_high))
+    envs = simulators_of(make_env, min(num_envs, episodes), player)
     begun = time.perf_counter()
-    key = jax.random.key(seed)
     tables: list[Table] = []
     try:
         with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
-            for first in range(0, episodes, len(envs)):
-                resets = [rollout.RESETS[split] + k for k in range(first, min(first + len(envs), episodes))]
-                beginning = zip(envs, resets)
-                begun_now = [Episode(env, player.shape, r, max_steps, early_ends) for env, r in beginning]
-                tables.append(Table(player, begun_now))
-                key = tables[-1].play(cost, key)
-                bar.advance(len(resets))
+            resets = range(rollout.RESETS[split], rollout.RESETS[split] + episodes)
+            key = jax.random.key(seed)
+            play_tables(tables, player, envs, resets, cost, key, bar, max_episode_steps, early_ends)
     except UserError as error:
         raise _with_finished(error, player, tables) from error
     except KeyboardInterrupt as stopped:
@@ -207,23 +200,60 @@ def _check_bounds(env: Any, bounds: Bounds) -> None:
             )
 
 
-def _made(make_env: Callable[[], Any], count: int) -> list[Any]:
-    """So many simulators, each its own."""
+def simulators_of(make_env: Callable[[], Any], count: int, player: Player) -> list[Any]:
+    """So many simulators, each its own, in which the player can act."""
     envs = [make_env() for _ in range(count)]
     if len({id(env) for env in envs}) < len(envs):
         raise UserError(
             f"make_env() gave the same {type(envs[0]).__name__} twice, but several are stepped side by side; make a "
             "new one at every call, or pass num_envs=1."
         )
+    _check_bounds(envs[0], Bounds(player.task.action_low, player.task.action_high))
     return envs
+
+
+def play_tables(
+    tables: list[Table],
+    player: Player,
+    envs: list[Any],
+    resets: range,
+    cost: Cost | None,
+    key: Key,
+    bar: Progress,
+    max_episode_steps: int | None = None,
+    early_ends: str = "refuse",
+    watch_of: Callable[[], Watch] | None = None,
+) -> None:
+    """Episodes of these resets, as many side by side as there are simulators. A table is among `tables` as soon as it
+    has begun, so that who interrupts it loses none of its episodes."""
+    max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
+    for first in range(0, len(resets), len(envs)):
+        beginning = zip(envs, resets[first : first + len(envs)])
+        begun = [Episode(env, player.shape, reset, max_steps, early_ends) for env, reset in beginning]
+        tables.append(Table(player, begun, watch_of() if watch_of else None))
+        key = tables[-1].play(cost, key)
+        bar.advance(len(begun))
+
+
+class Watch(Protocol):
+    """Who is shown every step of a table's B episodes."""
+
+    def begin(self, observations: np.ndarray, state: np.ndarray | None) -> None: ...
+
+    def step(
+        self, info: Mapping[str, Array], counts: np.ndarray, observations: np.ndarray, state: np.ndarray | None
+    ) -> None: ...
+
+    def shortfall(self) -> np.ndarray: ...
 
 
 class Table:
     """B episodes that are stepped side by side, and what is counted of each."""
 
-    def __init__(self, player: Player, episodes: list[Episode]):
+    def __init__(self, player: Player, episodes: list[Episode], watch: Watch | None = None):
         self.player = player
         self.episodes = episodes
+        self.watch = watch
         self.counts: dict[str, np.ndarray] = {}  # (B,) steps in which a guard failed, or did not know
         if player.unsafe is not None:
             for episode, unsafe in zip(episodes, player.unsafe(*self._seen())):
@@ -234,13 +264,19 @@ class Table:
         policy = self.player.policy
         with float32():
             carry = policy.initial_state(len(self.episodes))
+        if self.watch is not None:
+            self.watch.begin(*self._seen())
         while any(e.running for e in self.episodes):
             key, now = jax.random.split(key)
             carry, decided = self.player.act(policy, carry, *self._seen(), now)
             self._count(decided.info)
+            running = np.array([e.running for e in self.episodes])
             for episode, action in zip(self.episodes, np.asarray(decided.action)):
                 if episode.running:
                     episode.step(action, cost)
+            if self.watch is not None:
+                shown = running & np.array([e.running or e.showed_end for e in self.episodes])
+                self.watch.step(decided.info, shown, *self._seen())
             if any(e.lacks_cost for e in self.episodes if not e.skipped):
                 self._charge_by_formula()
             with float32():

@@ -64,7 +64,12 @@ def player_of(
     """A run as planner and options say, or a function under guard, which takes neither; behind faults, if any."""
     if isinstance(policy, Controller):
         return _behind(_of_function(policy.policy, planner, options), faults)
-    return _behind(_of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split), faults)
+    return player_of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split, faults)
+
+
+def player_of_run(resolved: Resolved, split: str, faults: Faults = NO_FAULTS) -> Player:
+    """What a spec named, behind faults, if any."""
+    return _behind(_of_run(resolved, split), faults)
 
 
 def _behind(player: Player, faults: Faults) -> Player:

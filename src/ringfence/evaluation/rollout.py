@@ -41,14 +41,15 @@ def rollout(
     """Play `episodes` episodes: `rewards`, `costs` (E, L) per step, `states` (E, L+1, S), `steps` (E,) taken and
     whether the task itself `terminated` (E,) it, and who was `violated` (E, L, N) where agents have costs of their own;
     the first `num_recorded` episodes also keep what the planner drew (`plans`, `chosen`). `seed` moves the policy's
-    noise, never the resets; another `batch` has other resets. `foreseen` keeps what a guard inside JAX foresees."""
+    noise, never the resets; another `batch` has other resets. `foreseen` keeps what a guard foresees (E, L), which is
+    −∞ after an episode's end."""
     if split not in RESETS:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
     root = RESETS[split] + 2 * batch  # whose noise has the key after it
     act_key = jax.random.fold_in(jax.random.key(root + 1), seed)
     label = label or "evaluating"
     if isinstance(env, NativeEnv):
-        return _rollout_native(policy, env, episodes, root, act_key, num_recorded, label, quiet)
+        return _rollout_native(policy, env, episodes, root, act_key, num_recorded, label, quiet, foreseen)
     if _foreign(policy):
         raise UserError(
             f"Simple Spread runs inside JAX, and {type(policy).__name__} is no pytree; make it an equinox.Module whose "
@@ -130,7 +131,15 @@ def _refuse_lost(played: Played) -> None:
 
 
 def _rollout_native(
-    policy: Policy, env: NativeEnv, episodes: int, root: int, key: Key, num_recorded: int, label: str, quiet: bool
+    policy: Policy,
+    env: NativeEnv,
+    episodes: int,
+    root: int,
+    key: Key,
+    num_recorded: int,
+    label: str,
+    quiet: bool,
+    foreseen: bool,
 ) -> Played:
     """`rollout` on a simulator that steps outside JAX: all episodes side by side. After an episode's end its rewards
     and costs are 0 and its state stays."""
@@ -143,6 +152,7 @@ def _rollout_native(
     outcomes: list[Outcome] = []
     counted: list[Played] = []
     drawn: list[Played] = []
+    scores: list[np.ndarray] = []
     with Progress(label, env.episode_length, 0, quiet) as bar:
         for t in range(env.episode_length):
             if not simulation.running.any():
@@ -155,6 +165,8 @@ def _rollout_native(
             states.append(simulation.state().astype(np.float32))
             carry = with_cost(policy, carry, outcomes[-1].cost)
             counted.append({name: np.asarray(value) * running for name, value in _counted(decided).items()})
+            if foreseen:
+                scores.append(np.where(running, np.asarray(decided.info[FORESEEN]), -np.inf))
             if num_recorded:
                 drawn.append({name: np.asarray(value[:num_recorded]) for name, value in _drawn(decided).items()})
             bar.advance(1)
@@ -168,6 +180,7 @@ def _rollout_native(
         "steps": lengths,
         "terminated": np.asarray(np.stack([o.terminated for o in outcomes], 1).any(1)),
         "states": _held(np.stack(states, 1), env.episode_length + 1),
+        **({FORESEEN: _padded(np.stack(scores, 1), env.episode_length, -np.inf)} if foreseen else {}),
         **_stacked(drawn),
     }
 
@@ -191,9 +204,9 @@ def _stacked(steps: list[Played]) -> Played:
     return {name: np.stack([step[name] for step in steps], 1) for name in (steps[0] if steps else ())}
 
 
-def _padded(x: np.ndarray, length: int) -> np.ndarray:
+def _padded(x: np.ndarray, length: int, after: float = 0.0) -> np.ndarray:
     """(E, length) from (E, T): nothing happens after the end."""
-    return np.pad(x, ((0, 0), (0, length - x.shape[1])))
+    return np.pad(x, ((0, 0), (0, length - x.shape[1])), constant_values=after)
 
 
 def _held(states: np.ndarray, length: int) -> np.ndarray:

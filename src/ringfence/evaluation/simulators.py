@@ -37,11 +37,12 @@ def simulator(name: str) -> NamedSimulator:
     return NamedSimulator(name, make)
 
 
-def name_of(make_env: Callable[[], Any], env: Any) -> str:
-    """The name a simulator was given by, else that of its class."""
+def name_of(make_env: Callable[[], Any], env: Any = None) -> str:
+    """The name a simulator was given by, else that of its class, or of what makes it."""
     if isinstance(make_env, NamedSimulator):
         return make_env.name
-    return f"{type(env).__module__}:{type(env).__qualname__}"
+    made = make_env if env is None else type(env)
+    return f"{made.__module__}:{getattr(made, '__qualname__', type(made).__qualname__)}"
 
 
 def _imported(where: str, attribute: str) -> ModuleType:

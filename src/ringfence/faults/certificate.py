@@ -38,6 +38,7 @@ class Certificate:
     infeasible_rate: float
     # where windows of logs were replayed: digest of the logs, windows (calibrated, tested), seconds, kinematics, radius
     replayed: dict[str, Any] = dataclasses.field(default_factory=dict)
+    simulator: str = ""  # of one's own
     format: int = FORMAT
 
     def summary(self) -> tuple[str, ...]:
@@ -49,7 +50,8 @@ class Certificate:
         return (
             f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of {what} violate: "
             f"{self.violations} of {self.episodes} fresh ones did.",
-            f"Behind {behind}; {self.task}, {self.agents} agents, barrier {self.barrier}.",
+            f"Behind {behind}; {self.task}, {self.agents} agents, barrier {self.barrier}"
+            + (f"; in {self.simulator}." if self.simulator else "."),
             f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batches; {agreed}.",
             f"In {100 * self.held:.1f} % of the fresh {what} reality fell short of foresight by no more than that.",
             *self._replay(),

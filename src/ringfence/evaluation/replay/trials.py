@@ -83,13 +83,14 @@ class Windowed:
     def about(self) -> dict[str, Any]:
         """What a certificate says of how it was made."""
         stage = self.test
-        return {
+        replayed = {
             "logs": self.content,
             "windows": [self.calibration.windows.count, stage.windows.count],
             "seconds": stage.windows.steps * stage.windows.dt,
             "kinematics": stage.kinematics.name,
             "radius": stage.radius,
         }
+        return {"replayed": replayed}
 
 
 def _evenly(chosen: np.ndarray, most: int) -> np.ndarray:
