@@ -434,6 +434,24 @@ def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
     assert not list((run.path / "ckpt").glob("*.part"))
 
 
+def test_a_program_that_does_not_count_its_updates_is_not_believed(small_store, tmp_path, monkeypatch):
+    """As jax 0.5.3 does with one that it kept, where a user has chosen a folder for them."""
+    real = loop.make_program
+
+    def forgetful(job):
+        program = real(job)
+
+        def advance(state, *given):
+            after, metrics = program.advance(jax.tree.map(jnp.copy, state), *given)
+            return {**after, "step": state["step"]}, metrics
+
+        return program._replace(advance=advance)
+
+    monkeypatch.setattr(loop, "make_program", forgetful)
+    with pytest.raises(UserError, match="After 1 updates the state counts 0: .*unset JAX_COMPILATION_CACHE_DIR"):
+        loop.train("bc", small_store, out=tmp_path, changes=TINY["bc"], quiet=True, chunk=1)
+
+
 def test_own_data_without_a_simulator(own_store, tmp_path):
     """Anybody's logs: a store with named features, a hazard, a policy that acts; nothing of Simple Spread is known."""
     store = own_store

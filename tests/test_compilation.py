@@ -7,9 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import pytest
 
-from ringfence.utils.compilation import keep_programs
+from ringfence.utils.compilation import SOUND, keep_programs
+
+where_programs_are_kept = pytest.mark.skipif(
+    jax.__version_info__[:2] < SOUND, reason="this version of JAX plays kept programs wrongly"
+)
 
 # What is kept, after a program was compiled before and one afterwards.
 CODE = """
@@ -41,6 +46,7 @@ def kept(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.rglob("*-cache"))
 
 
+@where_programs_are_kept
 def test_programs_are_kept_in_the_users_cache(tmp_path):
     """Though one was compiled before; a second process finds what the first has kept."""
     folder, again, result, config = played(tmp_path)
@@ -51,6 +57,7 @@ def test_programs_are_kept_in_the_users_cache(tmp_path):
     assert played(tmp_path) == [folder, again, result, config] and kept(tmp_path) == files
 
 
+@where_programs_are_kept
 def test_a_folder_may_be_chosen(tmp_path):
     played(tmp_path / "home", RINGFENCE_COMPILATION_CACHE=str(tmp_path / "mine"))
     assert kept(tmp_path / "mine") and not (tmp_path / "home").exists()
@@ -73,6 +80,7 @@ def test_whoever_has_chosen_a_folder_for_jax_keeps_it(tmp_path):
     assert lines[0] == "None" and not kept(home)
 
 
+@where_programs_are_kept
 def test_what_others_have_set_of_it_stays(tmp_path):
     lines = played(tmp_path, "jax.config.update('jax_compilation_cache_max_size', 10**9)")
     assert lines[-1].endswith(f" {10**9}") and kept(tmp_path)
