@@ -28,8 +28,6 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = os.environ.get("JAX_COMPILATION_CACHE_
     prefix="ringfence-tests-"
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
-if tuple(map(int, version("jaxlib").split(".")[:2])) < (0, 10):  # plays kept programs wrongly (utils/compilation.py)
-    os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
 
 # Worlds that tests fit are not the user's; workers share those of the process that began them.
 os.environ["RINGFENCE_TESTS_HOME"] = os.environ.get("RINGFENCE_TESTS_HOME") or tempfile.mkdtemp(

@@ -7,14 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import jax
 import pytest
-
-from ringfence.utils.compilation import SOUND, keep_programs
-
-where_programs_are_kept = pytest.mark.skipif(
-    jax.__version_info__[:2] < SOUND, reason="this version of JAX plays kept programs wrongly"
-)
 
 # What is kept, after a program was compiled before and one afterwards.
 CODE = """
@@ -46,7 +39,6 @@ def kept(folder: Path) -> list[str]:
     return sorted(file.name for file in folder.rglob("*-cache"))
 
 
-@where_programs_are_kept
 def test_programs_are_kept_in_the_users_cache(tmp_path):
     """Though one was compiled before; a second process finds what the first has kept."""
     folder, again, result, config = played(tmp_path)
@@ -57,7 +49,6 @@ def test_programs_are_kept_in_the_users_cache(tmp_path):
     assert played(tmp_path) == [folder, again, result, config] and kept(tmp_path) == files
 
 
-@where_programs_are_kept
 def test_a_folder_may_be_chosen(tmp_path):
     played(tmp_path / "home", RINGFENCE_COMPILATION_CACHE=str(tmp_path / "mine"))
     assert kept(tmp_path / "mine") and not (tmp_path / "home").exists()
@@ -80,7 +71,6 @@ def test_whoever_has_chosen_a_folder_for_jax_keeps_it(tmp_path):
     assert lines[0] == "None" and not kept(home)
 
 
-@where_programs_are_kept
 def test_what_others_have_set_of_it_stays(tmp_path):
     lines = played(tmp_path, "jax.config.update('jax_compilation_cache_max_size', 10**9)")
     assert lines[-1].endswith(f" {10**9}") and kept(tmp_path)
@@ -104,12 +94,3 @@ def test_an_import_sets_nothing_up():
     code += "assert jax.config.jax_compilation_cache_dir is None"
     inherited = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     subprocess.run([sys.executable, "-c", code], env=inherited, check=True)
-
-
-def test_nothing_is_kept_where_kept_programs_are_played_wrongly(monkeypatch):
-    """jax 0.5.3 left the count of a training's steps at 0 when its program came from the cache."""
-    monkeypatch.setattr("jax.__version_info__", (0, 5, 3))
-    option = lambda name: None if name == "compilation_cache_dir" else True  # noqa: E731 (nobody has chosen)
-    monkeypatch.setattr("ringfence.utils.compilation._option", option)
-    monkeypatch.setattr("ringfence.utils.compilation._folder", lambda: pytest.fail("a folder was made"))
-    assert keep_programs.__wrapped__() is None

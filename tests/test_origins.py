@@ -154,9 +154,8 @@ def test_a_run_and_its_files_move_what_they_are_given(far, world, run, tmp_path)
     for t in range(3):
         carry, decided = step(policy, carry, far.observations[t][None], None, jax.random.key(0))
         np.testing.assert_allclose(actions[t], decided.action[0], atol=1e-6)
-    if hasattr(jax, "enable_x64"):  # older JAX cannot write a program of two precisions
-        file = exporting.export(run, tmp_path / "far.stablehlo", "stablehlo", **options)
-        _plays(*_of_stablehlo(file), measured, actions)
+    file = exporting.export(run, tmp_path / "far.stablehlo", "stablehlo", **options)
+    _plays(*_of_stablehlo(file), measured, actions)
     pytest.importorskip("jax2onnx")
     _plays(*_of_onnx(exporting.export(run, tmp_path / "far.onnx", **options)), measured, actions)
 

@@ -8,28 +8,10 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
 from ringfence.training.runs import sound_arrays
-from ringfence.utils.precision import float32
 from tests.quick import QUICK_WORLD
-
-BOTH = hasattr(jax, "enable_x64")  # JAX that can compute in 32 bits within a program of 64
-needs_both = pytest.mark.skipif(not BOTH, reason="this JAX cannot compute in 32 bits and in 64")
-
-
-@pytest.mark.skipif(BOTH, reason="this JAX computes in 32 bits and in 64")
-def test_jax_that_mixes_precisions_is_refused(store, tmp_path, wide):
-    """It trained other weights, and counted other steps."""
-    with pytest.raises(UserError, match="cannot compute in 32 bits and in 64 in one program; unset JAX_ENABLE_X64"):
-        trained("bc", store, tmp_path)
-
-
-def test_what_cannot_be_mixed_is_said(monkeypatch, wide):
-    monkeypatch.delattr(jax, "enable_x64", raising=False)
-    with pytest.raises(UserError, match="cannot compute in 32 bits and in 64 in one program"):
-        float32()
 
 
 @pytest.fixture
@@ -63,7 +45,6 @@ def usual(store, tmp_path_factory):
     }
 
 
-@needs_both
 @pytest.mark.parametrize("algorithm", ["bc", "fisor", "ma-td3bc-lag"])
 def test_training_in_a_program_of_64_bits(algorithm, store, usual, tmp_path, wide):
     """11 of 12 algorithms ended in a TypeError."""
@@ -77,7 +58,6 @@ def test_training_in_a_program_of_64_bits(algorithm, store, usual, tmp_path, wid
     assert action.dtype == np.float32
 
 
-@needs_both
 def test_a_world_and_its_guard_in_a_program_of_64_bits(store, usual, wide):
     world = worlds.fit(store, cached=False, **QUICK_WORLD)
     for mine, theirs in zip(jax.tree.leaves(world), jax.tree.leaves(usual["world"]), strict=True):

@@ -16,15 +16,6 @@ from ringfence.errors import UserError
 GOLDEN = Path(__file__).parent / "golden" / "simple_spread_velocity_first.npz"
 
 
-def double_precision():
-    """Context in which JAX computes in float64; the name moved between the oldest and the newest supported JAX."""
-    if hasattr(jax, "enable_x64"):
-        return jax.enable_x64(True)
-    from jax.experimental import enable_x64
-
-    return enable_x64()
-
-
 def golden():
     with np.load(GOLDEN) as file:
         return {name: file[name] for name in file.files}
@@ -60,7 +51,7 @@ def play(env: SimpleSpread, episodes: int, seed: int = 0):
 def test_velocity_first_equals_the_original_environment():
     data = golden()
     for dtype, tolerance in (("float64", 1e-12), ("float32", 1e-5)):
-        with double_precision():
+        with jax.enable_x64(True):
             env = SimpleSpread(integrator="velocity_first", reward="omar")
             state = state_of(data["position"], data["velocity"], data["landmarks"], dtype=dtype)
             after, transition = jax.jit(env.step)(state, jnp.asarray(data["action"], dtype))
@@ -107,7 +98,7 @@ def test_position_first_equals_mpe2():
             )
             assert set(truncated.values()) == {step == 24} and set(terminated.values()) == {False}
     position, velocity, reward, observation = (np.stack(x) for x in zip(*theirs))
-    with double_precision():
+    with jax.enable_x64(True):
         env = SimpleSpread(integrator="position_first", reward="pettingzoo")
         state = state_of(*(np.stack(x) for x in zip(*before)), dtype="float64")
         after, transition = jax.jit(env.step)(state, jnp.asarray(np.stack(actions), "float64"))

@@ -359,10 +359,10 @@ class _Training:
         self.step += count
         metrics = {**metrics, **program.diagnose(self.state, *data)}
         values = {name: np.asarray(value) for name, value in metrics.items()}
-        if (counted := int(self.state["step"][0])) != self.step:  # utils/compilation.py says which versions do so
+        if (counted := int(self.state["step"][0])) != self.step:  # so did JAX 0.5.3 with a program that it had kept
             raise UserError(
                 f"After {self.step} updates the state counts {counted}: JAX {jax.__version__} plays programs wrongly "
-                "that it kept; unset JAX_COMPILATION_CACHE_DIR, or update jax to 0.10 or later."
+                "that it kept; unset JAX_COMPILATION_CACHE_DIR, or update jax."
             )
         self._log(values, count, time.perf_counter() - begun)
         means = {name: float(value.mean()) for name, value in values.items()}

@@ -31,8 +31,6 @@ OPTIONS = {
     "compilation_cache_max_size": (-1, 2**28),  # bytes
     "persistent_cache_min_compile_time_secs": (1.0, 0.1),
 }
-# With jax 0.5.3 a training program that was kept leaves the count of steps at 0; 0.10 and later were tried.
-SOUND = (0, 10)
 OFF = ("0", "off", "false", "no")
 ON = ("", "1", "on", "true", "yes")
 
@@ -41,13 +39,10 @@ _log = logging.getLogger(__name__)
 
 @cache
 def keep_programs() -> Path | None:
-    """Keep compiled programs from here on; the folder, or None where nothing is kept or the user has chosen one. With a
-    version of JAX that plays kept programs wrongly nothing is.
+    """Keep compiled programs from here on; the folder, or None where nothing is kept or the user has chosen one.
 
     A folder that cannot be written to is passed over: it costs time and nothing else.
     """
-    if jax.__version_info__[:2] < SOUND:
-        return None
     if _option("compilation_cache_dir") is not None or not _option("enable_compilation_cache"):
         return None
     folder = _folder()

@@ -13,8 +13,6 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
-from ringfence.errors import UserError
-
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -23,23 +21,12 @@ def float32() -> AbstractContextManager[object]:
     """While it is open, JAX makes numbers of 32 bits."""
     if not getattr(jax.config, "jax_enable_x64"):  # noqa: B009 (a name that its type does not tell)
         return nullcontext()
-    return _bits(wide=False)
+    return jax.enable_x64(False)
 
 
 def float64() -> AbstractContextManager[object]:
     """While it is open, JAX makes numbers of 64 bits."""
-    return _bits(wide=True)
-
-
-def _bits(wide: bool) -> AbstractContextManager[object]:
-    """JAX of before `enable_x64` mixes what it has compiled in 32 and in 64 bits: 0.5.3 trained other weights and
-    counted other steps, so nothing is computed there."""
-    if not hasattr(jax, "enable_x64"):
-        raise UserError(
-            f"JAX {jax.__version__} cannot compute in 32 bits and in 64 in one program; unset JAX_ENABLE_X64, or "
-            "install JAX 0.8 or newer."
-        )
-    return jax.enable_x64(wide)
+    return jax.enable_x64(True)
 
 
 def in_float32(function: Callable[P, T]) -> Callable[P, T]:
