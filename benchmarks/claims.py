@@ -31,6 +31,7 @@ RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 PROVING = "results/proving"
+PEDESTRIANS = "results/stress/pedestrians.csv"
 STRESS = "results/stress/crossing.csv"
 SHOWN = 80  # letters of a sentence in the table
 
@@ -121,6 +122,28 @@ def of_late_actions() -> tuple[bool, str]:
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
     holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and 0.93 <= max(unknown) < 0.95
     return holds, f"{known} of {unknown}"
+
+
+def of_pedestrians() -> tuple[bool, str]:
+    """Contacts of pedestrians that a guard leaves which knows of late or lost steps, of those of one that does not."""
+    rows = stored.table(ROOT / PEDESTRIANS)
+
+    def left(faults: str, guard: str) -> int:
+        return sum(int(r["contacts"]) for r in rows if (r["faults"], r["guard"]) == (faults, guard))
+
+    names = sorted({r["faults"] for r in rows if re.fullmatch(r"(delay|drop)[\d.]+", r["faults"])})
+    shares = {name: left(name, "shield, compensated") / left(name, "shield") for name in names}
+    return len(shares) == 6 and max(shares.values()) <= 0.5, f"{max(shares.values()):.2f} at most, of {len(shares)}"
+
+
+def of_filters() -> tuple[bool, str]:
+    """Naive drivers under the shield that learned, and under the classical filter, where there is one."""
+    found = [json.loads(file.read_text()) for file in sorted((ROOT / PROVING).glob("proving-*.json"))]
+    rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found if "naive cbf-qp" in one["rows"]}
+    both = {n: [r[f"naive {how}"]["violation_rate"] for how in ("shield learned", "cbf-qp")] for n, r in rows.items()}
+    fewer = [name for name, (mine, theirs) in both.items() if mine < theirs]
+    more = [name for name, (mine, theirs) in both.items() if mine > theirs]
+    return (len(fewer), sorted(more)) == (8, ["arms", "bench", "train"]), f"fewer on {len(fewer)}, more on {more}"
 
 
 PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 0)
@@ -576,6 +599,18 @@ CLAIMS = (
         "eight",
         PROVING,
         of_bad_driving,
+    ),
+    Claim(
+        "docs/stress.md",
+        "A guard that knows of late or lost steps leaves half of the contacts, or fewer",
+        PEDESTRIANS,
+        of_pedestrians,
+    ),
+    Claim(
+        "docs/proving-ground.md",
+        "With naive drivers it leaves more violations than the shield on eight of thirteen systems, fewer on three",
+        PROVING,
+        of_filters,
     ),
     Claim(
         "docs/stress.md",

@@ -3,7 +3,8 @@
 python benchmarks/stress.py                         # writes results/stress/crossing.csv, a row when it is played
 python benchmarks/stress.py --jobs 16 --rows delay3 delay3/compensated     # some rows, each in a process of its own
 python benchmarks/stress.py --list
-python benchmarks/stress.py --table                 # writes the table of docs/stress.md
+python benchmarks/stress.py --table                 # writes the tables of docs/stress.md
+python benchmarks/stress.py --runs runs/proving-discs/bc/seed-0 ...        # other tasks: results/stress/systems.csv
 
 Half a minute for 50 episodes of a row, on one core that has nothing else to do.
 """
@@ -51,6 +52,11 @@ FAULTS: tuple[dict[str, Any], ...] = (
 )
 KNOWN = ("delay", "jitter", "drop", "asynchrony")  # faults that `compensate` makes good for
 
+SYSTEMS = OUT.with_name("systems.csv")
+SYSTEMS_ROW = ("task", "faults", "guard", "episodes")
+SYSTEMS_FIELDS = (*SYSTEMS_ROW, "return", "cost", *RATES)
+ON_SYSTEMS: tuple[dict[str, Any], ...] = ({}, {"delay": 2}, {"drop": 0.6}, {"asynchrony": 0.667}, MIDDLE)
+
 Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether they are compensated, the guard's other options
 
 
@@ -91,6 +97,7 @@ def main() -> None:
     parser.add_argument("--rows", nargs="*", help="all by default")
     parser.add_argument("--jobs", type=int, default=1, help="rows that are played side by side")
     parser.add_argument("--agents", type=int, help="of another team than that of the logs")
+    parser.add_argument("--runs", nargs="*", type=Path, help="of other tasks, without a guard and under one that knows")
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
@@ -100,6 +107,11 @@ def main() -> None:
         return
     if a.table:
         write_table(a.out)
+        write_systems_table(SYSTEMS)
+        return
+    if a.runs:
+        for folder in a.runs:
+            play_system(folder, a.episodes, SYSTEMS if a.out == OUT else a.out)
         return
     unknown = set(a.rows or ()) - set(every)
     if unknown:
@@ -140,6 +152,46 @@ def play(run: Any, trial: Trial, episodes: int, out: Path, agents: int | None) -
     row |= {"return": round(result["return_mean"], 3), **{rate: round(result[rate], 4) for rate in RATES}}
     print(row, flush=True)
     _rows.append(out, row, FIELDS)
+
+
+def play_system(folder: Path, episodes: int, out: Path) -> None:
+    """A run behind few faults: without a guard, under a shield, and under one that knows of them."""
+    from ringfence.evaluation.stress import known_to_guards, stress
+    from ringfence.faults import Faults
+    from ringfence.training.runs import Run
+
+    run = Run.of(folder)
+    shield = {"guard": "shield", "anyway": True}
+    guards = {"none": {}, "shield": shield, "shield, compensated": {**shield, "compensate": True}}
+    for faults in ON_SYSTEMS:
+        for guard, options in guards.items():
+            row: dict[str, Any] = {"task": run.config["task"], "faults": name_of(faults)}
+            row |= {"guard": guard, "episodes": episodes}
+            done = {tuple(r[k] for k in SYSTEMS_ROW) for r in _rows.read(out)}
+            unknown = "compensate" in options and not known_to_guards(Faults.of(faults))
+            if unknown or tuple(str(row[k]) for k in SYSTEMS_ROW) in done:
+                continue
+            result = stress(run, faults, episodes=episodes, **options)
+            row |= {"return": round(result["return_mean"], 3), "cost": round(result["cost_mean"], 3)}
+            row |= {rate: round(result[rate], 4) for rate in RATES if rate in result}
+            print(row, flush=True)
+            _rows.append(out, row, SYSTEMS_FIELDS)
+
+
+def write_systems_table(out: Path) -> None:
+    """Other tasks: return, cost and episodes with a violation of each guard."""
+    from readme import put
+
+    rows = _rows.read(out)
+    guards = ("none", "shield", "shield, compensated")
+    lines = ["| task | faults | " + " | ".join(guards) + " |", "|---" * 5 + "|"]
+    for task, faults in dict.fromkeys((r["task"], r["faults"]) for r in rows):
+        cells = [f"`{task}`", in_words(faults)]
+        for guard in guards:
+            own = [r for r in rows if (r["task"], r["faults"], r["guard"]) == (task, faults, guard)]
+            cells.append(f"{float(own[0]['return']):.4g}, {float(own[0]['cost']):.3g}" if own else "–")
+        lines.append(f"| {' | '.join(cells)} |")
+    put("docs/stress.md", "systems", "\n".join(lines))
 
 
 def side_by_side(wanted: Sequence[str], jobs: int, episodes: int, out: Path, agents: int | None) -> None:
