@@ -67,7 +67,7 @@ class Foresight:
     def _features(self, observations: np.ndarray, state: np.ndarray | None) -> Array:
         with float32():
             x = local_features(self.guard.world.map, self.homogeneous, observations, state)
-            return jnp.asarray(x).reshape(len(observations), -1, x.shape[-1])
+            return jnp.asarray(x).reshape(len(observations), -1, *x.shape[1:])
 
 
 @dataclass(frozen=True)

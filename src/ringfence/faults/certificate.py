@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ringfence.errors import UserError
+from ringfence.faults.faults import Faults
 from ringfence.utils.files import regular, whole
 from ringfence.utils.pytrees import digest_of, named_arrays
 
@@ -43,16 +44,18 @@ class Certificate:
 
     def summary(self) -> tuple[str, ...]:
         """What it says, a sentence each."""
-        behind = ", ".join(f"{name} {value}" for name, value in self.faults.items()) or "no faults"
+        given = Faults.of(self.faults).given
+        behind = ", ".join(f"{name} {value}" for name, value in given.items()) or "no faults"
         again = "the same windows" if self.replayed else "a fresh batch"
         agreed = f"{again} agreed with it" if self.agreed else f"{again} did not agree with it"
         what = "windows" if self.replayed else "episodes"
         return (
             f"With confidence {self.confidence:g} at most {100 * self.bound:.2f} % of {what} violate: "
             f"{self.violations} of {self.episodes} fresh ones did.",
-            f"Behind {behind}; {self.task}, {self.agents} agents, barrier {self.barrier}"
+            f"Behind {behind}; {self.task}, {self.agents} agent{'s' * (self.agents != 1)}, barrier {self.barrier}"
             + (f"; in {self.simulator}." if self.simulator else "."),
-            f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batches; {agreed}.",
+            f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batch{'es' * (len(self.rounds) > 1)}; "
+            f"{agreed}.",
             f"In {100 * self.held:.1f} % of the fresh {what} reality fell short of foresight by no more than that.",
             *self._replay(),
             f"It holds for {what} drawn as these were, not for each state, another simulator or an adversary.",
