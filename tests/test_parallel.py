@@ -287,6 +287,8 @@ def test_a_run_is_certified_in_a_simulator_of_ones_own(guarded_run, small_world,
     assert Certificate.load(made.save(tmp_path / "cert.json")) == made
     with pytest.raises(UserError, match="give one of them"):
         certify(guarded_run, {}, make_env=Watched, logs=guarded_run, **given)
+    with pytest.raises(UserError, match="give make_env=, or leave cost out"):
+        certify(guarded_run, {}, cost=lambda infos: 0.0, **given)
 
 
 def test_what_was_foreseen_there_is_compared_with_what_came(guarded_run, small_world):

@@ -29,14 +29,13 @@ from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator, compensated
-from ringfence.evaluation.trials import Part, Trials, shortfall
+from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
 from ringfence.faults import Faults, under_faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
-from ringfence.problem.homogeneous import local_features
 from ringfence.training.runs import Run
 from ringfence.types import Array
 from ringfence.utils.compilation import keep_programs
@@ -95,6 +94,8 @@ def certify(
         check_simulator(PolicySpec.of(run, **options), BOUND_ELSEWHERE)
     if logs is not None and make_env is not None:
         raise UserError("logs and make_env both say what is played; give one of them.")
+    if cost is not None and make_env is None:
+        raise UserError("cost is of the infos of a simulator of one's own; give make_env=, or leave cost out.")
     if compensate:
         options = compensated(run, faults, options)
     resolved = _resolved(run, options)
@@ -145,7 +146,8 @@ class Simulated:
         count = self.episodes[part]
         played = rollout(policy, task.simulator, count, split, seed, 0, label, self.quiet, batch, foreseen=True)
         violated = played["costs"].sum(1) > 0
-        return Trials(violated, shortfalls(resolved, played), float(played["infeasible"].mean()))
+        infeasible = float(played["infeasible"].sum() / played["steps"].sum())  # an episode may end early
+        return Trials(violated, shortfalls(resolved, played), infeasible)
 
     @property
     def about(self) -> dict[str, Any]:
@@ -167,10 +169,8 @@ def judged(guard: Guard, task: Task, states: np.ndarray) -> np.ndarray:
     @jax.jit
     def of_episode(states: Array) -> Array:
         observations = None if isinstance(env, NativeEnv) else env.observe(env.from_global_state(states))
-        x = local_features(guard.world.map, task.homogeneous, observations, states)
-        x = x.reshape(len(states), -1, *x.shape[1:])
-        scores = guard.barrier.now(x[:-1], x[1:])
-        return scores.reshape(len(scores), -1).min(-1)
+        x = features(guard, task.homogeneous, observations, states)
+        return least_score(guard, x[:-1], x[1:])
 
     return np.stack([np.asarray(of_episode(jnp.asarray(one))) for one in states])
 

@@ -15,22 +15,15 @@ from ringfence.evaluation.play import Table, play_tables, simulators_of
 from ringfence.evaluation.player import player_of_run
 from ringfence.evaluation.rollout import FORESEEN, RESETS
 from ringfence.evaluation.simulators import name_of
-from ringfence.evaluation.trials import Part, Trials, shortfall
+from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
 from ringfence.faults import Faults
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved
-from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array
 from ringfence.utils.precision import float32
 from ringfence.utils.progress import Progress
 
 SIDE_BY_SIDE = 16  # simulators
-
-
-@jax.jit
-def _score(guard: Guard, before: Array, after: Array) -> Array:
-    scores = guard.barrier.now(before, after)
-    return scores.reshape(len(scores), -1).min(-1)
 
 
 class Foresight:
@@ -54,7 +47,7 @@ class Foresight:
         """What came of a step, where that counts (B,): the episode was running, and showed where it led."""
         after = self._features(observations, state)
         with float32():
-            came = np.asarray(_score(self.guard, self.before, after))
+            came = np.asarray(least_score(self.guard, self.before, after))
         self.foreseen.append(np.where(counts, np.asarray(info[FORESEEN]), -np.inf))
         self.came.append(np.where(counts, came, np.inf))
         self.before = after
@@ -66,8 +59,7 @@ class Foresight:
 
     def _features(self, observations: np.ndarray, state: np.ndarray | None) -> Array:
         with float32():
-            x = local_features(self.guard.world.map, self.homogeneous, observations, state)
-            return jnp.asarray(x).reshape(len(observations), -1, *x.shape[1:])
+            return jnp.asarray(features(self.guard, self.homogeneous, observations, state))
 
 
 @dataclass(frozen=True)
