@@ -5,6 +5,7 @@ python benchmarks/stress.py --jobs 16 --rows delay3 delay3/compensated     # som
 python benchmarks/stress.py --list
 python benchmarks/stress.py --table                 # writes the tables of docs/stress.md
 python benchmarks/stress.py --runs runs/proving-discs/bc/seed-0 ...        # other tasks: results/stress/systems.csv
+python benchmarks/stress.py --runs halfcheetah_2x3-good/bc --guard adapt --episodes 10      # a policy that ships
 
 Half a minute for 50 episodes of a row, on one core that has nothing else to do.
 """
@@ -55,6 +56,7 @@ KNOWN = ("delay", "jitter", "drop", "asynchrony")  # faults that `compensate` ma
 SYSTEMS = OUT.with_name("systems.csv")
 SYSTEMS_ROW = ("task", "faults", "guard", "episodes")
 SYSTEMS_FIELDS = (*SYSTEMS_ROW, "return", "cost", *RATES)
+KINDS = ("none", "guard", "compensated")
 ON_SYSTEMS: tuple[dict[str, Any], ...] = ({}, {"delay": 2}, {"drop": 0.6}, {"asynchrony": 0.667}, MIDDLE)
 
 Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether they are compensated, the guard's other options
@@ -98,6 +100,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="rows that are played side by side")
     parser.add_argument("--agents", type=int, help="of another team than that of the logs")
     parser.add_argument("--runs", nargs="*", type=Path, help="of other tasks, without a guard and under one that knows")
+    parser.add_argument("--guard", default="shield", help="of these")
     parser.add_argument("--list", action="store_true")
     parser.add_argument("--table", action="store_true")
     a = parser.parse_args()
@@ -111,7 +114,7 @@ def main() -> None:
         return
     if a.runs:
         for folder in a.runs:
-            play_system(folder, a.episodes, SYSTEMS if a.out == OUT else a.out)
+            play_system(folder, a.guard, a.episodes, SYSTEMS if a.out == OUT else a.out)
         return
     unknown = set(a.rows or ()) - set(every)
     if unknown:
@@ -154,19 +157,20 @@ def play(run: Any, trial: Trial, episodes: int, out: Path, agents: int | None) -
     _rows.append(out, row, FIELDS)
 
 
-def play_system(folder: Path, episodes: int, out: Path) -> None:
-    """A run behind few faults: without a guard, under a shield, and under one that knows of them."""
+def play_system(folder: Path, guard: str, episodes: int, out: Path) -> None:
+    """A run behind few faults: without a guard, under one, and under one that knows of them."""
+    from ringfence.deploy import zoo
     from ringfence.evaluation.stress import known_to_guards, stress
     from ringfence.faults import Faults
     from ringfence.training.runs import Run
 
-    run = Run.of(folder)
-    shield = {"guard": "shield", "anyway": True}
-    guards = {"none": {}, "shield": shield, "shield, compensated": {**shield, "compensate": True}}
+    run = Run.of(folder) if folder.exists() else zoo.pretrained(str(folder), tempfile.mkdtemp())
+    guarded = {"guard": guard, "anyway": True}
+    guards = {"none": {}, guard: guarded, f"{guard}, compensated": {**guarded, "compensate": True}}
     for faults in ON_SYSTEMS:
-        for guard, options in guards.items():
+        for name, options in guards.items():
             row: dict[str, Any] = {"task": run.config["task"], "faults": name_of(faults)}
-            row |= {"guard": guard, "episodes": episodes}
+            row |= {"guard": name, "episodes": episodes}
             done = {tuple(r[k] for k in SYSTEMS_ROW) for r in _rows.read(out)}
             unknown = "compensate" in options and not known_to_guards(Faults.of(faults))
             if unknown or tuple(str(row[k]) for k in SYSTEMS_ROW) in done:
@@ -183,15 +187,22 @@ def write_systems_table(out: Path) -> None:
     from readme import put
 
     rows = _rows.read(out)
-    guards = ("none", "shield", "shield, compensated")
-    lines = ["| task | faults | " + " | ".join(guards) + " |", "|---" * 5 + "|"]
+    lines = ["| task | faults | " + " | ".join(KINDS) + " |", "|---" * 5 + "|"]
     for task, faults in dict.fromkeys((r["task"], r["faults"]) for r in rows):
         cells = [f"`{task}`", in_words(faults)]
-        for guard in guards:
-            own = [r for r in rows if (r["task"], r["faults"], r["guard"]) == (task, faults, guard)]
-            cells.append(f"{float(own[0]['return']):.4g}, {float(own[0]['cost']):.3g}" if own else "–")
+        played = {kind(r["guard"]): r for r in rows if (r["task"], r["faults"]) == (task, faults)}
+        for name in KINDS:
+            own = played.get(name)
+            cells.append(f"{float(own['return']):.4g}, {float(own['cost']):.3g}" if own else "–")
         lines.append(f"| {' | '.join(cells)} |")
     put("docs/stress.md", "systems", "\n".join(lines))
+
+
+def kind(guard: str) -> str:
+    """Which of the table's columns a guard is in."""
+    if guard == "none":
+        return "none"
+    return "compensated" if guard.endswith("compensated") else "guard"
 
 
 def side_by_side(wanted: Sequence[str], jobs: int, episodes: int, out: Path, agents: int | None) -> None:

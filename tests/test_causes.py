@@ -285,10 +285,16 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
     out = np.zeros((N, 2), np.float32)
     out[0, 0] = 0.5
     ends = {}
-    for beyond in ({}, {"within_logs": False}):
-        pilot = guard(lambda seen, state: out, world, guard="shield", **beyond)
-        ends[bool(beyond)] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
-    assert ends[False] < 1.23 < 1.25 < ends[True]
+    for name, how in {"usual": {}, "no margin": {"margin": 0.0}, "beyond": {"within_logs": False}}.items():
+        pilot = guard(lambda seen, state: out, world, guard="shield", **how)
+        ends[name] = row[0, 0] + 0.8 * pilot.act(row)[0, 0]
+    assert max(ends["usual"], ends["no margin"]) < 1.23 < 1.25 < ends["beyond"], "whatever margin is kept"
+    rows = np.stack([row] * 11)[None, None]
+    slowest, fastest = ranges["own.v"]
+    rows[0, 0, [1, -2], 0, 2] = fastest + 0.02 * (fastest - slowest)
+    rows[0, 0, -1, 0, 0] = 1.5  # however far ahead: it may take that long to brake
+    support = shown.Shown.by(world).along(jnp.asarray(rows[..., 1:, :, :]))[0, 0, :, 0]
+    np.testing.assert_array_equal(support < 1, [True, *[False] * 8, True], "a speed, soon; a place, at any time")
     still = msgspec.structs.replace(fitted.card.data, ranges={"own.x": (1.0, 1.0)})
     with pytest.raises(UserError, match="within_logs keeps to what varies in the logs, and no entry of an agent does"):
         shown.Shown.by(dataclasses.replace(fitted, card=msgspec.structs.replace(fitted.card, data=still)))

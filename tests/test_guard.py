@@ -337,7 +337,7 @@ def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, pre
 
 
 def test_nothing_has_its_margin_out_of_distribution_where_a_guard_stays_within_the_logs(small_world, present):
-    anywhere = Shown((-1e3,), (1e3,), (0,), ())
+    anywhere = Shown((-1e3,), (1e3,), (0,), (False,), ())
     barrier = BarrierSource(small_world, "learned", None, False, anywhere)
     rows = jnp.stack([present, present], 1)[:, None]
     near = barrier.along(rows, jnp.zeros((64, 1, 1, 3)))

@@ -63,15 +63,25 @@ class BarrierSource(eqx.Module):
     def along(self, rows: Array, spread: Array) -> Array:
         """(..., K, N, C) scores of predicted rows (..., K+1, N, D), the present first, by each constraint (1 unless the
         logs name several); spread (..., K, N)."""
+        danger, support = self.danger_and_support(rows, spread)
+        return danger if support is None else jnp.minimum(danger, support[..., None])
+
+    def danger_and_support(self, rows: Array, spread: Array) -> tuple[Array, Array | None]:
+        """The same in two: scores of danger, and (..., K, N) of staying within what the logs have shown, if rows are
+        to: 1 at the end of it. A margin that moves is one of danger alone."""
         after = rows[..., 1:, :, :]
         if self.source == "analytic":
-            return self._within(self._analytic(after), after)
+            return self._analytic(after), None if self.shown is None else self.shown.along(after)
         score = self._barrier.along(rows, self._widening)
         if self.terminal_value:
             last = jnp.minimum(score[..., -1:, :, :], self._barrier.ahead_apart(after[..., -1:, :, :]))
             score = jnp.concatenate([score[..., :-1, :, :], last], -3)
-        score = self._where_known(score, spread / self.world.ood_threshold)
-        return self._within(self._with_analytic(score, after), after)
+        apart = spread / self.world.ood_threshold
+        beyond = jnp.maximum(apart - 1.0, 0.0)
+        if self.shown is None:
+            return self._with_analytic(score - beyond[..., None], after), None
+        known = 1.0 + STEEP * jnp.maximum(1.0 - apart, 0.0) - beyond
+        return self._with_analytic(score, after), jnp.minimum(known, self.shown.along(after))
 
     def now(self, before: Array, present: Array) -> Array:
         """(..., N, C) scores of the step that led from one state (..., N, D) to the present."""
@@ -132,17 +142,6 @@ class BarrierSource(eqx.Module):
     def _barrier(self) -> Barrier | MinBarrier:
         assert self.world.barrier is not None, "checked when it was made"
         return self.world.barrier
-
-    def _within(self, score: Array, rows: Array) -> Array:
-        """Scores (..., K, N, C), no larger than those of staying within what the logs have shown."""
-        return score if self.shown is None else jnp.minimum(score, self.shown.along(rows)[..., None])
-
-    def _where_known(self, score: Array, apart: Array) -> Array:
-        """Scores (..., K, N, C) where the ensemble disagrees by so many thresholds (..., K, N)."""
-        beyond = jnp.maximum(apart - 1.0, 0.0)[..., None]
-        if self.shown is None:
-            return score - beyond
-        return jnp.minimum(score, 1.0 + STEEP * jnp.maximum(1.0 - apart, 0.0)[..., None] - beyond)
 
     def _with_analytic(self, score: Array, x: Array) -> Array:
         return score if self.source == "learned" else jnp.minimum(score, self._analytic(x))

@@ -33,6 +33,7 @@ from ringfence.world.dynamics import Dynamics
 NEAREST = 0.02  # share of a distance that is left of it, whatever others may have done
 MAX_MARGIN = 3.0  # of an adapting margin
 RATE = 0.1  # Adam's, of refined actions
+WITHIN = 1.0  # score at the end of what the logs have shown
 
 
 # The present (B, N, D), for how long others were not seen, and who is driven (B, N).
@@ -152,8 +153,11 @@ class Guard(eqx.Module):
         return rows.at[..., entries].set(offset * share[..., None])
 
     def clear(self, rows: Array, spread: Array, margin: Array, unseen: Array | None = None) -> Array:
-        """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst."""
-        return lowest(self.barrier.along(self.nearer(rows, unseen), spread) - _over(margin, 2))
+        """(B, P, K, N) by how much the scores of predicted rows pass the margins; of several constraints the worst. The
+        logs are stayed within whatever margin is kept."""
+        danger, support = self.barrier.danger_and_support(self.nearer(rows, unseen), spread)
+        clear = lowest(danger - _over(margin, 2))
+        return clear if support is None else jnp.minimum(clear, support - WITHIN)
 
     def missing(self, present: Array, clear: Array, margin: Array) -> Array:
         """(B, K, N) how much predicted rows, clear of the margins by so much (B, K, N), fall short of the condition: 0

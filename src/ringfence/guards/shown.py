@@ -19,7 +19,8 @@ from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
-FAR = 1e3  # score of the others
+FAR = 10.0  # times the range inside it, of what has no range
+LOOSE = 0.05  # the same of what is no place, in rows that are far ahead
 
 
 class Shown(eqx.Module):
@@ -28,6 +29,7 @@ class Shown(eqx.Module):
     low: tuple[float, ...] = eqx.field(static=True)  # of entries
     high: tuple[float, ...] = eqx.field(static=True)
     entries: tuple[int, ...] = eqx.field(static=True)
+    places: tuple[bool, ...] = eqx.field(static=True)  # of these: what goes on by a velocity
     nearest: tuple[tuple[causes.Cause, float, float], ...] = eqx.field(static=True)  # least length, and range of it
 
     @classmethod
@@ -48,13 +50,17 @@ class Shown(eqx.Module):
                 "within_logs keeps to what varies in the logs, and no entry of an agent does; leave it out."
             )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
-        return cls(low, high, tuple(names.index(name) for name in known), nearest)
+        places = tuple(_is_place(name, names) for name in known)
+        return cls(low, high, tuple(names.index(name) for name in known), places, nearest)
 
     def along(self, x: Array) -> Array:
-        """(..., K, N) of predicted rows (..., K, N, D): those for which a proposal is held count."""
+        """(..., K, N) of predicted rows (..., K, N, D). Places count in all of them, since it may take long to brake.
+        What is no place may leave its range by a little after the rows for which a proposal is held: cars that brake
+        are predicted to come to less than a stop."""
         soon = self.score(x[..., :ASKED, :, :])
-        later = max(x.shape[-3] - ASKED, 0)
-        return jnp.concatenate([soon, jnp.full((*x.shape[:-3], later, x.shape[-2]), FAR)], -2)
+        slack = np.where(self.places, SLACK, LOOSE)
+        later = _in_margins((self._inside(x[..., ASKED:, :, :]) + slack).min(-1, initial=FAR))
+        return jnp.concatenate([soon, later], -2)
 
     @staticmethod
     def known(world: World) -> bool:
@@ -65,13 +71,28 @@ class Shown(eqx.Module):
     def score(self, x: Array) -> Array:
         """(..., N) of features (..., N, D), in margins: 1 at the end of what was shown, more inside, a half where that
         is as far outside as it is wide, and never below 0, so that danger that is known counts for more."""
-        low, high = np.array(self.low), np.array(self.high)
-        read = x[..., np.array(self.entries, int)]
-        inside = [jnp.minimum(read - low, high - read) / (high - low)]
+        inside = [self._inside(x)]
         for cause, least, width in self.nearest:
             inside.append((values_of(cause, x)[..., 0] - least) / max(width, 1e-6))
-        steps = STEEP * (jnp.concatenate(inside, -1).min(-1) + SLACK)
-        return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
+        return _in_margins(jnp.concatenate(inside, -1).min(-1) + SLACK)
+
+    def _inside(self, x: Array) -> Array:
+        """(..., N, M) how far within its range every entry is, as a share of that."""
+        low, high = np.array(self.low), np.array(self.high)
+        read = x[..., np.array(self.entries, int)]
+        return jnp.minimum(read - low, high - read) / (high - low)
+
+
+def _in_margins(inside: Array) -> Array:
+    """Scores of so large shares of a range inside it."""
+    steps = STEEP * inside
+    return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
+
+
+def _is_place(name: str, names: list[str]) -> bool:
+    """Whether an entry goes on by a velocity: a place, or what has a velocity of its name."""
+    whose, _, what = name.partition(".")
+    return what in ("x", "y", "z") or f"{whose}.v{what}" in names
 
 
 def _varying(world: World) -> list[str]:
