@@ -307,12 +307,16 @@ def test_who_never_went_backwards_is_not_predicted_to():
     """Nobody brakes at rest in logs of cars, so networks do not learn that they stay where they are."""
     heading = causes.Heading((0, 1), (2, 3))
     assert causes.Heading.of(["own.vx", "own.vy", "own.cos", "own.sin"]) == heading
-    assert causes.Heading.of(["own.speed", "own.cos", "own.sin"]) == causes.Heading((0,))
+    assert causes.Heading.of(["own.speed", "own.cos", "own.sin"]) == causes.Heading((0,), (1, 2))
     assert causes.Heading.of(["own.vx", "own.vy"]) is None
+    seeing = causes.Heading.of(["own.v", "own.cos", "own.sin", "thing_a.dvy", "own.dvx", "other1.dvx", "other1.dx"])
+    assert seeing == causes.Heading((0,), (1, 2), ((3, 1), (5, 0)))
+    moved = seeing.no_slower(jnp.array([-1.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0]), 0.0)
+    np.testing.assert_allclose(moved, [0, 0.6, 0.8, -0.8, 0, -0.6, 0], atol=1e-6)
     back = jnp.array([[-0.6, -0.8, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]])
     np.testing.assert_allclose(heading.no_slower(back, 0.0), [[0, 0, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]], atol=1e-6)
     np.testing.assert_allclose(heading.no_slower(back, -0.5)[0, :2], [-0.3, -0.4], atol=1e-6)
-    np.testing.assert_allclose(causes.Heading((0,)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
+    np.testing.assert_allclose(causes.Heading((0,), (1, 2)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
 
 
 def test_a_car_that_brakes_at_rest_stays(tmp_path):

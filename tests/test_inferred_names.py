@@ -70,6 +70,32 @@ def test_what_is_there_twice_is_named_once():
     assert inferred_names(twice, numbers(len(true) + 2), first)[: len(true)] == true
 
 
+def test_where_a_body_heads_for_and_what_else_moves():
+    """A direction that velocities are along; a place that goes on by a velocity less one's own."""
+    g = np.random.default_rng(0)
+    shape = (20, 31, 2)
+    turn = g.normal(size=shape).cumsum(1) * 0.3
+    pace = np.abs(g.normal(size=shape).cumsum(1) * 0.2)
+    look = np.stack([np.cos(turn), np.sin(turn)], -1)
+    speed = pace[..., None] * look
+    place = g.normal(size=(20, 1, 2, 2)) * 3 + DT * speed.cumsum(1)
+    phase = 0.05 * np.arange(31)[:, None, None] + g.random((20, 1, 1, 1)) * 6
+    thing = np.concatenate([np.cos(phase), np.sin(phase)], -1)
+    drift = 0.05 / DT * np.concatenate([-np.sin(phase), np.cos(phase)], -1)
+    who = features.others(2)
+    seen = [(x[:, :, who] - x[:, :, :, None])[..., 0, :] for x in (place, speed)]
+    x = np.concatenate([look, speed, *seen, thing - place, drift - speed], -1)
+    fields = [f"thing_a.d{k}{axis}" for k in ("", "v") for axis in "xy"]
+    others = [f"other0.d{k}{axis}" for k in ("", "v") for axis in "xy"]
+    true = ("own.cos", "own.sin", "own.vx", "own.vy", *others, *fields)
+    flat = x.reshape(-1, *x.shape[2:]).astype(np.float32)
+    assert inferred_names(flat, numbers(len(true)), np.arange(20) * 31) == true
+    sideways = flat.copy()
+    sideways[..., :2] = flat[..., [1, 0]] * [-1, 1]
+    found = inferred_names(sideways, numbers(len(true)), np.arange(20) * 31)
+    assert found == ("obs0", "obs1", *true[2:]), "nobody moves along that direction"
+
+
 def test_others_by_distance_are_not_named():
     x, true, first = team()
     seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)

@@ -2,13 +2,15 @@
 
 What an agent sees of another is, number for number, that other's own entry less its own; and what two see of each other
 is the same with the opposite sign. Nothing else in logs is so exact, so such entries may be named as if somebody had:
-`other0.dx` of agent 0 is minus `other0.dx` of agent 1. Their velocities, one's own place and what stands still follow.
+`other0.dx` of agent 0 is minus `other0.dx` of agent 1. Their velocities, one's own place, what stands still, what else
+moves and where a body heads for follow.
 """
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +20,7 @@ FEWEST = 50  # below which nothing is said
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
+LESS = 0.5  # of a change that is left of that of a velocity relative to one's own, once one's own is added
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
 AXES = "xyz"
 SAID = re.compile(r"own\.|other\d+\.")
@@ -55,6 +58,8 @@ def inferred_names(
     for axis, place in zip(AXES, moving):
         found |= _of_axis(steps, place, axis)
     found |= dict(_still(steps, moving, set(found)))
+    found |= _heading(steps, found)
+    found |= dict(_things(steps, found))
     return tuple(name if name in keep else found.get(entry, name) for entry, name in enumerate(names))
 
 
@@ -186,3 +191,48 @@ def _still(steps: _Steps, places: Sequence[_Field], named: set[int]) -> Iterator
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*found)):
         for axis, entry in zip(AXES, entries):
             yield entry, f"still_{letter}.d{axis}"
+
+
+def _heading(steps: _Steps, found: Mapping[int, str]) -> dict[int, str]:
+    """Names of two entries that are a direction, in which a body moves that has one: its velocity is along it."""
+    at = {name: entry for entry, name in found.items()}
+    if not {"own.vx", "own.vy"} <= set(at):
+        return {}
+    velocity = steps.before[..., [at["own.vx"], at["own.vy"]]].reshape(-1, 2)
+    speed = np.linalg.norm(velocity, axis=-1)
+    moves = speed > np.median(speed)
+    if not moves.any():
+        return {}
+    free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
+    for cos, sin in itertools.permutations(free, 2):
+        direction = steps.before[..., [cos, sin]].reshape(-1, 2)
+        if (np.abs(np.linalg.norm(direction, axis=-1) - 1.0) > EXACT).mean() > 1 - SHARE:
+            continue
+        ahead = (velocity * direction).sum(-1)
+        if (ahead[moves] >= (1 - LIKE) * speed[moves]).mean() >= SHARE:
+            return {cos: "own.cos", sin: "own.sin"}
+    return {}
+
+
+def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]:
+    """Entries that tell where things are that move by themselves: places with a velocity that is relative to one's
+    own."""
+    at = {name: entry for entry, name in found.items()}
+    pairs = []
+    for axis in AXES:
+        if (own := at.get(f"own.v{axis}")) is None:
+            break
+        free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
+        speeds = [e for e in free if _is_relative(steps, e, own)]
+        pairs.append([(p, s) for s in speeds for p in free if p != s and _unlike(steps, [p], [s]) <= LIKE])
+    for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*pairs)):
+        for axis, (place, speed) in zip(AXES, entries):
+            yield place, f"thing_{letter}.d{axis}"
+            yield speed, f"thing_{letter}.dv{axis}"
+
+
+def _is_relative(steps: _Steps, entry: int, own: int) -> bool:
+    """Whether an entry changes against one's own velocity, and by little else."""
+    change = steps.change([entry])[..., 0].ravel()
+    left = change + steps.change([own])[..., 0].ravel()
+    return bool(np.quantile(np.abs(left), SHARE) < LESS * np.quantile(np.abs(change), SHARE))

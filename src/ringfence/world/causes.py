@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from ringfence.types import Array
 
 WIDEST = 4  # entries of one cause
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
+RELATIVE = re.compile(r"(?!own\.)[a-z_]+\d*\.dv[xy]")  # how fast things move, less one's own velocity
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -112,11 +114,12 @@ def offsets(names: Sequence[str]) -> list[Cause]:
 
 
 class Heading(msgspec.Struct, frozen=True):
-    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity and that direction, or its
-    speed."""
+    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity, or its speed, and that
+    direction."""
 
-    velocity: tuple[int, ...]
-    direction: tuple[int, ...] = ()
+    velocity: tuple[int, ...]  # two, or the speed
+    direction: tuple[int, int]
+    relative: tuple[tuple[int, int], ...] = ()  # velocities of things less one's own, and along which axis
 
     @classmethod
     def of(cls, names: Sequence[str]) -> Heading | None:
@@ -124,27 +127,37 @@ class Heading(msgspec.Struct, frozen=True):
         at = {name: d for d, name in enumerate(names)}
         if not {"own.cos", "own.sin"} <= set(at):
             return None
+        direction = at["own.cos"], at["own.sin"]
+        relative = [(d, "xy".index(name[-1])) for name, d in at.items() if RELATIVE.fullmatch(name)]
         if {"own.vx", "own.vy"} <= set(at):
-            return cls((at["own.vx"], at["own.vy"]), (at["own.cos"], at["own.sin"]))
+            return cls((at["own.vx"], at["own.vy"]), direction, tuple(relative))
         speed = next((at[name] for name in ("own.v", "own.speed") if name in at), None)
-        return None if speed is None else cls((speed,))
+        return None if speed is None else cls((speed,), direction, tuple(relative))
+
+    @property
+    def about(self) -> tuple[int, ...]:
+        """Entries that are relative to the velocity."""
+        return tuple(entry for entry, _ in self.relative)
 
     def speed(self, x: Any) -> Any:
         """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
-        if not self.direction:
+        if len(self.velocity) == 1:
             return x[..., self.velocity[0]]
         cos, sin = (x[..., d] for d in self.direction)
         vx, vy = (x[..., v] for v in self.velocity)
         return (vx * cos + vy * sin) / (cos**2 + sin**2 + 1e-9) ** 0.5
 
     def no_slower(self, x: Array, least: float) -> Array:
-        """Features (..., D) with that speed ahead at least."""
+        """Features (..., D) with that speed ahead at least, and what is relative to it as much less."""
         lacks = jnp.maximum(least - self.speed(x), 0.0)[..., None]
-        if not self.direction:
-            return x.at[..., np.array(self.velocity)].add(lacks)
         direction = x[..., np.array(self.direction)]
         length = jnp.sqrt((direction**2).sum(-1, keepdims=True) + 1e-9)
-        return x.at[..., np.array(self.velocity)].add(lacks * direction / length)
+        faster = lacks * direction / length
+        x = x.at[..., np.array(self.velocity)].add(faster if len(self.velocity) == 2 else lacks)
+        if not self.relative:
+            return x
+        axes = np.array([axis for _, axis in self.relative])
+        return x.at[..., np.array(self.about)].add(-faster[..., axes])
 
 
 def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:

@@ -105,7 +105,9 @@ def fit_view(
     content += [settings.miscoverage, settings.barrier]
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
-    content += [AHEAD] if Heading.of(map.names) else []
+    heading = Heading.of(map.names)
+    content += [AHEAD] if heading else []
+    content += ["with what is relative to it"] if heading and not set(heading.about) <= set(map.follows) else []
     file = parts.file("world", list(PARTS), content)
     if cached and (kept := _kept_world(file, map)) is not None:
         return kept
