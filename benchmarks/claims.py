@@ -31,6 +31,7 @@ RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 PROVING = "results/proving"
+CROWD = "results/replay/students03.json"
 PEDESTRIANS = "results/stress/pedestrians.csv"
 STRESS = "results/stress/crossing.csv"
 SHOWN = 80  # letters of a sentence in the table
@@ -134,6 +135,17 @@ def of_pedestrians() -> tuple[bool, str]:
     names = sorted({r["faults"] for r in rows if re.fullmatch(r"(delay|drop)[\d.]+", r["faults"])})
     shares = {name: left(name, "shield, compensated") / left(name, "shield") for name in names}
     return len(shares) == 6 and max(shares.values()) <= 0.5, f"{max(shares.values()):.2f} at most, of {len(shares)}"
+
+
+def of_a_crowd() -> tuple[bool, str]:
+    """Of the contacts that five drivers make among filmed pedestrians: within the logs, and beyond."""
+    found = json.loads((ROOT / CROWD).read_text())
+    shares = []
+    for rows in (found["rows"], found["beyond the logs"]):
+        shield = [row for row in rows if row["filter"] == "shield"]
+        shares.append(sum(row["prevented"] for row in shield) / sum(row["alone"] for row in shield))
+    within, beyond = shares
+    return 0.72 < within < 0.78 and beyond < 0.5, f"{100 * within:.0f} and {100 * beyond:.0f} %"
 
 
 def of_filters() -> tuple[bool, str]:
@@ -599,6 +611,12 @@ CLAIMS = (
         "eight",
         PROVING,
         of_bad_driving,
+    ),
+    Claim(
+        "docs/replay-results.md",
+        "The shield prevents three quarters there, beyond the logs less than half",
+        CROWD,
+        of_a_crowd,
     ),
     Claim(
         "docs/stress.md",

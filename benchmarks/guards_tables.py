@@ -76,6 +76,7 @@ def main() -> None:
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
     put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
     put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", filtered=False))
+    put("docs/proving-ground.md", "drawn", proving(RESULTS / "proving" / "drawn", "*.json", filtered=False))
     put("docs/crossing-results.md", "tiers", tiers())
     put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
     put("docs/crossing-results.md", "proposals", proposals())
@@ -220,11 +221,19 @@ def proving(folder: Path, files: str, filtered: bool = True) -> str:
     for file in sorted(folder.glob(files)):
         found = json.loads(file.read_text())
         causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
-        name = found["task"].removeprefix("proving-").removeprefix("other-")
-        cells = [f"`{name}`", found["verdict"], "; ".join(causes) or "none"]
+        name = found["task"].removeprefix("proving-").removeprefix("other-").removeprefix("drawn-")
+        cells = [f"`{name}`{_in_words(found.get('system'))}", found["verdict"], "; ".join(causes) or "none"]
         cells += [_share_and_return(found["rows"].get(row)) for row in rows]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _in_words(system: dict | None) -> str:
+    """What was drawn."""
+    if system is None:
+        return ""
+    unnamed = ", no names" if system["names"] == "none" else ""
+    return f": {system['n_agents']} {system['body']}, {' and '.join(system['danger'])}{unnamed}"
 
 
 def _in_short(cause: str) -> str:
