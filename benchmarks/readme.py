@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +73,8 @@ UNSHOWN = re.compile(
 def main() -> None:
     put("README.md", "front", front())
     put("docs/replay-results.md", "drivers", replayed_drivers())
-    put("docs/replay-results.md", "recordings", replayed_recordings())
+    put("docs/replay-results.md", "recordings", replayed_recordings(RECORDINGS))
+    put("docs/replay-results.md", "machines", replayed_recordings(MACHINES))
     put("docs/tables.md", "summary", summary())
     put("docs/tables.md", "table", spread(grouped("simple_spread")))
     measured = grouped("mujoco")
@@ -155,6 +156,7 @@ FILTERS = {
     "formula, 2 s": ("rows", "formula"),
     "constant-velocity brake": ("rows", "brake"),
 }
+MACHINES = ("a-den", "b-den", "town")
 RECORDINGS = ("zara02", "seq_hotel", "zara01", "seq_eth", "students03")
 DRIVERS = {"bc": "clone (`bc`)", "straight": "", "accelerate": "", "hasty": "", "seek": ""}
 
@@ -169,11 +171,11 @@ def replayed_drivers() -> str:
     return "\n".join(lines)
 
 
-def replayed_recordings() -> str:
+def replayed_recordings(names: Sequence[str]) -> str:
     """The same of all drivers together, by recording."""
     lines = [f"| recording | verdict | windows | contacts | {' | '.join(FILTERS)} |"]
     lines.append("|---" * (4 + len(FILTERS)) + "|")
-    for name in RECORDINGS:
+    for name in names:
         found = json.loads((RESULTS / "replay" / f"{name}.json").read_text())
         lines.append(f"| `{name}` | {found['verdict']} | {found['windows']} | {_filtered(found, set(DRIVERS))} |")
     return "\n".join(lines)
