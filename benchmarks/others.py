@@ -3,8 +3,8 @@
     python benchmarks/others.py results/proving/others [--systems x1 x5] [--episodes 100] [--rows "bc none" ...]
 
 Rows as `benchmarks/proving.py` has them. Three of the systems have chosen something: `x1` that nothing has its margin
-out of distribution, `x2` that names are looked for in logs, `x5` that every agent has a way out of its own. The others
-have chosen nothing.
+out of distribution and that nobody is predicted to go backwards, `x2` that names are looked for in logs, `x5` that
+every agent has a way out of its own. The others have chosen nothing.
 """
 
 import argparse
