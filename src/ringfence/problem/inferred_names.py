@@ -223,8 +223,13 @@ def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]
         if (own := at.get(f"own.v{axis}")) is None:
             break
         free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
-        speeds = [e for e in free if _is_relative(steps, e, own)]
-        pairs.append([(p, s) for s in speeds for p in free if p != s and _unlike(steps, [p], [s]) <= LIKE])
+        pairs.append([])
+        for speed in [e for e in free if _is_relative(steps, e, own)]:
+            off = {e: _unlike(steps, [e], [speed]) for e in free if e != speed}
+            place = min(off, key=off.__getitem__, default=speed)
+            if place != speed and off[place] <= LIKE:
+                pairs[-1].append((place, speed))
+                free.remove(place)
     for letter, entries in zip("abcdefghijklmnopqrstuvwxyz", zip(*pairs)):
         for axis, (place, speed) in zip(AXES, entries):
             yield place, f"thing_{letter}.d{axis}"

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from ringfence.envs.proving.system import System
 
-# Settings of the library are chosen elsewhere, but for five things: `drones` told how fast scores fall out of
-# distribution where a guard stays within the logs (guards/barrier.py), `drones`, `couriers` and `convoy` which rows of a
-# plan are to stay within them (guards/shown.py), `convoy` and `crowd` how much near rows count (guards/correction.py),
-# and `gears` had names looked for in logs (problem/inferred_names.py).
+# Settings of the library are chosen elsewhere, but for these: `drones` told how fast scores fall out of distribution
+# where a guard stays within the logs (guards/barrier.py), `drones`, `couriers` and `convoy` which rows of a plan are to
+# stay within them (guards/shown.py), `convoy` and `crowd` how much near rows count (guards/correction.py), and `gears`
+# had names looked for in logs (problem/inferred_names.py).
 TEST: dict[str, System] = {
     "discs": System("integrator", ("mover", "pairs"), 3, mover=(0.35, 1.0, 16.0)),
     "posts": System("integrator", ("pairs", "posts"), 4, drag=0.3),
