@@ -138,6 +138,16 @@ def of_pedestrians() -> tuple[bool, str]:
     return len(shares) == 6 and max(shares.values()) <= 0.5, f"{max(shares.values()):.2f} at most, of {len(shares)}"
 
 
+def of_shielded_pool() -> tuple[bool, str]:
+    """Generators of the pool of experts under a shield, and the same without."""
+    rows = json.loads((ROOT / POOL).read_text())["rows"]
+    pairs = {name: (rows[name], rows[f"{name}, under shield"]) for name in rows if f"{name}, under shield" in rows}
+    cost = max(shield["cost_safe_start"] for _, shield in pairs.values())
+    more = {name: shield["return_norm"] - alone["return_norm"] for name, (alone, shield) in pairs.items()}
+    found = ", ".join(f"{name} {x:+.3f}" for name, x in more.items())
+    return cost < 0.005 and min(more.values()) >= 0, f"cost {cost:.3f} at most; {found}"
+
+
 def of_drawn_systems() -> tuple[bool, str]:
     """Guards by the Worlds of systems drawn at random that call themselves fit."""
     found = [json.loads(file.read_text()) for file in sorted((ROOT / DRAWN).glob("*.json"))]
@@ -600,6 +610,12 @@ CLAIMS = (
             "flow, 8 steps, guided by danger",
             lambda row, data: row["cost_safe_start"] == 0.0 and row["paired"]["return_norm_interval"][0] >= 0.0,
         ),
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "Under a shield none costs anything from safe starts**, and none earns less in the mean",
+        POOL,
+        of_shielded_pool,
     ),
     Claim(
         "README.md",

@@ -83,12 +83,6 @@ def posts(rng: np.random.Generator, body: str, side: float) -> tuple[tuple[float
     return tuple((round(float(x), 2), round(float(y), 2), round(float(rng.uniform(0.2, 0.4)), 2)) for x, y in places)
 
 
-def task_of(system: System, name: str) -> str:
-    room = TASKS["proving-dev-room"]
-    TASKS[name] = dataclasses.replace(room, name=name, env=system, homogeneous=system.homogeneous)
-    return name
-
-
 def logged_danger(task: str) -> float | None:
     """Share of logged steps that cost; nothing where agents find no room."""
     try:
@@ -110,7 +104,7 @@ def main() -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     kept = 0
     for k, system in enumerate(drawn(given.seed)):
-        task = task_of(system, f"proving-drawn-{given.seed}-{k}")
+        task = proving.task_of(system, f"proving-drawn-{given.seed}-{k}")
         share = logged_danger(task)
         if share is None or not SHARE[0] <= share <= SHARE[1]:
             print(task, "left out:", "no room" if share is None else f"{100 * share:.2f} % of steps cost", flush=True)

@@ -8,12 +8,10 @@ every agent has a way out of its own. The others have chosen nothing.
 """
 
 import argparse
-import dataclasses
 from pathlib import Path
 
 import proving
 
-from ringfence.datasets.registry import TASKS
 from ringfence.envs import System
 
 SYSTEMS = {
@@ -40,10 +38,7 @@ def main() -> None:
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
     for name in given.systems:
-        task = f"proving-other-{name}"
-        system = SYSTEMS[name]
-        room = TASKS["proving-dev-room"]
-        TASKS[task] = dataclasses.replace(room, name=task, env=system, homogeneous=system.homogeneous)
+        task = proving.task_of(SYSTEMS[name], f"proving-other-{name}")
         proving.tell(proving.system(task, given.runs, given.episodes, given.rows, given.out / f"{name}.json"))
 
 

@@ -19,8 +19,8 @@ from ringfence.world.cause_nets import values_of
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
-FAR = 10.0  # times the range inside it, of what has no range
 LOOSE = 0.05  # the same of what is no place, in rows that are far ahead
+FAR = 10.0  # times the range inside it, of what has no range
 
 
 class Shown(eqx.Module):
