@@ -12,6 +12,7 @@ import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -46,6 +47,8 @@ ROWS = {
     "flow, 4 steps": ("flow", "default", FLOW, {"sampling_steps": 4}),
     "flow, guided by danger": ("flow", "default", FLOW, {"barrier_guidance": 1.0}),
     **{f"flow, λ = {w:g}": ("flow", "default", FLOW | {"barrier_weight": w}, {}) for w in (0.1, 0.3, 1.0)},
+    "flow, 2 steps": ("flow", "default", FLOW, {"sampling_steps": 2}),
+    "flow, 2 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 2, "barrier_guidance": 1.0}),
     "flow, 8 steps": ("flow", "default", FLOW, {"sampling_steps": 8}),
     "flow, 8 steps, guided by danger": ("flow", "default", FLOW, {"sampling_steps": 8, "barrier_guidance": 1.0}),
     "flow, one driver": ("flow", "default", FLOW | {"drivers": 1}, {}),
@@ -79,10 +82,10 @@ _GUARDED = (
 ROWS |= {
     f"{name}, under {guard}": (*ROWS[name][:-1], ROWS[name][-1] | {"guard": guard})
     for name in _GUARDED
-    for guard in ("shield", "full")
+    for guard in ("shield", "adapt", "full")
 }
 # Rows that are compared with another of the same runs, on the same resets.
-PAIRED = {"flow, guided by danger": "flow", "flow, 8 steps, guided by danger": "flow, 8 steps"}
+PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,23 @@ def per_episode(results: list[dict], what: str) -> np.ndarray:
     return np.array([r["per_episode"][what] for r in results], float)
 
 
+def of_data(store: EpisodeStore, task: Task) -> dict:
+    """What the logs earned, and each of their drivers where the card says whose an episode is."""
+    returns = task.normalised_return(store.returns)
+    found: dict[str, Any] = {"return_norm": round(float(returns.mean()), 4)}
+    if store.card.extra.get("driver_of_episode") == TURNS:
+        drivers = len(store.card.extra["drivers"])
+        found["of_drivers"] = [round(float(returns[k::drivers].mean()), 4) for k in range(drivers)]
+    return found
+
+
+def few(results: list[dict]) -> dict:
+    """What every episode earned and cost, of robots', which are few: rows of other runs are compared by them."""
+    if results[0]["episodes"] > OF_ROBOTS:
+        return {}
+    return {"per_episode": {k: per_episode(results, k).round(2).tolist() for k in ("return", "cost")}}
+
+
 def differences(results: list[dict], others: list[dict], task: Task) -> dict:
     """What results have more than others of the same runs and resets: return, and cost of episodes that start safe."""
     earned = task.normalised_return(per_episode(results, "return")) - task.normalised_return(
@@ -183,6 +203,7 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
     given = options
     if "barrier_guidance" in options or "guard" in options:
         given = options | {"world": worlds.fit(store, task=task)}  # the same for all seeds
+        given |= {"anyway": True} if "guard" in options else {}
     episodes = episodes_of(task)
     results = [evaluate(run, episodes=episodes, **given) for run in trained]
     returns = task.normalised_return(per_episode(results, "return"))
@@ -201,6 +222,7 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
         "return_norm_interval": [round(x, 4) for x in mean_of_runs(returns)],
         "return_norm_of_seeds": [round(float(r["return_norm"]), 4) for r in results],
         "cost_interval": [round(x, 4) for x in mean_of_runs(per_episode(results, "cost"), least=0.0)],
+        **few(results),
         **paired,
         "drivers_purity": purity(trained[0], store),
         "milliseconds": milliseconds(trained[0], store, given),
@@ -215,6 +237,8 @@ def table() -> str:
     for file in sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"}):
         found = json.loads(file.read_text())
         lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
+        if drivers := found["data"].get("of_drivers"):
+            lines.append(f"| its best driver of {len(drivers)} | | {max(drivers):.3f} | | |")
         for name in ROWS:
             if name in found["rows"]:
                 r = found["rows"][name]
@@ -240,7 +264,8 @@ def main() -> None:
         store, _ = make(task)
         file = given.out / f"{name}.json"
         found = json.loads(file.read_text()) if file.exists() else {"task": name, "episodes": episodes_of(task)}
-        found["data"] = {"return_norm": round(float(task.normalised_return(store.returns.mean())), 4)}
+        found["data"] = of_data(store, task)
+        file.write_text(json.dumps(found, indent=1) + "\n")
         rows = found.setdefault("rows", {})
         for which in given.rows:
             if which in rows and len(rows[which]["seeds"]) >= given.seeds:
