@@ -22,7 +22,7 @@ from evidence import LEVEL, difference, evaluations, mean, of, tasks_of
 from readme import put
 from scipy.stats import spearmanr
 
-from ringfence.evaluation.statistics import mean_of_runs, upper_bound
+from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.report import board, standings
 from ringfence.utils import stored
 
@@ -294,12 +294,24 @@ def contact(suite: str, row, low: float, high: float, task: str = "crossing-hast
     return check
 
 
+def has_to_have_seen() -> tuple[bool, str]:
+    """Logs with contact in one episode of twenty teach a World that leaves most with it; of naive drivers, none."""
+    words = "logs of IR-SIM"
+    few, many = (
+        [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight naive")
+    )
+    text = " / ".join(f"{100 * x:.3g} %" for x in (*few, *many))
+    return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {text} of episodes"
+
+
 def crossing_rare() -> tuple[bool, str]:
-    runs = of("crossing", "crossing-hasty", ("bc", "default+shield-learned"))
-    touched = sum(round(r["violation_rate"] * r["episodes"]) for r in runs.values())
-    episodes = sum(r["episodes"] for r in runs.values())
-    bound = upper_bound(touched, next(iter(runs.values()))["episodes"])
-    return (touched, episodes) == (1, 5000), f"{touched} of {episodes} episodes; at most {100 * bound:.2g} % of resets"
+    """Contact under the shield, on all tiers of Crossing's discs."""
+    row = ("bc", "default+shield-learned")
+    tiers = [f"crossing-{tier}" for tier in ("hasty", "mixed", "careful", "random")]
+    runs = [r for tier in tiers for r in of("crossing", tier, row).values()]
+    touched = sum(round(r["violation_rate"] * r["episodes"]) for r in runs)
+    episodes = sum(r["episodes"] for r in runs)
+    return (touched, episodes) == (1, 4000), f"{touched} of {episodes} episodes, one seed"
 
 
 def rows_of(file: str, **where: str) -> list[dict[str, str]]:
@@ -420,16 +432,6 @@ def no_size_touches() -> tuple[bool, str]:
     return left == 0 and len(rows) >= 24, f"{len(rows)} rows, at most {left:g} steps"
 
 
-def has_to_have_seen() -> tuple[bool, str]:
-    """Logs with contact in one episode of twenty teach a World that leaves most with it; of naive drivers, none."""
-    words = "logs of IR-SIM"
-    few, many = (
-        [float(r["episodes with contact"]) for r in of_irsim(w)] for w in (words, f"{words}, two of eight naive")
-    )
-    text = " / ".join(f"{100 * x:.3g} %" for x in (*few, *many))
-    return min(few) > 0.6 and max(many) == 0, f"8 and 16 robots, both logs: {text} of episodes"
-
-
 def error_costs_nothing() -> tuple[bool, str]:
     """The simulator itself as the World's dynamics: intervals of return and cost reach 0 under shield and `full`."""
     rows = rows_of("ablations.csv", way="the true dynamics")
@@ -498,7 +500,12 @@ CLAIMS = (
         "results/guards-mujoco/table.csv",
         robots_kept("bc", "default+full-learned", 17),
     ),
-    Claim("docs/crossing-results.md", "1 of 5000", "results/crossing/table.csv", crossing_rare),
+    Claim(
+        "docs/crossing-results.md",
+        "the shield leaves contact in 1 of 4000 episodes",
+        "results/crossing/table.csv",
+        crossing_rare,
+    ),
     Claim(
         "docs/crossing-results.md",
         "V with one predicted step or three is as safe",
@@ -510,12 +517,6 @@ CLAIMS = (
         "a return-conditioned clone earns 4.94 under the same shield",
         "results/crossing-guards/table.csv",
         told_clones_earn,
-    ),
-    Claim(
-        "docs/crossing-results.md",
-        "the shield touches in 85 %",
-        "results/crossing/table.csv",
-        contact("crossing", ("bc", "default+shield-learned"), 0.83, 0.87, "crossing-careful"),
     ),
     Claim(
         "docs/crossing-results.md",
@@ -531,7 +532,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/crossing-results.md",
-        "A barrier needs to have seen danger",
+        "a World of their logs leaves most episodes with contact",
         "results/other_simulator.csv",
         has_to_have_seen,
     ),

@@ -1,4 +1,4 @@
-"""Eight more systems in one seed, drawn when the proving ground's sixteen were fixed: what is left to learn of danger.
+"""More systems in one seed, drawn when the proving ground's sixteen were fixed: what is left to learn of danger.
 
     python benchmarks/others.py results/proving/others [--systems x1 x5] [--episodes 100] [--rows "bc none" ...]
 
@@ -25,6 +25,9 @@ SYSTEMS = {
     "x6": System("motor", ("apart", "speed"), 3, lag=0.2, goals="team", apart_limit=0.6, speed_limit=1.2),
     "x7": System("integrator", ("battery", "mover"), 2, costs="each", drag=0.2, episode_length=120),
     "x8": System("unicycle", ("pairs",), 8, homogeneous=True, costs="each", side=6.0),
+    # What is touched throws a body back, so that nobody is ever logged within danger.
+    "x9": System("integrator", ("posts", "walls", "pairs"), 3, side=4.5, rebound=0.4),
+    "x10": System("unicycle", ("walls", "posts"), 4, side=6.0, names="none", rebound=0.3, episode_length=100),
 }
 
 

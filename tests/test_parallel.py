@@ -145,7 +145,10 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
 
     cases = (
         (lambda: object(), "without possible_agents; give a PettingZoo ParallelEnv"),
-        (lambda: made(_observations=wide)(n_agents=2), "has 2 agents, the run was trained with 3.$"),
+        (
+            lambda: made(_observations=wide)(n_agents=2),
+            "has 2 agents, the run was trained with 3; give a simulator of 3",
+        ),
         (lambda: SimpleSpreadParallel(n_agents=2), r"shape \(2, \d+\), this run takes \(3, 18\)"),  # said first
         (made(_observations=lambda self: dict.fromkeys(self.possible_agents, np.zeros(5))), r"shape \(3, 5\)"),
         (made(step=early), "agent_1 ended at step 1 before its team"),
@@ -162,9 +165,17 @@ def test_a_simulator_that_does_not_fit_is_refused(run):
     shared = SimpleSpreadParallel()
     with pytest.raises(UserError, match="gave the same SimpleSpreadParallel twice"):
         play(run, lambda: shared, episodes=2)
+    with pytest.raises(UserError, match="SimpleSpreadParallel and not what makes one; give SimpleSpreadParallel"):
+        play(run, shared)
+    with pytest.raises(UserError, match="still is a function and no run; give ringfence.guard"):
+        play(still, SimpleSpreadParallel)
     with pytest.raises(UserError, match="episodes=0 must be a whole number from 1"):
         play(run, SimpleSpreadParallel, episodes=0)
     assert resolve.load_job(run).task.cost_limit == 3
+
+
+def still(observations, state):
+    return np.zeros((len(observations), 3, 2))
 
 
 class Odd(SimpleSpreadParallel):

@@ -198,6 +198,17 @@ def test_the_commands_name_another_number_of_agents(runs):
     assert sum("--agents 5" in line for line in lines) == 1 and not any("--agents 3" in line for line in lines)
 
 
+def test_the_commands_of_own_data_give_the_guard_its_world(runs):
+    (section,) = sections(runs)
+    result = {**runs[0].results["split"], "guard": "shield", "barrier": "learned", "execution": "centralized"}
+    result["guard_options"] = {"horizon": 7}
+    config = json.loads((runs[0].path / "config.json").read_text())
+    assert "--world" not in made._how(result, runs[0])
+    (runs[0].path / "config.json").write_text(json.dumps(config | {"task": "harbour"}))
+    words = made._how(result, runs[0])
+    assert words[words.index("--world") + 1] == "DATA.world"
+
+
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
     said = (

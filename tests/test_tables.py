@@ -10,7 +10,8 @@ import pytest
 import ringfence
 from ringfence.cli import app
 from ringfence.cli.renamed import rewritten
-from ringfence.errors import UserError
+from ringfence.errors import StoreError, UserError
+from ringfence.logs.io.columns import numbers
 from ringfence.logs.io.observe import observe
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import cut, nearest, resample, teams
@@ -442,3 +443,8 @@ def test_files_with_flipped_and_missing_bytes_are_refused_in_a_sentence_or_read(
             except UserError:
                 refused += 1
         assert refused > 20
+
+
+def test_one_word_in_a_column_of_a_file_is_named_by_its_own_row():
+    with pytest.raises(StoreError, match="row 1: x is 'foo', no number"):
+        numbers({"x": np.array(["1.0", "foo", "2.0"], object)}, "x")

@@ -101,8 +101,9 @@ class Episode:
         shapes = {np.asarray(observations[a], object).shape for a in self.agents}
         if width is not None and shapes != {(width,)}:
             self._rows(observations, self.shape.agents)
-        remedy = f"; pass agents={count} (--agents {count})" if self.shape.homogeneous else ""
-        raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}{remedy}.")
+        other = f"give a simulator of {self.shape.agents}, or train on logs of {count}"
+        remedy = f"pass agents={count} (--agents {count})" if self.shape.homogeneous else other
+        raise UserError(f"{self.name} has {count} agents, the run was trained with {self.shape.agents}; {remedy}.")
 
     @property
     def lacks_cost(self) -> bool:

@@ -202,6 +202,9 @@ def _check_bounds(env: Any, bounds: Bounds) -> None:
 
 def simulators_of(make_env: Callable[[], Any], count: int, player: Player) -> list[Any]:
     """So many simulators, each its own, in which the player can act."""
+    if not callable(make_env):
+        kind = type(make_env).__name__
+        raise UserError(f"make_env is a {kind} and not what makes one; give {kind}, or lambda: {kind}(...).")
     envs = [make_env() for _ in range(count)]
     if len({id(env) for env in envs}) < len(envs):
         raise UserError(

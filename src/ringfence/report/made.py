@@ -19,6 +19,7 @@ from ringfence.proposals.options import PLANNERS, PlanOptions
 from ringfence.report.pooling import Result
 from ringfence.report.table import Row, Section
 from ringfence.training.runs import Run
+from ringfence.training.worlds import GUARD, WORLD
 from ringfence.utils import schemas, stored
 from ringfence.utils.escape import shell
 
@@ -141,6 +142,9 @@ def _how(result: Result, run: Run) -> list[Any]:
         words += ["--guard", result["guard"], "--barrier", result["barrier"]]
         if result["execution"] != "centralized":
             words += ["--execution", result["execution"]]
+        kept = any((run.path / name).exists() for name in (GUARD, WORLD))
+        if result["barrier"] == "learned" and task is None and not kept:
+            words += ["--world", "DATA.world"]  # of data that this package does not make it has to be given
         settings |= _given(result["guard_options"], _guard_options(result, task))
     return [*words, *_set(settings)]
 

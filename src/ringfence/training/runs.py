@@ -42,6 +42,11 @@ class Run:
     @classmethod
     def of(cls, run: Run | str | Path) -> Run:
         """A run, the one in the folder that is named, or the only one below it."""
+        if callable(run):
+            raise UserError(
+                f"{getattr(run, '__name__', type(run).__name__)} is a function and no run; give "
+                "ringfence.guard(function, world), with guard='none' to see what it does alone."
+            )
         if not isinstance(run, Run | str | Path) or not str(getattr(run, "path", run)).strip():
             raise UserError(f"{str(run)[:60]!r} is no run; give the folder that `ringfence train` made.")
         if isinstance(run, Run):

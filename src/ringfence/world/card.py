@@ -44,6 +44,7 @@ class Data(Part, frozen=True):
     state_origins: list[float] | None = None
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
     inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
+    impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
 
 
 class HeldOut(Part, frozen=True):
@@ -257,6 +258,11 @@ def _of_data(card: Card) -> Iterator[str]:
     if inferred := card.data.inferred_names:
         named = ", ".join(f"{name} ({entry})" for entry, name in inferred.items())
         yield f"Nobody named these entries; what agents see of each other says what they are: {named}."
+    if card.data.impacts:
+        yield (
+            f"In {card.data.impacts} unsafe steps a body was thrown back by what it touched: danger is where it would "
+            "have been."
+        )
 
 
 def _of_prediction(card: Card) -> Iterator[str]:

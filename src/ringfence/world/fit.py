@@ -32,7 +32,7 @@ from ringfence.utils.cache import cache_dir
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
-from ringfence.world import cause_search, dynamics, margins, validate, values
+from ringfence.world import cause_search, dynamics, impacts, margins, validate, values
 from ringfence.world.card import Card, Data
 from ringfence.world.cause_nets import fit_causes
 from ringfence.world.causes import AHEAD, Found, Heading, offsets
@@ -97,6 +97,7 @@ def fit_view(
     content = [
         validate.VERSION,
         cause_search.VERSION,
+        impacts.VERSION,
         margins.VERSION,
         store.content,
         features.to_dict(map),
@@ -137,8 +138,15 @@ def _fitted(
     moved += "".join(_bounds(store))
 
     world = blank_world(map, spec, settings)
-    acts = _dynamics(logged, moved, world.dynamics, parts, quiet)
     value = _values(logged, moved, world.values, parts, quiet)
+    thrown = impacts.count(logged, parts.seed) if labels and settings.labels == "costs" else 0
+    steps = logged.fitted_steps
+    if thrown:
+        steps = steps[~logged.unsafe[steps]]
+        moved += f"{impacts.VERSION} landed {_digest(logged.unsafe)}"
+    acts = _dynamics(logged, steps, moved, world.dynamics, parts, quiet)
+    if thrown:
+        logged = impacts.landed(logged, acts)
     barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts, quiet)
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
@@ -146,13 +154,13 @@ def _fitted(
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
-        data=_data(store, logged),
+        data=_data(store, logged, thrown),
         settings=settings,
         seed=parts.seed,
         shape=_shape_in_words(barrier),
         causes=found_by,
         seconds={name: round(took, 1) for name, took in seconds.items()},
-        held_out=found.held_out,
+        held_out=msgspec.structs.replace(found.held_out, episodes=int(out.sum())),
         prediction_error=found.prediction_error,
         values=found.values,
         ood=found.ood,
@@ -169,7 +177,7 @@ def _fitted(
     return dataclasses.replace(world, card=card)
 
 
-def _data(store: EpisodeStore, logged: Logged) -> Data:
+def _data(store: EpisodeStore, logged: Logged, impacts: int) -> Data:
     """What the card says of the logs."""
     several = logged.several
     return Data(
@@ -186,6 +194,7 @@ def _data(store: EpisodeStore, logged: Logged) -> Data:
         state_origins=store.card.state_origins,
         ranges=_ranges(logged),
         inferred_names=_inferred_names(store, logged.map) or None,
+        impacts=impacts,
     )
 
 
@@ -224,10 +233,17 @@ def _unsafe_cost(store: EpisodeStore, name: str) -> float:
 # --- parts ---
 
 
-def _dynamics(logged: Logged, moved: str, blank: dynamics.Dynamics, parts: _Parts, quiet: bool) -> dynamics.Dynamics:
+def _dynamics(
+    logged: Logged,
+    steps: np.ndarray,
+    moved: str,
+    blank: dynamics.Dynamics,
+    parts: _Parts,
+    quiet: bool,
+) -> dynamics.Dynamics:
+    """Of these steps."""
     settings = parts.settings
     arrays = logged.arrays
-    steps = logged.fitted_steps
 
     def fit(key: Key) -> dynamics.Dynamics:
         return dynamics.fit_dynamics(

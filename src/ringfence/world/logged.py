@@ -87,12 +87,13 @@ class Logged:
         """(W, N, D) the states after steps."""
         return self.picked("features", self.picked("row", steps) + 1)
 
-    def predicted(self, dynamics: Dynamics) -> Array:
-        """(T, N, D) where every step's actions are predicted to lead."""
+    def predicted(self, dynamics: Dynamics, steps: np.ndarray | None = None) -> Array:
+        """(W, N, D) where the actions of steps, of all by default, are predicted to lead."""
         parts = []
-        for start in range(0, self.store.steps, AT_ONCE):
-            steps = np.arange(start, min(start + AT_ONCE, self.store.steps))
-            parts.append(_after(dynamics, self.before(steps), self.picked("actions", steps)))
+        steps = np.arange(self.store.steps) if steps is None else steps
+        for start in range(0, len(steps), AT_ONCE):
+            some = steps[start : start + AT_ONCE]
+            parts.append(_after(dynamics, self.before(some), self.picked("actions", some)))
         return jnp.concatenate(parts)
 
     def close_to_danger(self) -> np.ndarray:

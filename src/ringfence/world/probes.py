@@ -91,7 +91,9 @@ def _along(name: str, at: np.ndarray, scores: np.ndarray, edge: float | None = N
         k = next(iter(np.flatnonzero((scores[:-1] < 0) != (scores[1:] < 0))), None)
         edge = UNKNOWN if k is None else float(at[k] - scores[k] * (at[k + 1] - at[k]) / (scores[k + 1] - scores[k]))
     shown = tuple(round(float(score), 3) for score in scores)
-    return Probe(name, tuple(round(float(value), 4) for value in at), shown, round(edge, 4))
+    return Probe(
+        name, tuple(round(float(value), 4) for value in at), shown, edge if edge is UNKNOWN else round(edge, 4)
+    )
 
 
 def _map(net: Score, unit: float) -> ProbeMap:

@@ -21,7 +21,8 @@ PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that ar
 def judge(card: Card) -> Verdict:
     """The verdict on the World of this card."""
     if card.barrier is None:
-        return Verdict("unfit", ("it was fitted without costs, so it knows no danger",), ("give a formula of danger",))
+        reason = "it knows no danger: no step of its logs costs, or every step, or it was fitted without a barrier"
+        return Verdict("unfit", (reason,), ("log steps of both kinds, or give a formula of danger",))
     found = list(_barrier(card.barrier, ""))
     for name, scores in (card.constraints or {}).items():
         found += _barrier(scores, f" of '{name}'")

@@ -105,4 +105,5 @@ OF_PLACE: dict[str, PlaceDanger] = {
     "apart": apart,
 }
 STANDING = ("walls", "posts", "corridor", "joints")  # that are where they are whoever does what
+SOLID = ("pairs", "walls", "posts", "mover", "corridor")  # that stop a body
 BY_PLACE = ("walls", "posts", "corridor")  # that follow from where one is

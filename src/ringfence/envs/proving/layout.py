@@ -61,6 +61,7 @@ class Layout:
     speed_limit: float = 0.8
     neighbours: int = 6  # that are observed at most
     homogeneous: bool = False
+    rebound: float = 0.0  # share of its rate at which a body that touches is thrown back; 0: it passes
     actions: Literal["unit", "physical"] = "unit"  # in [−1, 1], or in the body's own bounds
 
     def __post_init__(self):
@@ -171,5 +172,10 @@ def _check(system: Layout) -> None:
     for name in system.danger:
         if system.body not in misfits.get(name, get_args(Kind)):
             raise UserError(f"danger='{name}' is no danger to a body that is a {system.body}; leave it out.")
+    if not 0 <= system.rebound < 1 or (system.rebound and not system.planar):
+        raise UserError(
+            f"rebound={system.rebound:g} is a share from 0 to below 1 of the rate of a body that drives in a plane; "
+            "give another, or leave it out."
+        )
     if system.n_agents < (2 if {"pairs", "apart"} & set(system.danger) else 1):
         raise UserError(f"n_agents={system.n_agents} is too few for {', '.join(system.danger)}; give more.")

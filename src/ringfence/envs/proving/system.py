@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import jax
@@ -18,7 +18,7 @@ import numpy as np
 from ringfence.envs.base import Defaults
 from ringfence.envs.proving import drivers, film, goals, observations
 from ringfence.envs.proving.bodies import length
-from ringfence.envs.proving.dangers import LOW_CHARGE, MARGIN, METRES, OF_PLACE
+from ringfence.envs.proving.dangers import LOW_CHARGE, MARGIN, METRES, OF_PLACE, SOLID
 from ringfence.envs.proving.layout import Layout, SystemState
 from ringfence.problem import features
 from ringfence.types import Array, Key, Transition
@@ -109,6 +109,12 @@ class System(Layout, Defaults):
         unsafe = (self.clearance(now) < 0).astype(jnp.float32)
         cost = unsafe if self.costs == "each" else unsafe.max(-1)
         over = jnp.zeros(state.phase.shape, bool)
+        if self.rebound:
+            touches = self.touching(now)[..., None]
+            now = now._replace(
+                config=jnp.where(touches, state.config, now.config),
+                rate=jnp.where(touches, -self.rebound * now.rate, now.rate),
+            )
         return now, Transition(before - after - EFFORT * effort, cost, over)
 
     def played(
@@ -145,6 +151,17 @@ class System(Layout, Defaults):
         """(..., N) the least of them, each as if it were m (`MARGIN` of it as 0.1 m); negative where it costs."""
         scaled = [METRES / MARGIN.get(name, METRES) * d for name, d in self.distances(state).items()]
         return functools.reduce(jnp.minimum, scaled)
+
+    @property
+    def unhindered(self) -> System:
+        """The same, where a body that touches passes: danger is where it would be."""
+        return replace(self, rebound=0.0)
+
+    def touching(self, state: SystemState) -> Array:
+        """(..., N) bool: who has something solid within its radius."""
+        distances = self.distances(state)
+        solid = [distances[name] < 0 for name in SOLID if name in distances]
+        return functools.reduce(jnp.logical_or, solid, jnp.zeros(state.charge.shape, bool))
 
     def observe(self, state: SystemState) -> Array:
         """(..., N, O) as `observation_names` says."""

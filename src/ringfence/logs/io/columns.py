@@ -72,7 +72,10 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
         raise StoreError(f"row 0: {name} is {str(column[0])[:40]!r}, no number; convert the column, or leave it out.")
     row = None
     if column.dtype.kind == "O":
-        row = next((k for k, entry in enumerate(column) if not _is_number(entry)), None)
+        others = [k for k, entry in enumerate(column) if not _is_number(entry)]
+        # One word makes text of a whole column of a file; the row to repair is its own.
+        words = (k for k in others if not _reads_as_number(column[k]))
+        row = next(words, others[0] if others else None)
     if row is not None:
         raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; repair or drop it.")
     found = column.astype(np.float64)
@@ -229,6 +232,14 @@ def _affordable(path: Path, rows: int, columns: int) -> None:
     size = 8 * rows * columns
     if size > 100 * path.stat().st_size + 2**28:
         raise StoreError(f"'{path}' unpacks to {size / 2**20:.0f} MiB and holds far less; write it in parts.")
+
+
+def _reads_as_number(entry: Any) -> bool:
+    try:
+        float(entry)
+    except (TypeError, ValueError, OverflowError):
+        return False
+    return isinstance(entry, str)
 
 
 def _is_number(entry: Any) -> bool:
