@@ -182,6 +182,16 @@ def of_robot_pools() -> tuple[bool, str]:
     return signs == [-1, 0, 1], text
 
 
+def of_rebounds() -> tuple[bool, str]:
+    """Guards of a system whose bodies bounce off what they touch, and the same by states as they were logged."""
+    now, before = (
+        json.loads((ROOT / PROVING / name).read_text())["rows"]
+        for name in ("others/x9.json", "tried/x9-as-logged.json")
+    )
+    rates = [[rows[f"{who} shield learned"]["violation_rate"] for who in ("bc", "naive")] for rows in (now, before)]
+    return rates[0] == [0, 0] and min(rates[1]) > 0.9, f"clone and naive {rates[0]}, as logged {rates[1]}"
+
+
 def of_drawn_systems() -> tuple[bool, str]:
     """Guards by the Worlds of systems drawn at random that call themselves fit."""
     found = [json.loads(file.read_text()) for file in sorted((ROOT / DRAWN).glob("*.json"))]
@@ -673,6 +683,12 @@ CLAIMS = (
         "episodes; on three of these a naive driver does so more often",
         PROVING,
         of_systems,
+    ),
+    Claim(
+        "docs/proving-ground.md",
+        "the guard leaves contact in none of the episodes of `x9`",
+        "results/proving/others/x9.json",
+        of_rebounds,
     ),
     Claim(
         "docs/proving-ground.md",

@@ -473,7 +473,9 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
         with pytest.raises(UserError, match=said):
             pilot.act(seen, state)
     told = json.loads((run.path / "config.json").read_text())
-    del told["widths"], told["team"], told["spec"]["homogeneous"]  # as older versions wrote it
+    least, most = store.returns.min(), store.returns.max()  # by which returns are normalised
+    np.testing.assert_allclose(resolve.load_job(run).task.normalised_return(np.array([least, most])), [0, 1], atol=1e-6)
+    del told["widths"], told["team"], told["returns"], told["spec"]["homogeneous"]  # as older versions wrote it
     del told["data"]["observation_names"]
     (run.path / "config.json").write_text(json.dumps(told))
     pilot = Controller(run, sampling_steps=2)
@@ -527,7 +529,7 @@ def test_results_that_cannot_be_read_are_refused_before_an_episode_is_played(tra
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"seeds": 5}, r"seeds=5 must be several numbers; for so many seeds pass range\(5\)"),
+        ({"seeds": 5}, "seeds=5 must be several whole numbers; give e.g. range"),
         ({"seeds": (0, 0)}, "each of them once"),
         ({"seeds": (2**31,)}, "whole numbers from 0 to 2³¹ − 1"),
         ({"seeds": ()}, "one or more whole numbers"),

@@ -202,10 +202,13 @@ def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:
 def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: Spec) -> Task:
     """A task that exists only as data, as the run's card has it."""
     card = stored["data"]
+    low, high = stored.get("returns") or (0.0, 1.0)  # runs of before tell none
     return Task(
         stored["task"],
         None,
         hazard,
+        return_min=low,
+        return_max=high,
         cost_limit=float(card.get("cost_limit", 1.0)),
         action_low=spec.action_low,
         action_high=spec.action_high,

@@ -50,6 +50,8 @@ class Job:
             "hazard": constraints.to_dict(self.hazard.hazard),
             "feature_map": None if self.task.env is not None else features.to_dict(self.feature_map),
             "widths": None if self.task.env is not None else list(self.widths),
+            # of the logs' episodes, by which returns of anybody's own data are normalised
+            "returns": None if self.task.env is not None else [self.task.return_min, self.task.return_max],
             "world": self.world,
             "team": self.team,
             "seed": seed,

@@ -156,7 +156,7 @@ def _seeds(given: Iterable[int]) -> tuple[int, ...]:
     """The seeds as they were given, if each is a number that JAX takes and none comes twice."""
     seeds = tuple(given) if isinstance(given, Iterable) and not isinstance(given, str) else None
     if seeds is None:
-        raise UserError(f"seeds={given!r} must be several numbers; for so many seeds pass range({given}).")
+        raise UserError(f"seeds={given!r} must be several whole numbers; give e.g. range(5), or (0, 1, 2).")
     whole_numbers = all(isinstance(s, int | np.integer) and not isinstance(s, bool) for s in seeds)
     if not seeds or not whole_numbers or min(seeds) < 0 or max(seeds) >= 2**31 or len(set(seeds)) < len(seeds):
         raise UserError(f"seeds={seeds} must be one or more whole numbers from 0 to 2³¹ − 1, each of them once.")
@@ -423,7 +423,8 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
         card["content"] = data.content
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
-        older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team")}  # that older runs do not tell
+        # What older runs do not tell.
+        older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team", "returns")}
         there = older | run.config
         there["spec"] = {"homogeneous": False} | there.get("spec", {})
         later = {k: v for k, v in stored.LATER_CONFIG.items() if k in mine["config"]}

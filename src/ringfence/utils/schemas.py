@@ -91,6 +91,7 @@ class Config(TypedDict):
     spec: NotRequired[Spec]
     feature_map: NotRequired[Map | None]
     widths: NotRequired[tuple[int | None, int | None] | None]
+    returns: NotRequired[tuple[float, float] | None]
     world: NotRequired[dict[str, Scalar] | None]
     team: NotRequired[Few]
 
