@@ -133,7 +133,7 @@ def _fitted(
         map = features.alone(map)
     labels = labels_of(store, map, settings, hazard) if settings.barrier else {}
     out = held_out(store, parts.seed, unsafe_of(labels) if labels else None)
-    logged = Logged.of(store, map, out, labels)
+    whole = logged = Logged.of(store, map, out, labels)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
     moved += "".join(_bounds(store))
 
@@ -150,7 +150,7 @@ def _fitted(
     barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts, quiet)
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, settings.miscoverage, settings.loss)
+    found = validate.validate(world, logged, settings.miscoverage, settings.loss, whole)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,

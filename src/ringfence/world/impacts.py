@@ -19,13 +19,14 @@ from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.margins import entries
 
-VERSION = 1  # of what is found
-MOST = 20_000  # steps that are looked at, of either kind
+VERSION = 2  # of what is found
+MOST = 60_000  # steps of agents that are looked at at once
 USUAL = 0.999  # share of safe steps that change by no more than what is usual
 BEYOND = 2.0  # times what is usual, from which on a change is an impact
 SHARE = 0.15  # of the entries into danger that are impacts, or there are none: rough fits err at the ends of the logs
 FEW = 10  # entries that are, likewise
 LEAST = 100  # safe steps that tell what is usual
+RIDGE = 1e-9  # of a mean square of 1: entries may say the same
 SQUARES = 24  # numbers that products are read of, too
 
 
@@ -36,7 +37,8 @@ def count(logged: Logged, seed: int) -> int:
     if logged.map.joint or logged.map.shared_body or unsafe.all() or not unsafe.any():
         return 0
     rng = np.random.default_rng([seed, 11])
-    safe = rng.permutation(np.flatnonzero(~unsafe))[:MOST]
+    at_once = max(MOST // logged.map.plus.shape[0], LEAST)
+    safe = rng.permutation(np.flatnonzero(~unsafe))[:at_once]
     known, kept = np.split(safe, [len(safe) * 3 // 4])
     if len(kept) < LEAST:
         return 0
@@ -44,7 +46,7 @@ def count(logged: Logged, seed: int) -> int:
     most = np.quantile(usual.missed(logged, kept), USUAL, axis=0)  # (N, F)
     bad = np.flatnonzero(unsafe)
     jumps = np.zeros(len(unsafe), bool)
-    for some in np.array_split(bad, -(-len(bad) // MOST)):
+    for some in np.array_split(bad, -(-len(bad) // at_once)):
         beyond = usual.missed(logged, some) > BEYOND * most
         jumps[some] = (beyond & (most > 0)).any((1, 2))
     into = entries(logged, bad)
@@ -68,8 +70,9 @@ class Usual:
         mean, scale = before.mean(0), before.std(0)
         blank = cls(own, mean, np.where(scale > 0, scale, 1.0), np.zeros(0))
         x, changed = blank._read(logged, steps)
-        fitted = [np.linalg.lstsq(x[:, i], changed[:, i], rcond=1e-6)[0] for i in range(x.shape[1])]
-        return cls(own, blank.mean, blank.scale, np.stack(fitted))
+        x, changed = np.moveaxis(x, 1, 0), np.moveaxis(changed, 1, 0)
+        squares = np.swapaxes(x, 1, 2) @ x + RIDGE * len(steps) * np.eye(x.shape[-1])
+        return cls(own, blank.mean, blank.scale, np.linalg.solve(squares, np.swapaxes(x, 1, 2) @ changed))
 
     def missed(self, logged: Logged, steps: np.ndarray) -> np.ndarray:
         """(W, N, F) by how much own entries change otherwise."""

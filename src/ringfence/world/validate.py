@@ -77,13 +77,15 @@ def validate(
     logged: Logged,
     miscoverage: float,
     loss: str = "cross-entropy",
+    whole: Logged | None = None,
 ) -> Validation:
-    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above."""
+    """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above; `whole`: the
+    logs as they are, where others were cut at impacts, since returns go on after these."""
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
     read = foresight(world.dynamics, world.barrier, logged, np.random.default_rng(1))
     prediction_error = replace(_prediction_error(world.dynamics, logged, rng), read=read)
-    explained = _value_scores(world.values, logged, world.alone, rng)
+    explained = _value_scores(world.values, whole or logged, world.alone, rng)
     ood = _threshold(world.dynamics, logged)
     barrier = world.barrier
     scores = None
