@@ -17,7 +17,8 @@ from ringfence.envs import System
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import features
-from ringfence.world import impacts
+from ringfence.world import impacts, probes
+from ringfence.world.card import UNKNOWN
 from ringfence.world.logged import Logged, held_out, labels_of
 from ringfence.world.settings import Settings
 
@@ -118,3 +119,9 @@ def test_a_system_throws_back_who_touches():
 def test_a_rebound_is_a_share():
     with pytest.raises(UserError, match="rebound=1.5 is a share"):
         System("integrator", ("walls",), 2, rebound=1.5)
+
+
+def test_a_curve_that_danger_never_begins_on_has_no_edge():
+    at = np.linspace(0, 1, 5)
+    assert probes._along("own.x", at, np.ones(5)).edge is UNKNOWN  # which files leave out
+    assert probes._along("own.x", at, at - 0.5).edge == 0.5

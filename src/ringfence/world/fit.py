@@ -150,7 +150,7 @@ def _fitted(
     barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts, quiet)
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, settings.miscoverage, settings.loss, whole)
+    found = validate.validate(world, logged, whole, settings.miscoverage, settings.loss)
     seconds = parts.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
@@ -160,7 +160,7 @@ def _fitted(
         shape=_shape_in_words(barrier),
         causes=found_by,
         seconds={name: round(took, 1) for name, took in seconds.items()},
-        held_out=msgspec.structs.replace(found.held_out, episodes=int(out.sum())),
+        held_out=found.held_out,
         prediction_error=found.prediction_error,
         values=found.values,
         ood=found.ood,
@@ -177,7 +177,7 @@ def _fitted(
     return dataclasses.replace(world, card=card)
 
 
-def _data(store: EpisodeStore, logged: Logged, impacts: int) -> Data:
+def _data(store: EpisodeStore, logged: Logged, thrown: int) -> Data:
     """What the card says of the logs."""
     several = logged.several
     return Data(
@@ -194,7 +194,7 @@ def _data(store: EpisodeStore, logged: Logged, impacts: int) -> Data:
         state_origins=store.card.state_origins,
         ranges=_ranges(logged),
         inferred_names=_inferred_names(store, logged.map) or None,
-        impacts=impacts,
+        impacts=thrown,
     )
 
 

@@ -75,17 +75,17 @@ class Validation:
 def validate(
     world: World,
     logged: Logged,
+    whole: Logged,
     miscoverage: float,
     loss: str = "cross-entropy",
-    whole: Logged | None = None,
 ) -> Validation:
     """`miscoverage` is the share of unsafe steps that may be predicted at the default margin or above; `whole`: the
-    logs as they are, where others were cut at impacts, since returns go on after these."""
+    logs as they are, where `logged` is cut at impacts, since returns go on after these."""
     rng = np.random.default_rng(0)
-    held_out = HeldOut(episodes=int(logged.held_out.sum()), steps=len(logged.held_steps))
+    held_out = HeldOut(episodes=int(whole.held_out.sum()), steps=len(whole.held_steps))
     read = foresight(world.dynamics, world.barrier, logged, np.random.default_rng(1))
     prediction_error = replace(_prediction_error(world.dynamics, logged, rng), read=read)
-    explained = _value_scores(world.values, whole or logged, world.alone, rng)
+    explained = _value_scores(world.values, whole, world.alone, rng)
     ood = _threshold(world.dynamics, logged)
     barrier = world.barrier
     scores = None
