@@ -318,13 +318,13 @@ def has_to_have_seen() -> tuple[bool, str]:
 
 
 def crossing_rare() -> tuple[bool, str]:
-    """Contact under the shield, on all tiers of Crossing's discs."""
+    """Contact under the shield, on all tiers of Crossing."""
     row = ("bc", "default+shield-learned")
-    tiers = [f"crossing-{tier}" for tier in ("hasty", "mixed", "careful", "random")]
+    tiers = [f"crossing{body}-{tier}" for body in ("", "_unicycle") for tier in ("hasty", "mixed", "careful", "random")]
     runs = [r for tier in tiers for r in of("crossing", tier, row).values()]
     touched = sum(round(r["violation_rate"] * r["episodes"]) for r in runs)
     episodes = sum(r["episodes"] for r in runs)
-    return (touched, episodes) == (1, 4000), f"{touched} of {episodes} episodes, one seed"
+    return (touched, episodes) == (1, 10_000), f"{touched} of {episodes} episodes, one seed; three of hasty unicycles"
 
 
 def rows_of(file: str, **where: str) -> list[dict[str, str]]:
@@ -515,7 +515,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/crossing-results.md",
-        "the shield leaves contact in 1 of 4000 episodes",
+        "the shield leaves contact in 1 of 10,000 episodes",
         "results/crossing/table.csv",
         crossing_rare,
     ),

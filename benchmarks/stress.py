@@ -57,7 +57,15 @@ SYSTEMS = OUT.with_name("systems.csv")
 SYSTEMS_ROW = ("task", "faults", "guard", "episodes")
 SYSTEMS_FIELDS = (*SYSTEMS_ROW, "return", "cost", *RATES)
 KINDS = ("none", "guard", "compensated")
-ON_SYSTEMS: tuple[dict[str, Any], ...] = ({}, {"delay": 2}, {"drop": 0.6}, {"asynchrony": 0.667}, MIDDLE)
+# Of other tasks: what guards can know of and what they cannot, at three strengths, and several at once.
+STRENGTHS = {
+    "delay": (1, 2, 3),
+    "drop": (0.3, 0.6, 0.8),
+    "asynchrony": (0.5, 0.667, 0.75),
+    "noise": (0.005, 0.02, 0.05),
+    "gain": (0.8, 0.6, 0.4),
+}
+ON_SYSTEMS: tuple[dict[str, Any], ...] = ({}, *({k: v} for k, some in STRENGTHS.items() for v in some), MIDDLE)
 
 Trial = tuple[dict[str, Any], bool, dict[str, Any]]  # faults, whether they are compensated, the guard's other options
 

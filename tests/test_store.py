@@ -424,6 +424,14 @@ def test_arrays_that_do_not_fit_together_are_refused_by_name(played, name, wrong
         EpisodeStore.from_episodes(**arrays)
 
 
+@pytest.mark.parametrize("shape", [(0, 4, 2, 1), (3, 0, 2, 1), (3, 4, 0, 1)])
+def test_nothing_that_was_done_is_no_log(shape):
+    episodes, length, agents, _ = shape
+    seen = np.zeros((episodes, length + 1, agents, 5))
+    with pytest.raises(StoreError, match="nothing was done; give a step or more"):
+        EpisodeStore.from_episodes(seen, np.zeros(shape), np.zeros((episodes, length)), None)
+
+
 def test_logs_without_costs_and_odd_cards(played):
     arrays = [played[k] for k in ("observations", "actions", "rewards")]
     assert not EpisodeStore.from_episodes(*arrays, None).costs.any()

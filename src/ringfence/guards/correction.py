@@ -28,12 +28,18 @@ NEAR = 10.0  # times what is missing in these rows counts, beside later ones
 TOLERANCE = 1e-3  # of the condition, in margins: less is not counted as infeasible
 
 
+class Found(NamedTuple):
+    """Plans, and what is missing along them: whoever improves plans hands on what it knows of them."""
+
+    plan: Array  # (B, K, N, A)
+    missing: Array  # (B, K, N), 0 or less
+
+
 class Correction(NamedTuple):
     """Plans while they are corrected."""
 
     plan: Array  # (B, K, N, A)
-    best: Array  # (B, K, N, A) of those so far
-    least: Array  # (B, 1 or N) shortfall of the best
+    best: Found  # of those so far
     short: Array  # (B, 1 or N) shortfall of the plan before the last correction
     round: Array  # () int
 
@@ -52,37 +58,36 @@ class Corrector:
 
     def __call__(self, present: PyTree, plan: Array, margin: Array) -> Array:
         """Where nothing is missing a plan is kept as it is."""
-        begun = plan
+        asked = begun = Found(plan, self.missing(present, plan[:, None], margin)[:, 0])
         if plan.shape[1] > ASKED and self.steps:
-            begun = self._where_short(self._continued, AGAIN, 0.0, (present, plan, plan, margin))
+            begun = self._where_short(self._continued, AGAIN, 0.0, (present, plan, asked, margin))
         found = self._where_short(self._by_slope, TOGETHER, 0.0, (present, plan, begun, margin))
-        if not self.restarts:
-            return found
-        return self._where_short(self._again, AGAIN, TOLERANCE, (present, plan, found, margin))
+        if self.restarts:
+            found = self._where_short(self._again, AGAIN, TOLERANCE, (present, plan, found, margin))
+        return found.plan
 
     def _where_short(
-        self, improve: Callable[..., Array], together: int, bearable: float, given: tuple[PyTree, Array, Array, Array]
-    ) -> Array:
+        self, improve: Callable[..., Found], together: int, bearable: float, given: tuple[PyTree, Array, Found, Array]
+    ) -> Found:
         """`improve` of (present, plans asked, plans found, margin), a few teams at a time. Most plans miss nothing, so
         they are sorted, and it ends with the last that does."""
         _, _, found, _ = given
-        batch = len(found)
+
+        def few(part: tuple[PyTree, Array, Found, Array]) -> Found:
+            return jax.lax.cond(self._is_short(part[2], bearable).any(), lambda: improve(*part), lambda: part[2])
+
+        batch = len(found.plan)
         if batch <= together:
-            return improve(*given)
-        short = self._is_short(given, bearable)
-        order = jnp.argsort(short, descending=True)
+            return few(given)
+        order = jnp.argsort(self._is_short(found, bearable), descending=True)
         order = jnp.concatenate([order, jnp.repeat(order[-1:], -batch % together)])
         parts = jax.tree.map(lambda x: x[order].reshape(-1, together, *x.shape[1:]), given)
+        improved = jax.lax.map(few, parts)
+        return jax.tree.map(lambda old, new: old.at[order].set(new.reshape(-1, *old.shape[1:])), found, improved)
 
-        def few(part: tuple[PyTree, Array, Array, Array]) -> Array:
-            return jax.lax.cond(self._is_short(part, bearable).any(), lambda: improve(*part), lambda: part[2])
-
-        return found.at[order].set(jax.lax.map(few, parts).reshape(-1, *found.shape[1:]))
-
-    def _is_short(self, given: tuple[PyTree, Array, Array, Array], bearable: float) -> Array:
+    def _is_short(self, found: Found, bearable: float) -> Array:
         """(B,) bool: more than is bearable is missing of the plans found."""
-        present, _, found, margin = given
-        return (self.shortfall(present, found, margin) < -bearable).any(1)
+        return (self._shortfall(found.missing) < -bearable).any(1)
 
     def missing(self, present: PyTree, plans: Array, margin: Array) -> Array:
         """(B, S, K, N) what is missing along plans (B, S, K, N, A), more of it in the rows that were asked for: the
@@ -93,100 +98,102 @@ class Corrector:
             return missed
         return missed * np.where(np.arange(rows) < ASKED, NEAR, 1.0)[:, None]
 
-    def shortfall(self, present: PyTree, plan: Array, margin: Array) -> Array:
-        """(B, 1) of a team, or (B, N) of agents who are alone: what is missing along plans (B, K, N, A), in all."""
-        return team_sum(self.missing(present, plan[:, None], margin)[:, 0], (1,), self.alone)
+    def _shortfall(self, missing: Array) -> Array:
+        """(B, 1) of a team, or (B, N) of agents who are alone: what is `missing` (B, K, N), in all."""
+        return team_sum(missing, (1,), self.alone)
 
-    def _continued(self, present: PyTree, asked: Array, plan: Array, margin: Array) -> Array:
+    def _continued(self, present: PyTree, asked: Array, found: Found, margin: Array) -> Found:
         """Plans that go on after ASKED rows as they did, or by the fixed plans that miss least: all of a team by the
         same start, or each agent by its own best, whatever the others did by it."""
+        plan = found.plan
         _, rows, agents, dim = plan.shape
         tails = jnp.asarray(continuations(rows - ASKED, agents, dim), plan.dtype)  # (S, K - ASKED, N, A)
         begun = jnp.broadcast_to(plan[:, None, :ASKED], (len(plan), len(tails), ASKED, agents, dim))
         other = jnp.concatenate([begun, jnp.broadcast_to(tails, (len(plan), *tails.shape))], 2)
-        missing = self.missing(present, plan[:, None], margin)[:, 0]
-        other = jnp.concatenate([plan[:, None], self._of_unmet(present, other, asked, plan, missing, 0.0)], 1)
-        missing = self.missing(present, other, margin)
+        other = self._of_unmet(present, other, asked, found, 0.0)
+        missing = jnp.concatenate([found.missing[:, None], self.missing(present, other, margin)], 1)
+        other = jnp.concatenate([plan[:, None], other], 1)
         if not self.alone:
             own = _picked(other, missing.sum(2).argmax(1))[:, None]
             other = jnp.concatenate([other, own], 1)
             missing = jnp.concatenate([missing, self.missing(present, own, margin)], 1)
-        return _picked(other, self._of_team(missing, (1,)).argmax(1))
+        best = self._of_team(missing, (1,)).argmax(1)
+        return Found(_picked(other, best), _picked(missing[..., None], best)[..., 0])
 
-    def _of_unmet(
-        self, present: PyTree, plans: Array, asked: Array, kept: Array, missing: Array, bearable: float
-    ) -> Array:
-        """Plans (B or 1, S, K, N, A) within bounds of what was asked for; agents of whose plans `kept` (B, K, N, A) no
-        more than is bearable is `missing` (B, K, N) keep these."""
+    def _of_unmet(self, present: PyTree, plans: Array, asked: Array, found: Found, bearable: float) -> Array:
+        """Plans (B or 1, S, K, N, A) within bounds of what was asked for; agents of whose plans found no more than is
+        bearable is missing keep these."""
         low, high = self.within(present, asked)
-        unmet = missing.sum(1) < -bearable
-        return jnp.where(unmet[:, None, None, :, None], jnp.clip(plans, low[:, None], high[:, None]), kept[:, None])
+        unmet = found.missing.sum(1) < -bearable
+        kept = found.plan[:, None]
+        return jnp.where(unmet[:, None, None, :, None], jnp.clip(plans, low[:, None], high[:, None]), kept)
 
     def _of_team(self, x: Array, axes: tuple[int, ...]) -> Array:
         """(B, S, 1) of numbers (B, S, ...) of plans, or (B, S, N) of agents who are alone."""
         return jax.vmap(lambda x: team_sum(x, axes, self.alone), 1, 1)(x)
 
-    def _by_slope(self, present: PyTree, asked: Array, plan: Array, margin: Array) -> Array:
+    def _by_slope(self, present: PyTree, asked: Array, begun: Found, margin: Array) -> Found:
         """Polyak's steps on f(a) = Σ min(score − what is asked, 0), whose goal is 0: a ← a − f ∇f / ‖∇f‖². The best
         plan on the way, within bounds around the one that was asked for. Where the condition cannot be met, larger
         actions throw robots over."""
         low, high = self.within(present, asked)
 
-        def shortfall(plan: Array) -> Array:
-            return self.shortfall(present, plan, margin)
+        def shortfall(plan: Array) -> tuple[Array, Array]:
+            missing = self.missing(present, plan[:, None], margin)[:, 0]
+            return self._shortfall(missing), missing
 
         def correct(c: Correction) -> Correction:
-            f, back = jax.vjp(shortfall, c.plan)
+            f, back, missing = jax.vjp(shortfall, c.plan, has_aux=True)
             slope = back(jnp.ones_like(f))[0]
-            better = (f > c.least)[:, None, :, None]
             size = team_sum(slope**2, (1, 3), self.alone)
             moved = c.plan - (f / jnp.maximum(size, 1e-6))[:, None, :, None] * slope
             return Correction(
                 plan=jnp.clip(moved, low, high),
-                best=jnp.where(better, c.plan, c.best),
-                least=jnp.maximum(f, c.least),
+                best=self._better(f > self._shortfall(c.best.missing), Found(c.plan, missing), c.best),
                 short=f,
                 round=c.round + 1,
             )
 
-        def goes_on(c: Correction) -> Array:  # until the round after the last in which something was missing
-            return (c.round < self.steps) & (c.short < 0).any()
+        def goes_on(c: Correction) -> Array:  # one round more than steps: it judges what the last one led to
+            return (c.round <= self.steps) & (c.short < 0).any()
 
-        nothing = jnp.full_like(team_sum(plan, (1, 3), self.alone), -jnp.inf)
-        begun = Correction(plan, plan, nothing, nothing, jnp.asarray(0))
-        found = jax.lax.while_loop(goes_on, correct, begun)
-        return jnp.where((shortfall(found.plan) >= found.least)[:, None, :, None], found.plan, found.best)
+        start = Correction(begun.plan, begun, self._shortfall(begun.missing), jnp.asarray(0))
+        return jax.lax.while_loop(goes_on, correct, start).best
 
-    def _again(self, present: PyTree, asked: Array, found: Array, margin: Array) -> Array:
+    def _better(self, better: Array, new: Found, old: Found) -> Found:
+        """The new plans where they are `better` (B, 1 or N), else the old ones."""
+        missing = jnp.where(better[:, None], new.missing, old.missing)
+        return Found(jnp.where(better[:, None, :, None], new.plan, old.plan), missing)
+
+    def _again(self, present: PyTree, asked: Array, found: Found, margin: Array) -> Found:
         """Plans found, or better ones by corrections that begin elsewhere, in as many rounds as are allowed."""
-        _, rows, agents, dim = found.shape
-        starts = jnp.asarray(fixed_plans(rows, agents, dim, self.restarts), found.dtype)
+        _, rows, agents, dim = asked.shape
+        starts = jnp.asarray(fixed_plans(rows, agents, dim, self.restarts), asked.dtype)
 
-        def goes_on(carry: tuple[Array, Array]) -> Array:
+        def goes_on(carry: tuple[Found, Array]) -> Array:
             found, round = carry
-            return (round < self.restarts) & (self.shortfall(present, found, margin) < -TOLERANCE).any()
+            return (round < self.restarts) & self._is_short(found, TOLERANCE).any()
 
-        def again(carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        def again(carry: tuple[Found, Array]) -> tuple[Found, Array]:
             found, round = carry
-            missing = self.missing(present, found[:, None], margin)[:, 0]
-            start = self._start(present, asked, found, missing, starts[round], margin)
+            start = self._start(present, asked, found, starts[round], margin)
             other = self._by_slope(present, asked, start, margin)
-            before = team_sum(missing, (1,), self.alone)
-            better = (before < -TOLERANCE) & (self.shortfall(present, other, margin) > before)
-            return jnp.where(better[:, None, :, None], other, found), round + 1
+            before = self._shortfall(found.missing)
+            better = (before < -TOLERANCE) & (self._shortfall(other.missing) > before)
+            return self._better(better, other, found), round + 1
 
         return jax.lax.while_loop(goes_on, again, (found, jnp.asarray(0)))[0]
 
-    def _start(
-        self, present: PyTree, asked: Array, found: Array, missing: Array, starts: Array, margin: Array
-    ) -> Array:
-        """(B, K, N, A) the one of starts (S, K, N, A) that misses least, and among equals the one whose first action is
-        nearest to what was asked. Agents of whose plans found nothing is `missing` (B, K, N) keep these."""
-        starts = self._of_unmet(present, starts, asked, found, missing, TOLERANCE)
-        short = self._of_team(self.missing(present, starts, margin), (1,))
+    def _start(self, present: PyTree, asked: Array, found: Found, starts: Array, margin: Array) -> Found:
+        """The one of starts (S, K, N, A) that misses least, and among equals the one whose first action is nearest to
+        what was asked. Agents of whose plans found nothing is missing keep these."""
+        starts = self._of_unmet(present, starts, asked, found, TOLERANCE)
+        missing = self.missing(present, starts, margin)
+        short = self._of_team(missing, (1,))
         far = self._of_team((starts[:, :, :1] - asked[:, None, :1]) ** 2, (1, 3))
         fine = short >= short.max(1, keepdims=True) - TOLERANCE
-        return _picked(starts, jnp.where(fine, -far, -jnp.inf).argmax(1))
+        best = jnp.where(fine, -far, -jnp.inf).argmax(1)
+        return Found(_picked(starts, best), _picked(missing[..., None], best)[..., 0])
 
 
 def _picked(plans: Array, index: Array) -> Array:

@@ -274,6 +274,8 @@ class EpisodeStore:
                 f"from_episodes got observations {observations.shape} and actions {actions.shape}; they must be "
                 "(E, L+1, N, O) and (E, L, N, A): keep the state that the last action leads to."
             )
+        if 0 in actions.shape[:3]:
+            raise StoreError(f"from_episodes got actions {actions.shape}, so nothing was done; give a step or more.")
         e, length, n = actions.shape[:3]
         rewards = _numbers("rewards", rewards)
         costs, several, card = _several(costs, (e, length), n, card)

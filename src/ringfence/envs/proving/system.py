@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -22,6 +23,7 @@ from ringfence.envs.proving.dangers import LOW_CHARGE, MARGIN, METRES, OF_PLACE,
 from ringfence.envs.proving.layout import Layout, SystemState
 from ringfence.problem import features
 from ringfence.types import Array, Key, Transition
+from ringfence.utils.precision import in_float32
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -195,15 +197,7 @@ class System(Layout, Defaults):
 @functools.lru_cache(64)
 def _logged_map(system: System, view: str) -> features.FeatureMap:
     """The view that logs of these drivers have: which entries vary, and what follows from what, as logs tell it."""
-
-    def rows(key: Key) -> Array:
-        states, _, _, _ = system.played(key, SAMPLE)
-        return jnp.swapaxes(jax.vmap(system.observe)(states), 0, 1)
-
-    with jax.ensure_compile_time_eval():  # a policy that is compiled may be the first to ask
-        seen = np.asarray(jax.jit(rows)(jax.random.key(SAMPLE_SEED)))
-    if system.homogeneous:  # each sees for itself: a team of one
-        seen = np.moveaxis(seen, 2, 1).reshape(-1, seen.shape[1], 1, seen.shape[-1])
+    seen = _sample(system)
     episodes, rows_of_one = seen.shape[:2]
     return features.from_data(
         "pruned" if view == "centralized" else view,
@@ -215,3 +209,23 @@ def _logged_map(system: System, view: str) -> features.FeatureMap:
         homogeneous=system.homogeneous,
         dt=system.dt,
     )
+
+
+@functools.lru_cache(4)
+def _sample(system: System) -> np.ndarray:
+    """(E, L + 1, N, O) what drivers of it see; of homogeneous agents each is an episode of its own."""
+
+    def rows(key: Key) -> Array:
+        states, _, _, _ = system.played(key, SAMPLE)
+        return jnp.swapaxes(jax.vmap(system.observe)(states), 0, 1)
+
+    @in_float32
+    def played() -> np.ndarray:
+        return np.asarray(jax.jit(rows)(jax.random.key(SAMPLE_SEED)))
+
+    # A policy that is compiled may be the first to ask; in a thread of its own nothing else is being traced.
+    with ThreadPoolExecutor(1) as thread:
+        seen = thread.submit(played).result()
+    if not system.homogeneous:
+        return seen
+    return np.moveaxis(seen, 2, 1).reshape(-1, seen.shape[1], 1, seen.shape[-1])
