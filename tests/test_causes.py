@@ -414,9 +414,14 @@ def test_verdicts_give_their_reasons():
     for changes, word, reason in cases:
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, **changes)))
         assert found.word == word and found.reasons == (reason,) and found.remedies
-    blind = PredictionError(steps_ahead=(1,), error_of_change=(1.3,), by_entry={}, coasting=(0.9,))
-    found = verdict.judge(Card(data=data, barrier=good, prediction_error=blind))
-    assert found.word == "weak" and "constant velocity errs by 90%" in found.reasons[0]
+    for error, word, reason in (
+        (0.95, "weak", "constant velocity errs by 90%"),
+        (1.3, "unfit", "err by 1.3 times as much as what they predict changes at all"),
+        (3e6, "unfit", "err by hundreds of times as much"),
+    ):
+        blind = PredictionError(steps_ahead=(1,), error_of_change=(error,), by_entry={}, coasting=(0.9,))
+        found = verdict.judge(Card(data=data, barrier=good, prediction_error=blind))
+        assert found.word == word and reason in found.reasons[0]
 
 
 def test_a_world_of_before_says_that_it_has_no_verdict():

@@ -21,8 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
+from ringfence.problem import partners, turns
 from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
+from ringfence.problem.partners import Mirrored
+from ringfence.problem.turns import Turn
 from ringfence.types import Array
 
 View = Literal["pruned", "centralized", "decentralized"]
@@ -53,6 +56,9 @@ class FeatureMap:
     models_others: bool = False  # what comes next depends on what others see and do, which has to be guessed
     dt: float | None = None  # s, of a decentralized map: the step that velocities are predicted by
     late: float = 1.0  # of a decentralized map: the share of that step that is gone with the next velocity
+    turns: tuple[Turn, ...] = ()  # entries that are angles, which begin again after a whole turn
+    # What agents see of each other in lists that do not say of whom; what comes next depends on what these do.
+    mirrored: tuple[Mirrored, ...] = ()
     # D weights of the standardised entries that the critic reads; None: all the same
     critic_weight: tuple[float, ...] | None = None
 
@@ -107,6 +113,10 @@ class FeatureMap:
         assert state is not None, "a map of the state is given one"
         plain = self.minus < 0
         return observations, state.at[..., self.plus[plain]].set(features[..., plain])
+
+    def apart(self, after: X, before: X) -> X:
+        """(..., D) how far features are from others; of angles, the shorter way round."""
+        return turns.apart(self.turns, after, before)
 
     def agreed(self, plan: Array, history: int = 0) -> Array:
         """Plans (B, history + H, N, D) whose agents agree on where everybody will be, where the view knows how."""
@@ -287,7 +297,8 @@ def alone(map: FeatureMap) -> FeatureMap:
     rules = derived(map.names, map.plus.shape[0])
     how = {d: rule for d, rule in rules.items() if d in map.follows and rule[1] < 0}  # what stands still
     models_others = map.plus.shape[0] > 1 and not map.shared_body
-    return following(replace(map, own=None, reconcile=None, follows=(), joint=False, models_others=models_others), how)
+    blank = replace(map, own=None, reconcile=None, follows=(), joint=False, mirrored=(), models_others=models_others)
+    return following(blank, how)
 
 
 def _relative(how: dict[int, tuple[int, int]], names: Sequence[str], n: int) -> Callable[[Array], Array]:
@@ -358,14 +369,19 @@ def from_data(
     if view != "centralized":
         observation_names = inferred_names(observations, observation_names, first_rows, keep)
     plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
+    steps = _logged_steps(plain, observations, state, first_rows)
+    if steps is not None:
+        plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
     if view == "centralized":
         return plain
     if homogeneous and not any(f"own.{c}" in plain.names for c in "xyz"):
-        steps = _logged_steps(plain, observations, None, first_rows)
         dt = dt or _step_of(plain, steps)
         if dt is not None:
             return constant_velocity(plain, dt, _late(plain, steps, dt))
-    return following(plain, _confirmed(plain, _logged_steps(plain, observations, state, first_rows)))
+    how = _confirmed(plain, steps)
+    if steps is not None and not any(other >= 0 for _, other in how.values()):
+        plain = replace(plain, mirrored=partners.found_in(steps.before))
+    return following(plain, how)
 
 
 def _pruned_map(
@@ -561,11 +577,27 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
         raise UserError(f"The run's feature map is damaged: {data['late']} is no share of a step; train the run again.")
     kind = _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
+    map = replace(map, turns=_turns(data), mirrored=_mirrored(data))
     if data.get("dt") is not None:
         return constant_velocity(map, data["dt"], data.get("late", 1.0))
     kept = set(data.get("follows", ()))
     rules = derived(map.names, map.plus.shape[0])
     return following(map, {d: rule for d, rule in rules.items() if d in kept})
+
+
+def _turns(data: Mapping[str, Any]) -> tuple[Turn, ...]:
+    found = tuple(Turn(int(entry), low, whole) for entry, low, whole in data.get("turns", ()))
+    if any(not 0 <= turn.entry < len(data["names"]) or not 0 < turn.whole < math.inf for turn in found):
+        raise UserError("The run's feature map is damaged: its angles are none of its entries; train the run again.")
+    return found
+
+
+def _mirrored(data: Mapping[str, Any]) -> tuple[Mirrored, ...]:
+    found = tuple(Mirrored(tuple(entries), int(sign)) for entries, sign in data.get("mirrored", ()))
+    every = [entry for part in found for entry in part.entries]
+    if len({len(part.entries) for part in found}) > 1 or not all(0 <= e < len(data["names"]) for e in every):
+        raise UserError("The run's feature map is damaged: others are none of its entries; train the run again.")
+    return found
 
 
 def to_dict(map: FeatureMap) -> dict[str, Any]:
@@ -578,6 +610,8 @@ def to_dict(map: FeatureMap) -> dict[str, Any]:
         "minus": map.minus.tolist(),
         "joint": isinstance(map, _Joint),
         "follows": list(map.follows),
+        **({"turns": [list(turn) for turn in map.turns]} if map.turns else {}),
+        **({"mirrored": [[list(entries), sign] for entries, sign in map.mirrored]} if map.mirrored else {}),
         **({} if map.dt is None else {"dt": map.dt}),
         **({} if map.late == 1 else {"late": map.late}),
     }

@@ -60,6 +60,8 @@ class Map(TypedDict):
     joint: bool
     follows: NotRequired[list[int]]
     dt: NotRequired[float | None]
+    turns: NotRequired[list[tuple[int, float, float]]]
+    mirrored: NotRequired[list[tuple[list[int], int]]]
 
 
 class Data(TypedDict, total=False):

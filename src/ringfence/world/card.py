@@ -45,6 +45,7 @@ class Data(Part, frozen=True):
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
     inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
     impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
+    partners: bool = False  # predictions read what those do who are in lists of the nearest (problem/partners.py)
 
 
 class HeldOut(Part, frozen=True):
@@ -258,6 +259,8 @@ def _of_data(card: Card) -> Iterator[str]:
     if inferred := card.data.inferred_names:
         named = ", ".join(f"{name} ({entry})" for entry, name in inferred.items())
         yield f"Nobody named these entries; what agents see of each other says what they are: {named}."
+    if card.data.partners:
+        yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
     if card.data.impacts:
         yield (
             f"In {card.data.impacts} unsafe steps a body was thrown back by what it touched: danger is where it would "

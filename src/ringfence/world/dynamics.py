@@ -19,11 +19,14 @@ import optax
 
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
+from ringfence.problem import partners
 from ringfence.problem.features import FeatureMap, others
 from ringfence.problem.normalise import varying
+from ringfence.problem.turns import pointing, within
 from ringfence.types import Array, Key
 from ringfence.world.causes import AHEAD, Heading
 
+Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by
 BATCH = 128  # small and often: at equal time it learns contacts that 512 at half the rate does not
 
@@ -74,16 +77,26 @@ class Dynamics(eqx.Module):
 
         return jax.vmap(of_member)(self.net, self.guesses)
 
-    def read(self, before: Array, action: Array) -> Array:
-        """What the network reads, (..., N or 1, D + A or N A), but for what is guessed."""
+    def read(self, before: Array, action: Array, seen: Seen | None = None) -> Array:
+        """What the network reads, (..., N or 1, D + T + A or N A), but for what is guessed: T angles are two numbers
+        each. Where a list of others does not say who they are, their views and actions, too, (..., N, J (D + T + A +
+        1)) of those that are known. `seen` says who these are, where that is looked up already."""
         if self.map.joint:
             before = before[..., :1, :]
             action = action.reshape(*action.shape[:-2], 1, -1)
-        return jnp.concatenate([(before - self.mean) / self.scale, action], -1)
+        mine = jnp.concatenate([self._standard(before), action], -1)
+        if not self.map.mirrored:
+            return mine
+        who, known = seen or partners.seen_by(self.map.mirrored, before, self.scale)
+        return jnp.concatenate([mine, partners.looked_up(mine, who, known)], -1)
+
+    def _standard(self, before: Array) -> Array:
+        """(..., D + T) features as networks read them."""
+        return pointing(self.map.turns, before, (before - self.mean) / self.scale)
 
     def guessed(self, guesses: MLP, before: Array) -> Array:
-        """(..., N, (N-1) (D + A)) what each agent takes the others to see and do, standardised."""
-        return guesses((before - self.mean) / self.scale)
+        """(..., N, (N-1) (D + T + A)) what each agent takes the others to see and do, standardised."""
+        return guesses(self._standard(before))
 
     def members(self, index: Array) -> tuple[MLP, MLP | None]:
         """The networks of the members at `index` (...), leaves (..., G, ...), for `by_members`."""
@@ -102,14 +115,15 @@ class Dynamics(eqx.Module):
         """Features (..., N, D) after a standardised change (..., N or 1, F)."""
         moved = change * self.step_scale + self.step_mean
         if self.map.joint:
-            return (before[..., 0, :] + moved[..., 0, :])[..., _of_first(self.map)]
+            after = within(self.map.turns, before[..., 0, :] + moved[..., 0, :])
+            return after[..., _of_first(self.map)]
         after = before.at[..., self.predicted].add(moved)
         if self.ahead is not None:
             heading, least = self.ahead
             after = heading.no_slower(after, least)
-        if self.map.reconcile is None:
-            return after
-        return self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
+        if self.map.reconcile is not None:
+            after = self.map.reconcile(jnp.stack([before, after], -3))[..., 1, :, :]
+        return within(self.map.turns, after)
 
 
 def slowest(map: FeatureMap, ranges: Mapping[str, tuple[float, float]] | None) -> tuple[Heading, float] | None:
@@ -143,11 +157,11 @@ def fit_dynamics(
     nets = _networks(key_nets, map, actions.shape[-1], num_ensemble, width)
     whose = others(map.plus.shape[0])
 
-    def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array) -> Array:
+    def of_member(nets: tuple[MLP, MLP | None], before: Array, action: Array, after: Array, seen: Seen | None) -> Array:
         net, guesses = nets
-        moved = (after - before)[:, shown, model.predicted]
+        moved = map.apart(after, before)[:, shown, model.predicted]
         moved = (moved - model.step_mean) / model.step_scale
-        read = model.read(before, action)
+        read = model.read(before, action, seen)
         wrong = 0.0
         if guesses is not None:  # it learns from what others saw and did
             theirs = read[:, whose].reshape(*read.shape[:2], -1)
@@ -156,20 +170,21 @@ def fit_dynamics(
         return optax.losses.huber_loss(net(read), moved, delta=1.0).mean() + wrong
 
     def loss(nets: tuple[MLP, MLP | None], data: tuple[Array, ...], pick: Array) -> Array:
-        features, actions, row = data
+        features, actions, row, *seen = data
 
         def of(nets: tuple[MLP, MLP | None], step: Array) -> Array:
-            return of_member(nets, features[row[step]], actions[step], features[row[step] + 1])
+            who = (seen[0][row[step]], seen[1][row[step]]) if seen else None
+            return of_member(nets, features[row[step]], actions[step], features[row[step] + 1], who)
 
         return jax.vmap(of)(nets, pick.reshape(num_ensemble, -1)).sum()
 
-    data = features, actions, row
+    data = features, actions, row, *(partners.seen_in(map.mirrored, features, model.scale) if map.mirrored else ())
     return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * num_ensemble, 4e-3, label))
 
 
 def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dynamics:
     """The model with mean and deviation of states (M, D) and of their changes."""
-    moved = (after - before)[:, model.predicted]
+    moved = model.map.apart(after, before)[:, model.predicted]
     mean = before.mean(0)
     scale = varying(before.std(0), mean)
     step_scale = varying(moved.std(0), (np.abs(mean) + scale)[model.predicted])
@@ -200,8 +215,9 @@ def _networks(key: Key, map: FeatureMap, action: int, num_ensemble: int, width: 
     """Of what moves, and of what others see and do where that is guessed. Agents of one kind share weights: all of a
     team whose entries are named alike, and the one body of robots."""
     n = map.plus.shape[0]
-    entries = len(map.names)
+    entries = len(map.names) + len(map.turns)
     read = n * (entries + action) if map.models_others else entries + (n if map.joint else 1) * action
+    read += partners.places(map.mirrored) * (entries + action + 1)
     groups = 1 if map.joint or map.follows else n
     sizes = (read, width, width, len(_predicted(map)))
     keys = jax.random.split(key, num_ensemble)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ringfence.problem.features import FeatureMap
 from ringfence.world import causes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import Foresight
@@ -36,8 +37,9 @@ def foresight(
     came = logged.picked("features", row[:, None] + index)
     predicted = np.asarray(rolled(dynamics, logged, starts, steps[-1])[0])[:, index - 1]
     dt = logged.store.card.dt
-    moved = _moved(logged.map.names, now, logged.picked("features", row - 1), dt)
+    moved = _moved(logged.map, now, logged.picked("features", row - 1), dt)
     coasted = now[:, None] + index[:, None, None] * moved[:, None]
+    predicted, coasted = (came + logged.map.apart(x, came) for x in (predicted, coasted))
     found = []
     for name, (cause, edge) in _reads(barrier, logged.map.names).items():
         truth = _read(came, cause, edge)
@@ -54,13 +56,13 @@ def foresight(
     return tuple(found)
 
 
-def _moved(names: Sequence[str], now: np.ndarray, before: np.ndarray, dt: float | None) -> np.ndarray:
+def _moved(map: FeatureMap, now: np.ndarray, before: np.ndarray, dt: float | None) -> np.ndarray:
     """What entries (W, N, D) change by in a step of constant velocity: by their velocities where names tell these,
     since a place in a list of others may change its owner; else by what they changed by."""
-    moved = now - before
+    moved = map.apart(now, before)
     if dt is None:
         return moved
-    at = {name: d for d, name in enumerate(names)}
+    at = {name: d for d, name in enumerate(map.names)}
     for name, d in at.items():
         velocity = at.get(re.sub(r"\.(d?)([xyz])$", r".\1v\2", name))
         if velocity is not None and velocity != d:

@@ -81,13 +81,15 @@ class Usual:
 
     def _read(self, logged: Logged, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(W, N, P) what changes follow from, and (W, N, F) the changes."""
-        before, after = (x[..., self.own].astype(np.float64) for x in (logged.before(steps), logged.after(steps)))
+        whole = logged.before(steps).astype(np.float64)
+        changed = logged.map.apart(logged.after(steps), whole)[..., self.own]
+        before = whole[..., self.own]
         x = np.concatenate([(before - self.mean) / self.scale, logged.picked("actions", steps)], -1)
         parts = [np.ones((*x.shape[:2], 1)), x]
         if x.shape[-1] <= SQUARES:
             i, j = np.triu_indices(x.shape[-1])
             parts.append(x[..., i] * x[..., j])
-        return np.concatenate(parts, -1), after - before
+        return np.concatenate(parts, -1), changed
 
 
 def landed(logged: Logged, acts: Dynamics) -> Logged:

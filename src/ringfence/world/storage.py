@@ -40,7 +40,8 @@ def blank_world(
     alone = settings.execution == "decentralized"
 
     def shapes() -> World:
-        acts = dynamics.blank_dynamics(map, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
+        moving = map if card is not None and card.data.partners else replace(map, mirrored=())
+        acts = dynamics.blank_dynamics(moving, spec.action_dim, settings.num_ensemble, settings.dynamics_width)
         if card is not None:
             acts = replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
         value = values.blank_values(map, spec.action_dim, settings.discount, alone)

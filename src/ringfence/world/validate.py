@@ -84,7 +84,7 @@ def validate(
     rng = np.random.default_rng(0)
     held_out = HeldOut(episodes=int(whole.held_out.sum()), steps=len(whole.held_steps))
     read = foresight(world.dynamics, world.barrier, logged, np.random.default_rng(1))
-    prediction_error = replace(_prediction_error(world.dynamics, logged, rng), read=read)
+    predicted = replace(prediction_error(world.dynamics, logged, rng), read=read)
     explained = _value_scores(world.values, whole, world.alone, rng)
     ood = _threshold(world.dynamics, logged)
     barrier = world.barrier
@@ -103,7 +103,7 @@ def validate(
         scores, unit = _barrier_scores(world.dynamics, barrier, logged, rng, miscoverage, LEAST[loss])
         barrier = _in_units(barrier, unit)
         scores = _with_widening(scores, barrier, world.dynamics, logged)
-    return Validation(held_out, prediction_error, explained, ood, barrier, scores, constraints)
+    return Validation(held_out, predicted, explained, ood, barrier, scores, constraints)
 
 
 def _with_widening(scores: BarrierScores, barrier: Barrier, dynamics: Dynamics, logged: Logged) -> BarrierScores:
@@ -120,7 +120,7 @@ def _in_units(barrier: Barrier, unit: float) -> Barrier:
 # --- predictions ---
 
 
-def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> PredictionError:
+def prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> PredictionError:
     """Root mean square errors of held-out windows, rolled out along the logged actions."""
     held = logged.held_steps
     left = np.asarray(logged.arrays["last_row"] - logged.arrays["row"])[held]
@@ -130,8 +130,9 @@ def _prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generat
     predicted, _ = rolled(dynamics, logged, starts, ahead)
     row = np.asarray(logged.arrays["row"])[starts]
     came = logged.picked("features", row[:, None] + np.arange(ahead + 1))
-    error = _rms(np.asarray(predicted) - came[:, 1:])
-    change = _rms(came[:, 1:] - came[:, :1])
+    apart = logged.map.apart
+    error = _rms(apart(np.asarray(predicted), came[:, 1:]))
+    change = _rms(apart(came[:, 1:], came[:, :1]))
     scale = np.maximum(np.asarray(dynamics.scale), 1e-9)
     entries = dynamics.predicted
     share = _over_entries(error / scale, entries) / np.maximum(_over_entries(change / scale, entries), 1e-9)
@@ -154,8 +155,9 @@ def _coasted(logged: Logged, starts: np.ndarray, ahead: int) -> np.ndarray:
         return np.full((ahead, len(logged.map.names)), np.nan)
     x = np.asarray(logged.arrays["features"])
     now = x[row]
-    moved = now - x[row - 1]
-    errors = [now + k * moved - x[row + k] for k in range(1, ahead + 1)]
+    apart = logged.map.apart
+    moved = apart(now, x[row - 1])
+    errors = [apart(now + k * moved, x[row + k]) for k in range(1, ahead + 1)]
     return _rms(np.stack(errors, 1))
 
 

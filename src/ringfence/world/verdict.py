@@ -15,6 +15,7 @@ RECALL = (0.8, 0.95)  # share of unsafe steps found with 1 false alarm in 100
 KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights most actions below it
 FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to have less than the margin
 AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
+NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
 
 
@@ -81,6 +82,9 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
             when = f"{one.seconds[-1]:g} s" if one.seconds else f"{one.steps_ahead[-1]} steps"
             ours, theirs = f"{one.error[-1]:.3g}", f"{one.coasting[-1]:.3g}"
             yield "weak", f"it errs by {ours} in {one.name} at {when}, and constant velocity by {theirs}", remedy
+    ours = max(error.error_of_change, default=0.0)
+    if ours > NOTHING:
+        yield "unfit", f"its predictions err by {_times(ours)} as much as what they predict changes at all", remedy
     if not error.coasting:
         return
     ours, theirs = error.error_of_change[-1], error.coasting[-1]
@@ -90,6 +94,10 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
             f"its predictions err by {ours:.0%} of what changes where constant velocity errs by {theirs:.0%}",
             remedy,
         )
+
+
+def _times(ratio: float) -> str:
+    return f"{ratio:.1f} times" if ratio < 100 else "hundreds of times"
 
 
 def require(card: Card, anyway: bool = False) -> None:
