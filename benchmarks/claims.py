@@ -36,6 +36,7 @@ DRAWN = "results/proving/drawn"
 CROWD = "results/replay/students03.json"
 PEDESTRIANS = "results/stress/pedestrians.csv"
 SYSTEMS = "results/stress/systems.csv"
+TRACKERS = "results/proving/trackers.json"
 STRESS = "results/stress/crossing.csv"
 SHOWN = 80  # letters of a sentence in the table
 
@@ -127,6 +128,15 @@ def of_late_actions() -> tuple[bool, str]:
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
     holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and 0.93 <= max(unknown) < 0.95
     return holds, f"{known} of {unknown}"
+
+
+def of_trackers() -> tuple[bool, str]:
+    """Violations of a naive driver under guard, by what dynamics know of lists."""
+    rows = json.loads((ROOT / TRACKERS).read_text())
+    naive = {name: row["naive, shield"]["violation_rate"] for name, row in rows.items()}
+    clones = max(row["clone, shield"]["violation_rate"] for row in rows.values())
+    falls = naive["as it is"] < 0.3 * naive["not who is seen"] < 0.3 * naive["nor what is an angle"]
+    return falls and clones == 0, f"{naive}, clones {clones} at most"
 
 
 def of_late_systems() -> tuple[bool, str]:
@@ -747,6 +757,12 @@ CLAIMS = (
         "A guard that knows of up to three late steps leaves no unsafe step on the three systems",
         SYSTEMS,
         of_late_systems,
+    ),
+    Claim(
+        "docs/proving-ground.md",
+        "Who is seen matters to bold drivers",
+        TRACKERS,
+        of_trackers,
     ),
     Claim(
         "docs/stress.md",

@@ -96,12 +96,12 @@ def test_where_a_body_heads_for_and_what_else_moves():
     assert found == ("obs0", "obs1", *true[2:]), "nobody moves along that direction"
 
 
-def test_others_by_distance_are_not_named():
+def test_others_by_distance_are_named_in_that_order():
     x, true, first = team()
     seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)
     nearest = (seen[..., :2] ** 2).sum(-1).argsort(-1)
     x[..., 7:] = np.take_along_axis(seen, nearest[..., None], 2).reshape(*x.shape[:2], -1)
-    assert inferred_names(x, numbers(len(true)), first) == numbers(len(true))
+    assert inferred_names(x, numbers(len(true)), first) == true
 
 
 def test_what_is_measured_has_no_names():

@@ -10,6 +10,7 @@ import pytest
 from ringfence import EpisodeStore
 from ringfence.errors import UserError
 from ringfence.problem import features, partners, turns
+from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.turns import Turn
 from ringfence.training import worlds
 from ringfence.world import storage
@@ -174,3 +175,21 @@ def test_a_world_reads_who_is_seen_only_where_that_tells_more(tmp_path, monkeypa
     kept = storage.load(storage.save(told, tmp_path / "told.world"))
     assert kept.dynamics.map.mirrored and kept.map == told.map
     assert not storage.load(storage.save(plain, tmp_path / "plain.world")).dynamics.map.mirrored
+
+
+def test_lists_that_nobody_named_are_named():
+    """Three of five seen, by how near they are: the same place is another's at another step."""
+    rng = np.random.default_rng(7)
+    place, speed = rng.normal(size=(30, 5, 2)) * 2, rng.normal(size=(30, 5, 2))
+    seen = []
+    for _ in range(41):
+        off, gap = (x[:, None] - x[:, :, None] for x in (place, speed))
+        order = (np.linalg.norm(off, axis=-1) + 1e9 * np.eye(5)).argsort(-1)[..., :3, None]
+        listed = [np.take_along_axis(x, order, 2) for x in (off, gap)]
+        seen.append(np.concatenate([speed, np.concatenate(listed, -1).reshape(30, 5, -1)], -1))
+        speed = speed + 0.2 * rng.normal(size=speed.shape) - 0.02 * place
+        place = place + 0.1 * speed
+    seen = np.stack(seen, 1).astype(np.float32)
+    found = inferred_names(seen.reshape(-1, *seen.shape[2:]), [f"obs{d}" for d in range(14)], np.arange(30) * 41)
+    wanted = [f"other{k}.{what}" for k in range(3) for what in ("dx", "dy", "dvx", "dvy")]
+    assert found == ("own.vx", "own.vy", *wanted)

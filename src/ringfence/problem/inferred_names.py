@@ -13,7 +13,10 @@ import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import jax.numpy as jnp
 import numpy as np
+
+from ringfence.problem import partners
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
@@ -49,7 +52,7 @@ def inferred_names(
     steps = _Steps.of(observations, first_rows)
     if steps is None:
         return tuple(names)
-    fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)])
+    fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps)
     places = [f for f in fields if not any(f is other.speed for other in fields)]
     moving = [f for f in places if f.speed is not None] or places
     if len(moving) > len(AXES):
@@ -113,6 +116,46 @@ def _fields(steps: _Steps) -> Iterator[_Field]:
             yield _Field(tuple(entries))
 
 
+def _listed(steps: _Steps) -> list[_Field]:
+    """The same where others are listed by how near they are: who is in which place changes, and is found by what two
+    see of each other."""
+    seen = [part for part in partners.found_in(steps.before) if part.sign < 0]
+    if not seen:
+        return []
+    scale = np.maximum(steps.before.std((0, 1)), 1e-9)
+    before, after = (partners.seen_by(seen, jnp.asarray(x), scale, partners.SAME) for x in (steps.before, steps.after))
+    who, known = (np.asarray(x) for x in before)  # (W, N, J)
+    stays = known & np.asarray(after[1]) & (who == np.asarray(after[0]))
+    fields = [_Field(part.entries, _own_of_listed(steps, part.entries, who, known)) for part in seen]
+    for place in fields:
+        others = [f for f in fields if f is not place and f.speed is not place]
+        some = place.entries[: stays.shape[-1]]
+        left = [_off(*_moves(steps, some, f.entries[: len(some)], stays)) for f in others]
+        if left and min(left) <= LIKE:
+            place.speed = others[int(np.argmin(left))]
+    return fields
+
+
+def _own_of_listed(steps: _Steps, entries: Sequence[int], who: np.ndarray, known: np.ndarray) -> int | None:
+    """The entry of one's own that what is seen of others is the difference of, where there is one."""
+    x = steps.before
+    seen = x[..., list(entries[: who.shape[-1]])]
+    rows = np.arange(len(x))[:, None, None]
+    for own in range(x.shape[2]):
+        gap = x[rows, who, own] - x[:, :, None, own]
+        if own not in entries and steps.varies(own) and known.any() and steps.equal(seen[known], gap[known], own):
+            return own
+    return None
+
+
+def _moves(
+    steps: _Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """What places changed by, and what speeds may be, before, after and between, of the steps (W, N, k) in question."""
+    rows = (steps.after, steps.before, 0.5 * (steps.after + steps.before))
+    return steps.change(places)[where], [row[..., list(speeds)][where] for row in rows]
+
+
 def _pairs(agents: int) -> Iterator[tuple[int, int]]:
     return ((i, j) for i in range(agents) for j in range(i + 1, agents))
 
@@ -168,11 +211,16 @@ def _own_speed(steps: _Steps, place: _Field) -> int | None:
 def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int]) -> float:
     """By what share of their changes places are off what speeds predict, in nine of ten steps; the seconds of a step
     are those that predict best."""
-    change = steps.change(places).ravel()
+    return _off(*_moves(steps, places, speeds, np.ones((*steps.before.shape[:2], len(places)), bool)))
+
+
+def _off(change: np.ndarray, speeds: Sequence[np.ndarray]) -> float:
+    """The same of changes, and of what speeds may be."""
+    if not len(change):
+        return 1.0
     least = np.quantile(np.abs(change), SHARE)
     found = [1.0]
-    for rows in (steps.after, steps.before, 0.5 * (steps.after + steps.before)):
-        speed = rows[..., list(speeds)].ravel()
+    for speed in speeds:
         moves = np.abs(speed) > np.median(np.abs(speed))
         if least > 0 and moves.any() and (dt := float(np.median(change[moves] / speed[moves]))) > 0:
             found.append(float(np.quantile(np.abs(change - dt * speed), SHARE) / least))
