@@ -60,11 +60,11 @@ class Prover(eqx.Module):
         shared = all(len(net.weights[0]) == 1 for net in ([] if barrier is None else _networks(barrier)))
         known = isinstance(barrier, Barrier) and not barrier.shape.use_transition and not barrier.shape.joint
         dynamics = self.world.dynamics
-        linear = dynamics.guesses is None and dynamics.ahead is None
+        linear = dynamics.guesses is None and dynamics.ahead is None and not dynamics.map.turns
         if self.world.map.dt is None or not known or not shared or not linear:
             raise UserError(
-                "proof is of Worlds of homogeneous agents without a heading, whose danger is one and of states, and "
-                "this World is another; leave proof out."
+                "proof is of Worlds of homogeneous agents without a heading or angles, whose danger is one and of "
+                "states, and this World is another; leave proof out."
             )
 
     def continued(self, present: Array, plan: Array) -> Array:
