@@ -36,6 +36,7 @@ DRAWN = "results/proving/drawn"
 CROWD = "results/replay/students03.json"
 PEDESTRIANS = "results/stress/pedestrians.csv"
 SYSTEMS = "results/stress/systems.csv"
+ROBOTS_NOW = "results/guards-mujoco-defaults/table.csv"
 TRACKERS = "results/proving/trackers.json"
 STRESS = "results/stress/crossing.csv"
 SHOWN = 80  # letters of a sentence in the table
@@ -137,6 +138,13 @@ def of_trackers() -> tuple[bool, str]:
     clones = max(row["clone, shield"]["violation_rate"] for row in rows.values())
     falls = naive["as it is"] < 0.3 * naive["not who is seen"] < 0.3 * naive["nor what is an angle"]
     return falls and clones == 0, f"{naive}, clones {clones} at most"
+
+
+def of_limits_by_defaults() -> tuple[bool, str]:
+    """Unsafe steps of robots under guards of today's defaults."""
+    rows = [r for r in stored.table(ROOT / ROBOTS_NOW) if r["guard"] in ("adapt", "full")]
+    most = max(float(r["cost_mean"]) for r in rows)
+    return most <= 25 and len({r["task"] for r in rows}) == 6, f"{most:.1f} at most, of {len(rows)}"
 
 
 def of_late_systems() -> tuple[bool, str]:
@@ -757,6 +765,12 @@ CLAIMS = (
         "A guard that knows of up to three late steps leaves no unsafe step on the three systems",
         SYSTEMS,
         of_late_systems,
+    ),
+    Claim(
+        "docs/guard-results.md",
+        "Today's defaults keep each of these limits",
+        ROBOTS_NOW,
+        of_limits_by_defaults,
     ),
     Claim(
         "docs/proving-ground.md",

@@ -39,6 +39,9 @@ ROBOTS: dict[str, Column] = {
     "**full**": ("guards-mujoco", ("bc", "default+full-learned")),
     "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
 }
+ROBOTS_DEFAULTS: dict[str, Column] = {
+    words: ("guards-mujoco-defaults", row) for words, (suite, row) in ROBOTS.items() if suite == "guards-mujoco"
+}
 # Crossing's rows: algorithm and variant, and their words.
 SHIELDED = "+shield-learned"
 WAYS = {
@@ -78,6 +81,7 @@ def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "spread-defaults", table(DEFAULTS, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
+    put("docs/guard-results.md", "robots-defaults", table(ROBOTS_DEFAULTS, long))
     put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
     put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", filtered=False))
     put("docs/proving-ground.md", "drawn", proving(RESULTS / "proving" / "drawn", "*.json", filtered=False))

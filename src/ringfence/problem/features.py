@@ -595,7 +595,8 @@ def _turns(data: Mapping[str, Any]) -> tuple[Turn, ...]:
 def _mirrored(data: Mapping[str, Any]) -> tuple[Mirrored, ...]:
     found = tuple(Mirrored(tuple(entries), int(sign)) for entries, sign in data.get("mirrored", ()))
     every = [entry for part in found for entry in part.entries]
-    if len({len(part.entries) for part in found}) > 1 or not all(0 <= e < len(data["names"]) for e in every):
+    alike = len({len(part.entries) for part in found}) <= 1 and all(part.entries for part in found)
+    if not alike or not all(0 <= e < len(data["names"]) for e in every):
         raise UserError("The run's feature map is damaged: others are none of its entries; train the run again.")
     return found
 
