@@ -14,6 +14,8 @@ from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.guards import searched, shown
 from ringfence.problem import features
+from ringfence.problem.features import FeatureMap
+from ringfence.problem.turns import Turn
 from ringfence.report.ope_page import build_ope
 from ringfence.world import cause_counts, cause_search, causes, foresight, load, margins, probes, save, verdict
 from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
@@ -575,10 +577,13 @@ def test_foresight_reads_the_thing_in_most_danger():
 
 def test_constant_velocity_is_that_of_the_names():
     """Who changes places in a list of others has not jumped."""
-    names = ("own.x", "other0.dx", "other0.dvx")
-    before, now = np.array([[[0.0, 5.0, 1.0]]]), np.array([[[1.0, -3.0, 2.0]]])
-    np.testing.assert_allclose(foresight._moved(names, now, before, 0.5), [[[1.0, 1.0, 1.0]]])
-    np.testing.assert_allclose(foresight._moved(names, now, before, None), [[[1.0, -8.0, 1.0]]])
+    table = np.arange(4)[None]
+    names = ("own.x", "other0.dx", "other0.dvx", "own.yaw")
+    map = FeatureMap("pruned", names, "observations", table, -np.ones_like(table), turns=(Turn(3, -np.pi, 2 * np.pi),))
+    before, now = np.array([[[0.0, 5.0, 1.0, 3.0]]]), np.array([[[1.0, -3.0, 2.0, -3.0]]])
+    turned = 2 * np.pi - 6.0
+    np.testing.assert_allclose(foresight._moved(map, now, before, 0.5), [[[1.0, 1.0, 1.0, turned]]])
+    np.testing.assert_allclose(foresight._moved(map, now, before, None), [[[1.0, -8.0, 1.0, turned]]])
 
 
 def test_foresight_is_told_in_seconds_where_logs_say_how_long_a_step_is():
