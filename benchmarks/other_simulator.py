@@ -170,11 +170,11 @@ def main() -> None:
     rows = [r for r in read(OUT) if a.of and r["learned from"] not in mine]
 
     def played(words: str, run, world, n: int, **guard) -> None:
-        guarded = {"world": world, "anyway": True} | guard if guard else {}
+        guarded = {} if not guard else {"world": world} | guard
         r = play(run, lambda: IrSim(n), episodes=a.episodes, agents=n, num_envs=50, **guarded)
         row = {"learned from": words, "agents": n, "guard": guard.get("guard", "none"), "seed": a.seed}
-        row |= {"verdict": world.card.verdict.word, "episodes": a.episodes}
-        row |= {"return": round(r["return_mean"], 3), "steps with contact": r["cost_mean"]}
+        row |= {"options": ", ".join(f"{k}={v}" for k, v in guard.items() if k != "guard")}
+        row |= {"episodes": a.episodes, "return": round(r["return_mean"], 3), "steps with contact": r["cost_mean"]}
         row |= {"episodes with contact": r["violation_rate"], "bound": round(r["violation_upper"], 4)}
         rows.append(row)
         print(row, flush=True)
@@ -188,7 +188,7 @@ def main() -> None:
                 "agents": 8,
                 "guard": "none",
                 "seed": a.seed,
-                "verdict": "",
+                "options": "",
                 "episodes": a.logs,
                 "return": round(float(logs.returns.mean()), 3),
                 "steps with contact": round(float(logs.episode_costs.mean()), 3),
@@ -211,7 +211,7 @@ def main() -> None:
             (run,) = loop.train("bc", store, seeds=(a.seed,), out=Path(folder), quiet=True)
             played(words, run, world, 8)
             for n in (8, 16):
-                played(words, run, world, n, guard="shield")
+                played(words, run, world, n, guard="shield", horizon=3, terminal_value=True)
 
 
 if __name__ == "__main__":

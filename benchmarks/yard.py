@@ -30,21 +30,19 @@ import yard  # noqa: E402
 
 OUT = ROOT / "results" / "yard.csv"
 # Who acts, under which guard, of how many episodes one (`full` takes ten times as long).
-NEAR = {"horizon": 3, "terminal_value": False}
-NEAR_AND_V = {"horizon": 3, "terminal_value": True}
 ROWS = (
     ("BC", "none", "none", {}, 1),
-    ("BC", "shield", "learned", NEAR, 1),
-    ("BC", "shield", "learned", NEAR_AND_V, 1),
+    ("BC", "shield", "learned", {"terminal_value": False}, 1),
     ("BC", "shield", "learned", {}, 1),
     ("BC", "shield", "analytic", {}, 1),
     ("BC", "full", "learned", {}, 5),
+    ("BC", "full", "learned", {"horizon": 3, "terminal_value": True}, 5),
     ("BC", "full", "analytic", {}, 5),
     ("naive controller", "none", "none", {}, 1),
-    ("naive controller", "shield", "learned", NEAR, 1),
-    ("naive controller", "shield", "learned", NEAR_AND_V, 1),
+    ("naive controller", "shield", "learned", {"terminal_value": False}, 1),
     ("naive controller", "shield", "learned", {}, 1),
-    ("naive controller", "shield", "analytic", NEAR, 1),
+    ("naive controller", "shield", "learned", {"horizon": 7}, 1),
+    ("naive controller", "shield", "learned", {"horizon": 10}, 1),
     ("naive controller", "shield", "analytic", {}, 1),
 )
 HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
@@ -109,7 +107,9 @@ def write(rows: list[list]) -> None:
 
 def table(file: Path) -> str:
     lines = ["| method | guard | return | episodes with contact (bound) |", "|---|---|---|---|"]
-    ways = {"": "", "horizon=3 terminal_value=False": ", 3 steps", "horizon=3 terminal_value=True": ", 3 steps and V"}
+    ways = {"": "", "terminal_value=False": ", 3 steps without V", "horizon=7": ", 7 steps"}
+    ways |= {"horizon=10": ", 10 steps"}
+    ways |= {"horizon=3 terminal_value=True": ", 3 steps"}
     for r in stored.table(file):
         guard = "" if r["guard"] in ("", "none") else f"{r['guard']}, {r['barrier']}{ways[r['options']]}"
         bound = f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
