@@ -127,13 +127,7 @@ def _listed(steps: _Steps) -> list[_Field]:
     who, known = (np.asarray(x) for x in before)  # (W, N, J)
     stays = known & np.asarray(after[1]) & (who == np.asarray(after[0]))
     fields = [_Field(part.entries, _own_of_listed(steps, part.entries, who, known)) for part in seen]
-    for place in fields:
-        others = [f for f in fields if f is not place and f.speed is not place]
-        some = place.entries[: stays.shape[-1]]
-        left = [_off(*_moves(steps, some, f.entries[: len(some)], stays)) for f in others]
-        if left and min(left) <= LIKE:
-            place.speed = others[int(np.argmin(left))]
-    return fields
+    return _with_speeds(steps, fields, stays)
 
 
 def _own_of_listed(steps: _Steps, entries: Sequence[int], who: np.ndarray, known: np.ndarray) -> int | None:
@@ -146,14 +140,6 @@ def _own_of_listed(steps: _Steps, entries: Sequence[int], who: np.ndarray, known
         if own not in entries and steps.varies(own) and known.any() and steps.equal(seen[known], gap[known], own):
             return own
     return None
-
-
-def _moves(
-    steps: _Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """What places changed by, and what speeds may be, before, after and between, of the steps (W, N, k) in question."""
-    rows = (steps.after, steps.before, 0.5 * (steps.after + steps.before))
-    return steps.change(places)[where], [row[..., list(speeds)][where] for row in rows]
 
 
 def _pairs(agents: int) -> Iterator[tuple[int, int]]:
@@ -178,11 +164,13 @@ def _with_own(steps: _Steps, found: _Field) -> _Field:
     return found
 
 
-def _with_speeds(steps: _Steps, fields: list[_Field]) -> list[_Field]:
-    """The fields, each with the one that is its rate of change."""
+def _with_speeds(steps: _Steps, fields: list[_Field], where: np.ndarray | None = None) -> list[_Field]:
+    """The fields, each with the one that is its rate of change, in all steps or `where` (W, N, k) the first k of the
+    others stay who they are."""
+    places = None if where is None else where.shape[-1]
     for place in fields:
         others = [f for f in fields if f is not place and f.speed is not place]
-        left = [_unlike(steps, place.entries, f.entries) for f in others]
+        left = [_unlike(steps, place.entries[:places], f.entries[:places], where) for f in others]
         if left and min(left) <= LIKE:
             place.speed = others[int(np.argmin(left))]
     return fields
@@ -208,19 +196,17 @@ def _own_speed(steps: _Steps, place: _Field) -> int | None:
     return entries[int(np.argmin(left))] if left and min(left) <= LIKE else None
 
 
-def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int]) -> float:
-    """By what share of their changes places are off what speeds predict, in nine of ten steps; the seconds of a step
-    are those that predict best."""
-    return _off(*_moves(steps, places, speeds, np.ones((*steps.before.shape[:2], len(places)), bool)))
-
-
-def _off(change: np.ndarray, speeds: Sequence[np.ndarray]) -> float:
-    """The same of changes, and of what speeds may be."""
-    if not len(change):
+def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray | None = None) -> float:
+    """By what share of their changes places are off what speeds predict, in nine of ten steps, of all or `where`
+    (W, N, k); the seconds of a step are those that predict best."""
+    some = ... if where is None else where
+    change = steps.change(places)[some].ravel()
+    if not change.size:
         return 1.0
     least = np.quantile(np.abs(change), SHARE)
     found = [1.0]
-    for speed in speeds:
+    for rows in (steps.after, steps.before, 0.5 * (steps.after + steps.before)):
+        speed = rows[..., list(speeds)][some].ravel()
         moves = np.abs(speed) > np.median(np.abs(speed))
         if least > 0 and moves.any() and (dt := float(np.median(change[moves] / speed[moves]))) > 0:
             found.append(float(np.quantile(np.abs(change - dt * speed), SHARE) / least))
