@@ -38,6 +38,7 @@ EPISODES = 200  # test resets
 OF_ROBOTS = 20  # theirs are forty times as long
 COLUMNS = ("return_mean", "return_norm", "cost_mean", "cost_safe_start", "train_seconds", "parameters")
 FLOW = {"num_updates": 4000}
+RAW = {"condition": "raw", "discount": 0.99}
 # (algorithm, preset, changes, how it is played)
 ROWS = {
     "bc": ("bc", "default", {}, {}),
@@ -65,6 +66,17 @@ ROWS = {
     "ma-td3bc-lag": ("ma-td3bc-lag", "default", {}, {}),
     "madiff": ("madiff", "default", {}, {}),
     "icbf": ("icbf", "split", {}, {}),
+    # MADIFF at inference, one step at a time: a raw return-to-go, how much of it, less noise, 24 rows.
+    "madiff, long": ("madiff", "long", {}, {}),
+    "madiff, long, 2.5 asked": ("madiff", "long", {}, {"target_return": 2.5}),
+    "madiff, long, 5 asked": ("madiff", "long", {}, {"target_return": 5.0}),
+    "madiff, long, temperature 0.5": ("madiff", "long", {}, {"temperature": 0.5}),
+    "madiff, long, 24 rows": ("madiff", "long", {"horizon": 24}, {}),
+    **{f"madiff, long, raw, {t} asked": ("madiff", "long", RAW, {"target_return": t}) for t in (0.5, 0.9, 1.5)},
+    "madiff, long, raw, 0.9 asked, temperature 0.5": ("madiff", "long", RAW, {"planner": "published"}),
+    "madiff, as published at inference": ("madiff", "raw-return", {}, {"planner": "published"}),
+    **{f"flow, told raw, {t} asked": ("flow", "return", FLOW | RAW, {"target_return": t}) for t in (0.5, 0.9, 1.5)},
+    "bc-return, raw, 0.9 asked": ("bc-return", "default", RAW | {"target_return": 0.9}, {}),
 }
 # The same runs under guards, by one World of the pool, seed 0.
 _GUARDED = (
@@ -78,6 +90,7 @@ _GUARDED = (
     "madiff",
     "icbf",
     "flow",
+    "flow, told the return",
 )
 ROWS |= {
     f"{name}, under {guard}": (*ROWS[name][:-1], ROWS[name][-1] | {"guard": guard})

@@ -233,6 +233,8 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
         assert stop.value.code == 2 and said in told.err + told.out, words
     with pytest.raises(UserError, match="Unknown format 'onx'; did you mean 'onnx'"):
         exporting.export(run, tmp_path / "x", "onx")
+    with pytest.raises(UserError, match="'p.xyz' ends in .xyz, and what is written is onnx; end it in .onnx"):
+        exporting.export(run, tmp_path / "p.xyz")
     monkeypatch.setitem(sys.modules, "jax2onnx", None)  # as if it were not installed
     with pytest.raises(UserError, match=r"pip install 'ringfence\[export\]'"):
         exporting.export(run, tmp_path / "x.onnx")

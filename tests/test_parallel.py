@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import html
 import shutil
+import warnings
 
 import jax
 import numpy as np
@@ -45,11 +46,12 @@ class Watched(SimpleSpreadParallel):
 
     def reset(self, seed=None, options=None):
         self.kept = []
-        self.books.append(self.kept)
         return super().reset(seed, options)
 
     def step(self, actions):
         step = super().step(actions)
+        if not self.kept:  # an episode begins; a reset alone may only look
+            self.books.append(self.kept)
         self.kept.append((np.mean(list(step[1].values())), step[4]["agent_0"]["cost"]))
         return step
 
@@ -73,6 +75,24 @@ def test_what_is_summed_is_what_the_simulator_gave(run):
             return seen, reward, {a: 0.5 * k for k, a in enumerate(reward)}, *rest
 
     assert play(run, Apart, episodes=1)["cost_mean"] == 25  # the largest of costs that step() tells beside rewards
+
+
+class Unseeded(SimpleSpreadParallel):
+    """Begins anywhere."""
+
+    begun = 0
+
+    def reset(self, seed=None, options=None):
+        Unseeded.begun += 1
+        return super().reset(Unseeded.begun, options)
+
+
+def test_a_simulator_that_ignores_its_seed_is_told(run):
+    with pytest.warns(UserWarning, match=r"Unseeded begins differently at each reset\(seed=\d+\)"):
+        play(run, Unseeded, episodes=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        play(run, SimpleSpreadParallel, episodes=1)
 
 
 class Own(SimpleSpreadParallel):

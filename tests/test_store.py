@@ -18,7 +18,7 @@ from ringfence.logs.schema import ARRAYS, StoreCard, complete_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import NOT_ARRIVED, WindowData, at, returns_to_go
 from ringfence.problem.constraints import CostColumn
-from ringfence.proposals.conditions import return_scores
+from ringfence.proposals.conditions import raw_scores, return_scores
 from ringfence.utils import arrays
 
 
@@ -386,6 +386,14 @@ def test_returns_to_go_is_the_discounted_sum(lengths, discount, seed):
             expected.append(sum(discount**i * r for i, r in enumerate(reward[start + t : start + length])))
         start += length
     np.testing.assert_allclose(returns_to_go(reward, lengths, discount), expected, rtol=1e-9, atol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(lengths=st.lists(st.integers(1, 12), min_size=1, max_size=80), seed=st.integers(0, 999))
+def test_raw_scores_are_shares_of_the_largest_also_where_nothing_was_earned(lengths, seed):
+    left = np.random.default_rng(seed).normal(size=sum(lengths))
+    np.testing.assert_allclose(raw_scores(left) * np.abs(left).max(), left)
+    assert (raw_scores(np.zeros(3)) == 0).all()
 
 
 @settings(max_examples=30, deadline=None)

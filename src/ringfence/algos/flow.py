@@ -66,7 +66,7 @@ class Config:
     sigma_first: Positive = 0.5  # σ of the shares at the first update, in units of action
     sigma: Positive = 0.15  # and when `settled`
     settled: Share = 0.3  # of training: σ falls until then, and drivers are used equally
-    condition: Literal["none", "return", "advantage"] = "none"  # what y is
+    condition: Literal["none", "return", "raw", "advantage"] = "none"  # what y is
     condition_dropout: Share = 0.25  # p, share of windows that are not given y
     discount: Share = 0.9  # of what y scores
     barrier_weight: NonNegative = 0.0  # λ of danger, as a World knows it; 0: no World is read

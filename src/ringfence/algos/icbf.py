@@ -53,7 +53,9 @@ class Config:
     history: Natural = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    condition: conditions.Condition = "advantage"  # what y is: the window's advantage, or the return-to-go (MADIFF)
+    condition: conditions.Condition = (
+        "advantage"  # what y is: the window's advantage, or the return-to-go, ranked or raw (MADIFF)
+    )
     discount: Share = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
@@ -149,7 +151,7 @@ PRESETS: dict[str, dict] = {
         "coordinates": "state",
         "prediction": "epsilon",
         "clip": 3.0,
-        "condition": "return",
+        "condition": "raw",
         "discount": 0.99,
         "batch": 64,
         "lr": 2e-4,
@@ -624,6 +626,15 @@ MADIFF = dataclasses.replace(
     presets={
         "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
         "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "num_updates": 6000},
+        # MADIFF's condition and rows, at a size for CPUs; play it with the planner `published`
+        "raw-return": {
+            "barrier": False,
+            "barrier_weight": 0.0,
+            "condition": "raw",
+            "discount": 0.99,
+            "horizon": 24,
+            "num_updates": 6000,
+        },
         # MADIFF-D: everybody plans for all from its own observation
         "own": {
             "barrier": False,

@@ -48,9 +48,9 @@ class Config(bc.Config):
     """L = E ‖a_i − π_i(s̃_i, y)‖² with y the score of what followed; played with y = `target_return`."""
 
     view: features.View = "pruned"  # the planner's
-    condition: conditions.Condition = "return"  # what y is: the return-to-go, or the advantage of the next `ahead` rows
+    condition: conditions.Condition = "return"  # what y is: the return-to-go, ranked or raw, or the advantage
     discount: Share = 0.9  # of what y scores
-    ahead: AtLeastOne = 8  # rows, of the advantage
+    ahead: AtLeastOne = 8  # rows that an advantage is of
     target_return: float = 1.5  # y when it acts, as a normal score: the best 7 %
 
 

@@ -368,12 +368,13 @@ def _limit(speed_limit: float | None, quantile: bool):
 
 def imported(store, file: Path) -> None:
     """Keep what was imported, and say what was noted."""
+    from ringfence.datasets.audit import odd_costs
     from ringfence.logs.resolution import coarse
 
     each = f" of {store.card.dt:g} s" if store.card.dt is not None else ""
     summary = f"{store.episodes:,} episodes, {store.steps:,} steps{each}: {store.save(file)}"
     out.print(summary, soft_wrap=True, markup=False)
-    for note in [*store.card.warnings, *coarse(store)]:
+    for note in [*store.card.warnings, *odd_costs(store), *coarse(store)]:
         out.print(f"[yellow]note[/] {escape(plain(note))}", soft_wrap=True)
 
 

@@ -37,7 +37,7 @@ def audit(store: EpisodeStore) -> Audit:
     else:
         danger, warnings = _danger(store, task)
         facts |= danger
-    warnings += [*_rare_or_common_costs(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
+    warnings += [*odd_costs(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
     return Audit(facts, warnings, list(store.card.warnings))
 
 
@@ -113,7 +113,8 @@ def _danger(store: EpisodeStore, task: Task) -> tuple[dict[str, str], list[str]]
     return facts, warnings
 
 
-def _rare_or_common_costs(store: EpisodeStore) -> list[str]:
+def odd_costs(store: EpisodeStore) -> list[str]:
+    """Warnings of costs that teach little of danger."""
     rate = _cost_rate(store)
     if rate == 0:
         return ["No step has a cost: a barrier can learn danger only from the hazard's formula."]

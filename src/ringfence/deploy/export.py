@@ -100,6 +100,8 @@ def export(
     if format not in FORMATS:
         raise unknown("format", str(format), FORMATS)
     file = writable(out)
+    if format == "onnx" and file.suffix not in ("", ".onnx"):
+        raise UserError(f"'{file.name}' ends in {file.suffix}, and what is written is onnx; end it in .onnx.")
     _converter() if format == "onnx" else _packer()
     options = renamed(options, {"step": "checkpoint"}, "export")
     checkpoint = options.pop("checkpoint", checkpoint)

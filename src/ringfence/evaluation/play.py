@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Mapping
 from typing import Any, Literal, Protocol
 
@@ -215,6 +216,16 @@ def simulators_of(make_env: Callable[[], Any], count: int, player: Player) -> li
     return envs
 
 
+def _warn_unless_repeated(one: Episode, again: Episode) -> None:
+    """Say so where two resets with the same seed begin differently."""
+    if not np.array_equal(one.seen, again.seen, equal_nan=True):
+        warnings.warn(
+            f"{one.name} begins differently at each reset(seed={one.seed}), so that no two policies are played from the "
+            "same starts; let its reset draw from that seed alone.",
+            stacklevel=4,
+        )
+
+
 def play_tables(
     tables: list[Table],
     player: Player,
@@ -230,6 +241,7 @@ def play_tables(
     """Episodes of these resets, as many side by side as there are simulators. A table is among `tables` as soon as it
     has begun, so that who interrupts it loses none of its episodes."""
     max_steps = max_episode_steps or max(10_000, 20 * player.episode_length)
+    _warn_unless_repeated(*(Episode(envs[0], player.shape, resets[0], max_steps, early_ends) for _ in range(2)))
     for first in range(0, len(resets), len(envs)):
         beginning = zip(envs, resets[first : first + len(envs)])
         begun = [Episode(env, player.shape, reset, max_steps, early_ends) for env, reset in beginning]

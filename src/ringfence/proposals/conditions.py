@@ -1,4 +1,4 @@
-"""The condition y of plans: how much better than others a logged window went, as a normal score."""
+"""The condition y of plans: how well a logged window went, as a normal score among others, or raw as in MADIFF."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.world import World
 from ringfence.world.values import Values, values_of
 
-Condition = Literal["advantage", "return"]
+Condition = Literal["advantage", "return", "raw"]
 MIN_COHORT = 30  # return scores are ranks among at least this many steps
 
 
@@ -33,7 +33,8 @@ def scores_of(
         last = store.episode_ends[episode] + episode
         value = values_of(values.critic, features)
         return normal_scores(advantages(value, team, row, last, horizon, discount))
-    return return_scores(returns_to_go(team, store.lengths, discount), step - starts[episode])
+    left = returns_to_go(team, store.lengths, discount)
+    return raw_scores(left) if condition == "raw" else return_scores(left, step - starts[episode])
 
 
 def scored_windows(
@@ -77,6 +78,14 @@ def advantages(
     n = np.minimum(horizon - 1, left)
     tail = np.where(left > horizon - 1, value[row + n], 0.0)
     return total + discount**n * tail - value[row]
+
+
+def raw_scores(returns_to_go: np.ndarray) -> np.ndarray:
+    """(T,) each return-to-go in units of the largest: what MADIFF reads (Zhu et al. 2024), whose scale is set by hand.
+
+    Late steps have little left to earn, so one number asked for at every step soon lies outside the data.
+    """
+    return returns_to_go / max(float(np.abs(returns_to_go).max()), np.finfo(np.float32).tiny)
 
 
 def normal_scores(x: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ class PlanOptions:
     sampling_steps: Count = 5  # of the sampler
     sampler: diffusion.Sampler = "ddim"
     cfg_scale: float = 1.2  # ω of classifier-free guidance; 1 switches it off
-    target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %
+    target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %; of the largest, if raw
     temperature: NonNegative = 1.0  # scale of the first noise
     value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
@@ -54,6 +54,9 @@ PLANNERS: dict[str, dict] = {
     DEFAULT: {},
     # Value steers the samples.
     "value_guided": {"sampling_steps": 10, "cfg_scale": 1.0, "value_guidance": 100.0, "persist": 0.5},
+    # MADIFF at inference (Zhu et al. 2024), for runs whose condition is `raw`: nine tenths of the largest return-to-go
+    # are asked for at every step, which most steps cannot earn.
+    "published": {"target_return": 0.9, "temperature": 0.5},
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
     # gradient on value, which rises with the very speed that is limited.
     "low_temperature": {"temperature": 0.3},
