@@ -4,7 +4,7 @@ no more than it allows.
 python benchmarks/certificates.py play --batches 2     # plays each setting, a file for each batch, resumable
 python benchmarks/certificates.py judge                # writes results/stress/certificates.csv and .json from these
 python benchmarks/certificates.py picture              # docs/images/certificate.png, of certificates.csv
-python benchmarks/certificates.py table                # writes the table of docs/stress.md
+python benchmarks/certificates.py table                # writes the table of docs/stress-results.md
 
 Margins are those of a grid: a calibration takes the least of them that is no less than its quantile. A larger one is
 played where a batch's quantile asks for it. The episodes of a setting are one pool. A repetition draws its
@@ -268,7 +268,7 @@ def picture(out: Path, file: Path) -> None:
 
 
 def write_table(out: Path) -> None:
-    """The table of docs/stress.md between its markers."""
+    """The table of docs/stress-results.md between its markers."""
     from readme import put
 
     head = "faults | episodes of the setting | violated, % | bounds, % | certificates | kept, by the rest | by all"
@@ -288,7 +288,7 @@ def write_table(out: Path) -> None:
             str(told),
         ]
         lines.append(f"| {' | '.join(cells)} |")
-    put("docs/stress.md", "certificates", "\n".join(lines))
+    put("docs/stress-results.md", "certificates", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -755,13 +755,13 @@ CLAIMS = (
         of_a_crowd,
     ),
     Claim(
-        "docs/stress.md",
+        "docs/stress-results.md",
         "A guard that knows of late or lost steps leaves half of the contacts, or fewer",
         PEDESTRIANS,
         of_pedestrians,
     ),
     Claim(
-        "docs/stress.md",
+        "docs/stress-results.md",
         "A guard that knows of up to three late steps leaves no unsafe step on the three systems",
         SYSTEMS,
         of_late_systems,
@@ -779,7 +779,7 @@ CLAIMS = (
         of_trackers,
     ),
     Claim(
-        "docs/stress.md",
+        "docs/stress-results.md",
         "is kept behind every fault",
         SYSTEMS,
         of_a_robot_behind_faults,
@@ -791,7 +791,7 @@ CLAIMS = (
         of_filters,
     ),
     Claim(
-        "docs/stress.md",
+        "docs/stress-results.md",
         "leaves contact in at most 2 % of the episodes. One that does not know leaves it in up to 94 %",
         STRESS,
         of_late_actions,

@@ -1,7 +1,7 @@
 """Crossing behind faults under a classical filter: a control barrier function by formula, and a quadratic program.
 
     python benchmarks/filters.py --episodes 200            # writes results/stress/filters.csv
-    python benchmarks/filters.py --table                   # writes the table of docs/stress.md
+    python benchmarks/filters.py --table                   # writes the table of docs/stress-results.md
 
 The filter is that of Wang, Ames and Egerstedt 2017 (Safety barrier certificates for collisions-free multirobot systems)
 for double integrators: h = sqrt(4 a (d − D)) + the speed at which two part, and each of them takes half of
@@ -145,7 +145,7 @@ def play(run: Any, faults: dict[str, Any], gamma: float, compensated: bool, epis
 
 
 def write_table(out: Path) -> None:
-    """The table of docs/stress.md between its markers, of the gain that leaves fewer contacts."""
+    """The table of docs/stress-results.md between its markers, of the gain that leaves fewer contacts."""
     from readme import put
 
     head = "faults | delay | return | episodes with contact, % (95 % ≤) | infeasible steps, %"
@@ -157,7 +157,7 @@ def write_table(out: Path) -> None:
         delay = "known" if r["compensated"] == "True" else ""
         said = f"{float(r['return']):.2f} | {rate:.1f} (≤ {upper:.1f}) | {infeasible:.0f}"
         lines.append(f"| {in_words(r['faults'])} | {delay} | {said} |")
-    put("docs/stress.md", "filters", "\n".join(lines))
+    put("docs/stress-results.md", "filters", "\n".join(lines))
 
 
 if __name__ == "__main__":

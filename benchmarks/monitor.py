@@ -1,6 +1,6 @@
 """How seldom the monitor of a certificate raises a false alarm, and how soon a true one.
 
-python benchmarks/monitor.py          # writes results/stress/monitor.csv and the table of docs/stress.md
+python benchmarks/monitor.py          # writes results/stress/monitor.csv and the table of docs/stress-results.md
 
 Episodes violate or not, independently and with a given probability; no simulator is asked. Promises and rates are
 those of results/stress/crossing.csv (benchmarks/stress.py): a guard's upper bound as it was tested, and the rate that
@@ -50,7 +50,7 @@ def main() -> None:
             cases["two more late steps"] = float(played[AFTER[name]]["violation_rate"])
         rows += [{"guard knows": name, "promised": promised, **case(what, promised, r)} for what, r in cases.items()]
     _rows.write(a.out, rows)
-    put("docs/stress.md", "monitor", table(rows))
+    put("docs/stress-results.md", "monitor", table(rows))
 
 
 def case(what: str, promised: float, rate: float) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 python benchmarks/pedestrians.py FOLDER                        # results/replay/zara02.json; four minutes on one core
 python benchmarks/pedestrians.py FOLDER --recording zara01     # or seq_hotel, seq_eth, students03
 python benchmarks/pedestrians.py FOLDER --faults               # results/stress/pedestrians.csv, certificates beside it
-python benchmarks/pedestrians.py FOLDER --table                # writes their table of docs/stress.md
+python benchmarks/pedestrians.py FOLDER --table                # writes their table of docs/stress-results.md
 
 FOLDER holds `obsmat` files of ETH and UCY (github.com/crowdbotp/OpenTraj, e.g. `datasets/UCY/zara02/obsmat.txt`). A
 recording is split by time: the first 70 % to learn by, the rest to replay. A step costs 1 where two centres come closer
@@ -108,7 +108,7 @@ def _stressed(found: dict[str, ReplayResult]) -> list[dict[str, Any]]:
 
 
 def write_table(out: Path) -> None:
-    """Contacts of all drivers together, between the markers of docs/stress.md."""
+    """Contacts of all drivers together, between the markers of docs/stress-results.md."""
     from readme import put
 
     head = ("faults", "of 1000 windows with contact: no guard", "shield", "caused", "compensated", "caused")
@@ -121,7 +121,7 @@ def write_table(out: Path) -> None:
             counted = ("contacts", "caused") if guard != "none" else ("contacts",)
             cells += [str(sum(int(row[c]) for row in own)) if own else "–" for c in counted]
         lines.append(f"| {' | '.join(cells)} |")
-    put("docs/stress.md", "pedestrians", "\n".join(lines))
+    put("docs/stress-results.md", "pedestrians", "\n".join(lines))
 
 
 def obsmat(folder: Path, recording: str = "zara02") -> Path:

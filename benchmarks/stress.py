@@ -3,7 +3,7 @@
 python benchmarks/stress.py                         # writes results/stress/crossing.csv, a row when it is played
 python benchmarks/stress.py --jobs 16 --rows delay3 delay3/compensated     # some rows, each in a process of its own
 python benchmarks/stress.py --list
-python benchmarks/stress.py --table                 # writes the tables of docs/stress.md
+python benchmarks/stress.py --table                 # writes the tables of docs/stress-results.md
 python benchmarks/stress.py --runs runs/proving-discs/bc/seed-0 ...        # other tasks: results/stress/systems.csv
 python benchmarks/stress.py --runs halfcheetah_2x3-good/bc --guard adapt --episodes 10      # a policy that ships
 
@@ -203,7 +203,7 @@ def write_systems_table(out: Path) -> None:
             own = played.get(name)
             cells.append(f"{float(own['return']):.4g}, {float(own['cost']):.3g}" if own else "–")
         lines.append(f"| {' | '.join(cells)} |")
-    put("docs/stress.md", "systems", "\n".join(lines))
+    put("docs/stress-results.md", "systems", "\n".join(lines))
 
 
 def kind(guard: str) -> str:
@@ -230,7 +230,7 @@ def side_by_side(wanted: Sequence[str], jobs: int, episodes: int, out: Path, age
 
 
 def write_table(out: Path) -> None:
-    """The table of docs/stress.md between its markers."""
+    """The table of docs/stress-results.md between its markers."""
     from readme import put
 
     rows = _rows.read(out)
@@ -254,7 +254,7 @@ def write_table(out: Path) -> None:
             f"{share:.0f}",
         ]
         lines.append("| " + " | ".join([*cells, f"{rate:.1f} (≤ {upper:.1f})", f"{infeasible:.0f}"]) + " |")
-    put("docs/stress.md", "stress", "\n".join(lines))
+    put("docs/stress-results.md", "stress", "\n".join(lines))
 
 
 if __name__ == "__main__":

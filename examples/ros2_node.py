@@ -56,7 +56,7 @@ class Pilot:
 
 
 class Evidence:
-    """Records that show whether they were changed (docs/stress.md): a line of "DIGEST JSON" each."""
+    """Records that show whether they were changed (docs/certificates.md): a line of "DIGEST JSON" each."""
 
     def __init__(self, file: str, policy: str):
         self.file, self.last, self.n = open(file, "xb", buffering=0), "ringfence log 1", 0  # never over an older one

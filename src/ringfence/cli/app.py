@@ -373,7 +373,7 @@ def certify(
     playing: How = AS_IT_IS,
 ) -> None:
     """Calibrate a guard's margin behind faults, and bound the episodes that violate; `Controller(certificate=)` reads
-    it. The guard knows of late actions, old observations and held actions. docs/stress.md says what is promised.
+    it. The guard knows of late actions, old observations and held actions. docs/certificates.md says what is promised.
 
     Episodes are those of a simulator of your own (--env), or windows of logs that are replayed (--logs): then the
     certificate says so.

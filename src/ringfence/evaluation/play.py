@@ -220,8 +220,8 @@ def _warn_unless_repeated(one: Episode, again: Episode) -> None:
     """Say so where two resets with the same seed begin differently."""
     if not np.array_equal(one.seen, again.seen, equal_nan=True):
         warnings.warn(
-            f"{one.name} begins differently at each reset(seed={one.seed}), so that no two policies are played from the "
-            "same starts; let its reset draw from that seed alone.",
+            f"{one.name} begins differently at each reset(seed={one.seed}), so that no two policies are played from "
+            "the same starts; let its reset draw from that seed alone.",
             stacklevel=4,
         )
 

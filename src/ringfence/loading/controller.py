@@ -68,8 +68,8 @@ class Controller:
     for them alone, and expects of the others what is proposed for them. `info["agent_infeasible"]` is of them, too.
 
     log: a file, to which a record of every step is added before its action is returned: what was requested and what
-    is executed, why, how old the observations were, whether it was covered (docs/stress.md). Each record holds a digest
-    of the one before; `evidence.last` is that of the last one. `close()` ends the log.
+    is executed, why, how old the observations were, whether it was covered (docs/certificates.md). Each record holds a
+    digest of the one before; `evidence.last` is that of the last one. `close()` ends the log.
     """
 
     def __init__(
