@@ -30,6 +30,7 @@ from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.loading import run_worlds
 from ringfence.loading.resolve import load_job
 from ringfence.logs.store import EpisodeStore
+from ringfence.report.published import PUBLISHED
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 
@@ -97,6 +98,9 @@ ROWS |= {
     for name in _GUARDED
     for guard in ("shield", "adapt", "full")
 }
+ROWS["mpc, under full"] = ("mpc", "default", {}, {"guard": "full"})  # from a zero proposal
+# Chosen among by learned values, and not corrected.
+ROWS |= {f"flow, the best of {n}": ("flow", "default", FLOW, {"guard": "select", "num_samples": n}) for n in (8, 64)}
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
 
@@ -244,6 +248,13 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
     }
 
 
+def printed(task: str) -> list[str]:
+    """Rows of others on the public files, which pool five learners, too."""
+    public = task.removesuffix("-pooled")
+    found = [p for p in PUBLISHED if public in p.values and public.startswith("simple_spread")]
+    return [f"| *{p.name}, as printed* | | *{p.values[public] / 100:.3f}* | | |" for p in found]
+
+
 def table() -> str:
     """Rows of all tasks in the order of `ROWS`, the data first."""
     lines = ["| | seeds | return, normalised | cost | of safe starts |", "|---|---|---|---|---|"]
@@ -252,6 +263,7 @@ def table() -> str:
         lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
         if drivers := found["data"].get("of_drivers"):
             lines.append(f"| its best driver of {len(drivers)} | | {max(drivers):.3f} | | |")
+        lines += printed(found["task"])
         for name in ROWS:
             if name in found["rows"]:
                 r = found["rows"][name]

@@ -21,6 +21,7 @@ class Published:
 
 OMAR = "Pan et al. 2022 (OMAR), as tabulated in MADIFF's README"
 MADIFF = "Zhu et al. 2024 (MADIFF), README"
+COFLOW = "Guowei-Zou/coflow-release, raw returns of its table of MPE, normalised here"
 
 
 def _spread(expert: float, replay: float, medium: float, random: float) -> dict[str, float]:
@@ -74,6 +75,7 @@ PUBLISHED = (
     Published("OMAR", OMAR, ("omar",), _spread(114.9, 37.9, 47.9, 34.4)),
     Published("MADiff-D (each agent plans for itself)", MADIFF, ("madiff",), _spread(95.0, 30.3, 64.9, 6.9)),
     Published("MADiff-C (one joint plan)", MADIFF, ("madiff",), _spread(116.7, 42.2, 58.2, 4.3)),
+    Published("CoFlow-C (one joint flow)", COFLOW, ("flow",), _spread(119.4, 47.6, 59.9, 53.9)),
 )
 
 
