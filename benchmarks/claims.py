@@ -31,6 +31,8 @@ RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 MEDIUM_POOL = "results/pooled/simple_spread-medium-pooled.json"
+RANDOM_POOL = "results/pooled/simple_spread-random-pooled.json"
+FULL_POOL = ", under full"  # ends the names of their rows
 PROVING = "results/proving"
 DRAWN = "results/proving/drawn"
 CROWD = "results/replay/students03.json"
@@ -183,7 +185,7 @@ def of_shielded_pool() -> tuple[bool, str]:
     cost = max(shield["cost_safe_start"] for _, shield in pairs.values())
     more = {name: shield["return_norm"] - alone["return_norm"] for name, (alone, shield) in pairs.items()}
     found = ", ".join(f"{name} {x:+.3f}" for name, x in more.items())
-    return cost < 0.005 and min(more.values()) >= 0, f"cost {cost:.3f} at most; {found}"
+    return cost < 0.005 and min(more.values()) > -0.01, f"cost {cost:.3f} at most; {found}"
 
 
 def of_medium_pool() -> tuple[bool, str]:
@@ -196,14 +198,38 @@ def of_medium_pool() -> tuple[bool, str]:
     return within, f"the best driver {best:.3f}; {text}"
 
 
+def under_full(file: str) -> dict[str, dict]:
+    """Rows of a pool under `full`."""
+    rows = json.loads((ROOT / file).read_text())["rows"]
+    return {name.removesuffix(FULL_POOL): r for name, r in rows.items() if name.endswith(FULL_POOL)}
+
+
 def of_full_pool() -> tuple[bool, str]:
-    """Generators of the pool of experts under `full`."""
-    found = json.loads((ROOT / POOL).read_text())
-    rows = {name: r for name, r in found["rows"].items() if name.endswith(", under full")}
+    """Clones of the pool of experts under `full`."""
+    data = json.loads((ROOT / POOL).read_text())["data"]["return_norm"]
+    rows = {name: r for name, r in under_full(POOL).items() if name.startswith("bc")}
     least = min(r["return_norm_interval"][0] for r in rows.values())
-    seeds = {len(r["seeds"]) for r in rows.values()}
-    text = ", ".join(f"{name} {r['return_norm']:.2f}" for name, r in rows.items())
-    return least > found["data"]["return_norm"] and seeds == {5}, text
+    seeds = {len(rows[name]["seeds"]) for name in ("bc, 20,000 updates", "bc-best")}
+    return least > data and seeds == {5}, ", ".join(f"{name} {r['return_norm']:.2f}" for name, r in rows.items())
+
+
+def of_full_pools() -> tuple[bool, str]:
+    """Whoever proposes under `full` on the pools without experts, beside what generators earn alone."""
+    least, most = np.inf, -np.inf
+    for file in (MEDIUM_POOL, RANDOM_POOL):
+        rows = json.loads((ROOT / file).read_text())["rows"]
+        least = min(least, *(r["return_norm"] for r in under_full(file).values()))
+        most = max(most, *(r["return_norm"] for r in rows.values() if "guard" not in r["played"]))
+    return least > 1.2 and most < 0.34, f"full {least:.2f} at least, alone {most:.2f} at most"
+
+
+def of_planners_on_a_pool() -> tuple[bool, str]:
+    """Planners that diffuse states, on the pool of experts, beside `flow` and the drivers."""
+    found = json.loads((ROOT / POOL).read_text())
+    told = {name: found["rows"][name]["return_norm"] for name in ("madiff", "icbf", "flow")}
+    learned = told["flow"] > max(found["data"]["of_drivers"])
+    text = ", ".join(f"{name} {value:.2f}" for name, value in told.items())
+    return learned and max(told["madiff"], told["icbf"]) < 0.2, text
 
 
 def of_robot_pools() -> tuple[bool, str]:
@@ -216,6 +242,69 @@ def of_robot_pools() -> tuple[bool, str]:
     text = ", ".join(f"{tier} [{low:.0f}, {high:.0f}]" for tier, (low, high) in more.items())
     signs = sorted((low > 0) - (high < 0) for low, high in more.values())
     return signs == [-1, 0, 1], text
+
+
+def robots_of_pools() -> list[Path]:
+    """Results of robots' data."""
+    return [p for p in sorted((ROOT / "results/pooled").glob("*.json")) if p.stem.startswith(("ant_", "halfcheetah_"))]
+
+
+ASKED_ROBOT = "flow, told the return, under adapt"
+BEST_OF_8 = "flow, told the return, the best of 8, under adapt"
+
+
+def of_robots_asked(who: str, wins: int, losses: int = 0):
+    """What `flow` under `adapt` earns more than a clone under it, on the same resets of every robot's data."""
+
+    def found() -> tuple[bool, str]:
+        more, costs = {}, []
+        for file in robots_of_pools():
+            rows = json.loads(file.read_text())["rows"]
+            earned = [
+                np.array(rows[name]["per_episode"]["return"]) for name in (who, "bc, 20,000 updates, under adapt")
+            ]
+            more[file.stem] = mean_of_runs(earned[0] - earned[1])
+            costs.append(rows[who]["cost_mean"])
+        lost = sum(high < 0 for _, high in more.values())
+        won = sum(low > 0 for low, _ in more.values())
+        text = ", ".join(f"{name} [{low:.0f}, {high:.0f}]" for name, (low, high) in more.items())
+        return (won, lost) == (wins, losses) and max(
+            costs
+        ) <= 25, f"{text}; {max(costs):.0f} steps above the limit at most"
+
+    return found
+
+
+def of_climbing_robots() -> tuple[bool, str]:
+    """Clones under `full` beside the best of eight proposals, on robots whose guards are of today's defaults."""
+    climbed = {
+        r["task"]: float(r["return_mean"])
+        for r in rows_of("guards-mujoco-defaults/table.csv")
+        if r["algorithm"] == "bc" and r["variant"].endswith("+full-learned")
+    }
+    more = {}
+    for file in robots_of_pools():
+        if file.stem in climbed:
+            more[file.stem] = climbed[file.stem] - json.loads(file.read_text())["rows"][BEST_OF_8]["return_mean"]
+    most = sum(x > 0 for x in more.values()) > len(more) / 2
+    return most, ", ".join(f"{name} {x:+.0f}" for name, x in more.items())
+
+
+def of_selection() -> tuple[bool, str]:
+    """The best of several proposals, by values, beside the proposals."""
+    told = {}
+    for file in (MEDIUM_POOL, RANDOM_POOL):
+        rows = json.loads((ROOT / file).read_text())["rows"]
+        told[file] = [rows[name]["return_norm"] for name in ("flow", "flow, the best of 8", "flow, the best of 64")]
+    text = "; ".join(" / ".join(f"{x:.2f}" for x in row) for row in told.values())
+    return all(one + 0.1 < eight < many for one, eight, many in told.values()), f"1 / 8 / 64: {text}"
+
+
+def of_madiff_asked() -> tuple[bool, str]:
+    """MADIFF asked as published, and as here, with every step between them."""
+    rows = json.loads((ROOT / "results/pooled/simple_spread-medium.json").read_text())["rows"]
+    told = {name: r["return_norm"] for name, r in rows.items() if name.startswith("madiff")}
+    return max(told, key=told.get) == "madiff, long", f"{min(told.values()):.2f} to {max(told.values()):.2f}"
 
 
 def of_rebounds() -> tuple[bool, str]:
@@ -697,7 +786,51 @@ CLAIMS = (
     ),
     Claim(
         "docs/drivers-results.md",
-        "`flow` earns less on one of three and more on another",
+        "none of them corrected (`select`), earns more than `flow` alone on both",
+        "pooled/simple_spread-{medium,random}-pooled.json",
+        of_selection,
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "earns no more on `simple_spread-medium` than asked as we do, nor does any part of that",
+        "pooled/simple_spread-medium.json",
+        of_madiff_asked,
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "earns more than a clone under the same guard on eight of nine data sets and less on none",
+        "results/pooled",
+        of_robots_asked(BEST_OF_8, 8),
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "**The first proposal alone** earns more on four of nine and less on two",
+        "results/pooled",
+        of_robots_asked(ASKED_ROBOT, 4, 2),
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "`full` from cloned actions earns more than that on most",
+        "pooled, guards-mujoco-defaults",
+        of_climbing_robots,
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "On medium and random alone none earns more than 0.33; under `full` all earn 1.2 or more",
+        "pooled/simple_spread-{medium,random}-pooled.json",
+        of_full_pools,
+    ),
+    *(
+        Claim(page, text, POOL, of_planners_on_a_pool)
+        for page, text in (
+            ("README.md", "It does not learn logs of several drivers, where a flow that follows one of them does"),
+            ("docs/attribution.md", "Logs of several drivers it does not learn"),
+            ("docs/drivers-results.md", "Diffusion planners do not learn a pool"),
+        )
+    ),
+    Claim(
+        "docs/drivers-results.md",
+        "`flow` earns less on one of three and more on another of HalfCheetah's tiers than a clone",
         "results/pooled",
         of_robot_pools,
     ),
@@ -712,7 +845,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/drivers-results.md",
-        "Under a shield none costs anything from safe starts**, and none earns less in the mean",
+        "Under a shield none costs anything from safe starts**, and none loses 0.01 of its return",
         POOL,
         of_shielded_pool,
     ),

@@ -100,7 +100,17 @@ ROWS |= {
 }
 ROWS["mpc, under full"] = ("mpc", "default", {}, {"guard": "full"})  # from a zero proposal
 # Chosen among by learned values, and not corrected.
-ROWS |= {f"flow, the best of {n}": ("flow", "default", FLOW, {"guard": "select", "num_samples": n}) for n in (8, 64)}
+ROWS |= {
+    f"flow, the best of {n}": ("flow", "default", FLOW, {"guard": "select", "num_samples": n}) for n in (8, 64, 256)
+}
+BEST_OF_8 = {"num_samples": 8, "select": True}
+ROWS["flow, told the return, the best of 8, under adapt"] = ("flow", "return", FLOW, {"guard": "adapt"} | BEST_OF_8)
+# Rows that say no more than others, and are not in the table.
+UNTOLD = {
+    "flow, one driver, its mean",
+    *(f"{who}, {t} asked" for who in ("flow, told raw", "madiff, long, raw") for t in (0.5, 1.5)),
+    "madiff, long, 2.5 asked",
+}
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
 
@@ -248,24 +258,39 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
     }
 
 
-def printed(task: str) -> list[str]:
-    """Rows of others on the public files, which pool five learners, too."""
-    public = task.removesuffix("-pooled")
-    found = [p for p in PUBLISHED if public in p.values and public.startswith("simple_spread")]
-    return [f"| *{p.name}, as printed* | | *{p.values[public] / 100:.3f}* | | |" for p in found]
+def found_of(file: Path) -> dict:
+    return json.loads(file.read_text())
+
+
+def files() -> list[Path]:
+    return sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"})
+
+
+def of_robot(file: Path) -> bool:
+    return isinstance(TASKS[file.stem].env, SafeMuJoCo)
+
+
+def printed(task: str) -> str:
+    """What others printed on the public files, which pool five learners, too."""
+    values = {p.name.split(" ")[0]: p.values.get(task.removesuffix("-pooled")) for p in PUBLISHED}
+    told = ", ".join(f"{name} {values[name] / 100:.3f}" for name in ("OMAR", "MADiff-D", "MADiff-C", "CoFlow-C"))
+    return f"| *as printed, on the public files: {told}* | | | | |"
 
 
 def table() -> str:
-    """Rows of all tasks in the order of `ROWS`, the data first."""
+    """Rows of all tasks but robots' in the order of `ROWS`, the data first."""
     lines = ["| | seeds | return, normalised | cost | of safe starts |", "|---|---|---|---|---|"]
-    for file in sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"}):
-        found = json.loads(file.read_text())
+    for file in files():
+        if of_robot(file):
+            continue
+        found = found_of(file)
         lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
         if drivers := found["data"].get("of_drivers"):
             lines.append(f"| its best driver of {len(drivers)} | | {max(drivers):.3f} | | |")
-        lines += printed(found["task"])
+        if found["task"].startswith("simple_spread"):
+            lines.append(printed(found["task"]))
         for name in ROWS:
-            if name in found["rows"]:
+            if name in found["rows"] and name not in UNTOLD:
                 r = found["rows"][name]
                 interval = r.get("return_norm_interval")  # older rows tell none
                 within = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
@@ -273,6 +298,40 @@ def table() -> str:
                 cost = f"{r['cost_mean']:.2f} | {r['cost_safe_start']:.2f}"
                 lines.append(f"| {words} | {len(r['seeds'])} | {r['return_norm']:.3f}{within} | {cost} |")
     return "\n".join(lines)
+
+
+def more(row: dict, other: dict) -> tuple[float, tuple[float, float]]:
+    """Return that a robot's row has more than another on the same resets, and its interval."""
+    apart = np.array(row["per_episode"]["return"]) - np.array(other["per_episode"]["return"])
+    return float(apart.mean()), mean_of_runs(apart)
+
+
+def robots() -> str:
+    """A line for each robot's data under `adapt`: a clone, a flow that is asked for a return, and the best of eight of
+    its proposals."""
+    clone, asked = "bc, 20,000 updates, under adapt", "flow, told the return, under adapt"
+    best = asked.replace(", under", ", the best of 8, under")
+    columns = [clone, asked, best]
+    heads = ["data set", "logs", "BC", "`flow`", "the best of 8", "`flow`, not BC", "the best, not BC"]
+    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
+    for file in filter(of_robot, files()):
+        found = found_of(file)
+        rows = [found["rows"].get(name) for name in columns]
+        cells = ["–" if r is None else f"{r['return_mean']:.0f} / {r['cost_mean']:.0f}" for r in rows]
+        cells += [said(found["rows"], name, clone) for name in (asked, best)]
+        task = TASKS[file.stem]
+        logged = found["data"]["return_norm"] * (task.return_max - task.return_min) + task.return_min
+        lines.append(f"| `{file.stem}` | {logged:.0f} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def said(rows: dict[str, dict], name: str, other: str) -> str:
+    """What one row earns more than another, bold beyond chance."""
+    if name not in rows or other not in rows:
+        return "–"
+    mean, (low, high) = more(rows[name], rows[other])
+    text = f"{mean:+.0f} [{low:.0f}, {high:.0f}]"
+    return f"**{text}**" if low > 0 or high < 0 else text
 
 
 def main() -> None:
@@ -300,6 +359,7 @@ def main() -> None:
             file.write_text(json.dumps(found, indent=1) + "\n")
     if given.out.resolve() == RESULTS:
         put("docs/drivers-results.md", "pooled", table())
+        put("docs/drivers-results.md", "robots", robots())
 
 
 if __name__ == "__main__":

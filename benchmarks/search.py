@@ -1,16 +1,17 @@
 """The same budget of search for every algorithm: four settings each, one seed, validation resets.
 
-    python benchmarks/search.py                  # Simple Spread medium, to results/tuning/search.csv
+    python benchmarks/search.py                  # a learner of Simple Spread medium, to results/tuning/learner.csv
     python benchmarks/search.py --study robots   # HalfCheetah medium, quantile limit, to results/tuning/robots.csv
     python benchmarks/search.py --summary        # ranks of what is there
 
-What is in the file is not made again. Setting 0 is the algorithm's preset. On Simple Spread it was the published one
-where there is one, until another did clearly better: omar's and ma-cql's (on both; on robots bc-safe's, too), whose
-earlier setting is then the first of the others. All were written down before the first run, but for what keeps omar's
-and ma-cql's actors from saturating, and the robots' presets had hand trials before (results/tuning/mujoco.csv). Seed
-100 trains no row of any table, and evaluation on test resets never sees validation resets. Learners that know no cost
-are ranked by return; safe ones by the rule of the leaderboard: those whose mean cost is within the limit first, by
-return, then the others, by lower cost. On robots planners are played steadily, under a guard that adapts.
+Simple Spread's task carries no row of any table: it is the fifth of a pool that one learner drove, where tables have
+all of the pool, or another learner. What is in the file is not made again. Setting 0 is the algorithm's preset. The
+others were written down before the first search, which was on a task of the tables (results/tuning/search.csv): omar's
+and ma-cql's presets of then are among them (on robots bc-safe's, too). The robots' presets had hand trials before
+(results/tuning/mujoco.csv). Seed 100 trains no row of any table, and evaluation on test resets never sees validation
+resets. Learners that know no cost are ranked by return; safe ones by the rule of the leaderboard: those whose mean cost
+is within the limit first, by return, then the others, by lower cost. On robots planners are played steadily, under a
+guard that adapts.
 """
 
 from __future__ import annotations
@@ -19,9 +20,10 @@ import argparse
 import json
 import tempfile
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from _pool import finished
 from _rows import append, measured, read
 
@@ -55,14 +57,17 @@ class Study:
     settings: dict[tuple[str, str], list[dict]]  # algorithm, preset ("": the task's) -> changes of settings 1 to 3
     file: str
     planner: str = "default"
+    learner: int | None = None  # of a pooled task, the one whose episodes are the logs
     safe: tuple[str, ...] = SAFE  # ranked by the rule of the leaderboard
-    # Algorithm -> tasks on which settings 0, 1 and 4 were tried, too.
-    further: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.task if self.learner is None else f"{self.task}, learner {self.learner}"
 
 
 STUDIES = {
     "simple_spread": Study(
-        "simple_spread-medium",
+        "simple_spread-medium-pooled",
         100,
         1.0,
         {
@@ -88,9 +93,8 @@ STUDIES = {
             ("madiff", "default"): [{"lr": 1e-3}, {"discount": 0.95}, {"diffusion_steps": 50}],
             ("icbf", "split"): [{"lr": 1e-3}, {"discount": 0.95}, {"barrier_weight": 10.0}],
         },
-        "search.csv",
-        # OMAR's coefficients are per tier, in its study too; so what keeps its actors alive was tried on every tier.
-        further={"omar": tuple(f"simple_spread-{t}" for t in ("expert", "medium-replay", "random"))},
+        "learner.csv",
+        learner=3,
     ),
     "robots": Study(
         "halfcheetah_2x3-medium-quantile",
@@ -143,19 +147,31 @@ STUDIES = {
 
 def one(job: tuple) -> dict:
     """Train and play one setting; a row of the file."""
-    algorithm, preset, number, changes, name, episodes, planner = job
+    algorithm, preset, number, changes, name, learner, episodes, planner = job
+    from ringfence import algos
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
     from ringfence.evaluation.evaluate import evaluate
     from ringfence.training import loop
 
-    store, _ = make(registry.get(name))
+    task = registry.get(name)
+    store, _ = make(task)
+    presets = task.presets
+    if learner is not None:  # its episodes alone, by the settings of logs of one learner
+        store = store.select(np.arange(store.episodes) % len(store.card.extra["drivers"]) == learner)
+        presets = tuple(p for p in presets if p != "pooled")
     begun = time.perf_counter()
     played = planner if algorithm in ("icbf", "madiff") else "default"
     guard = {"guard": "adapt"} if played == "low_temperature" else {}  # robots' planners
     with tempfile.TemporaryDirectory() as folder:
         (run,) = loop.train(
-            algorithm, store, preset=preset or None, seeds=(SEED,), changes=changes, out=folder, quiet=True
+            algorithm,
+            store,
+            preset=preset or algos.get(algorithm).preset_for(presets),
+            seeds=(SEED,),
+            changes=changes,
+            out=folder,
+            quiet=True,
         )
         seconds = time.perf_counter() - begun
         r = evaluate(run, episodes=episodes, split="validation", planner=played, **guard)
@@ -164,7 +180,7 @@ def one(job: tuple) -> dict:
         "preset": preset,
         "setting": number,
         "changes": json.dumps(changes),
-        "task": name,
+        "task": name if learner is None else f"{name}, learner {learner}",
         "seed": SEED,
         "split": r["split"],
         "episodes": r["episodes"],
@@ -177,7 +193,7 @@ def ranked(study: Study, rows: list[dict]) -> dict[tuple, list[dict]]:
     """(algorithm, preset) -> rows on the study's task, best first."""
     found: dict[tuple, list[dict]] = {}
     for r in rows:
-        if r["task"] == study.task:
+        if r["task"] == study.name:
             found.setdefault((r["algorithm"], r["preset"]), []).append(r)
 
     def merit(row: dict) -> tuple:
@@ -199,12 +215,11 @@ def main() -> None:
     done = {(r["algorithm"], r["preset"], int(r["setting"]), r["task"]) for r in read(out)}
     if not a.summary:
         jobs = [
-            (name, preset, number, changes, task, study.episodes, study.planner)
+            (name, preset, number, changes, study.task, study.learner, study.episodes, study.planner)
             for (name, preset), others in study.settings.items()
             if not a.algorithms or name in a.algorithms
             for number, changes in enumerate([{}, *others])
-            for task in (study.task, *(study.further.get(name, ()) if number in (0, 1, 4) else ()))
-            if (name, preset, number, task) not in done
+            if (name, preset, number, study.name) not in done
         ]
         for row in finished(one, jobs):
             append(out, row, FIELDS)

@@ -34,7 +34,7 @@ TINY = {  # all that learn; the naive driver of the proving ground does not
     "icbf": dict(num_updates=12, batch=16, width=16, depth=1, barrier_batch=8, barrier_width=8,
                  inverse_width=16, horizon=4, diffusion_steps=20, barrier_start=0.0, barrier_full=0.2),
     "madiff": dict(num_updates=12, batch=16, width=16, depth=1, inverse_width=16, horizon=4, diffusion_steps=20),
-    "flow": dict(num_updates=12, batch=16, width=16, depth=2, drivers=4, condition="return"),
+    "flow": dict(num_updates=12, batch=16, width=16, depth=2, drivers=4, condition="raw"),
     "mpc": dict(num_updates=12),
     "bc": dict(num_updates=12, batch=32, width=16, depth=1),
     "bc-safe": dict(num_updates=12, batch=32, width=16, depth=1),
@@ -148,6 +148,13 @@ def test_no_weight_is_madiff(small_store, tmp_path):
         if k.split("/")[0] in ("params", "ema", "frozen"):
             np.testing.assert_allclose(a[k], b[k], rtol=1e-5, atol=1e-7, err_msg=k)
     assert a.keys() == b.keys()
+
+
+@pytest.mark.parametrize(("name", "remedy"), [("bc", "leave it out"), ("bc-return", "set it when it is trained")])
+def test_a_return_is_not_asked_for_in_vain(small_store, tmp_path, name, remedy):
+    run = loop.train(name, small_store, out=tmp_path, **job_of(name))[0]
+    with pytest.raises(UserError, match=f"target_return=2.0 asks for a return, and {name} .*; {remedy}"):
+        load(run, target_return=2.0)
 
 
 def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):

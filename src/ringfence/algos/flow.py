@@ -222,7 +222,11 @@ FLOW = Algorithm(
     make_update,
     ac.no_diagnosis,
     make_policy,
-    {"default": {}, "return": {"condition": "return"}},
+    {
+        "default": {},
+        "return": {"condition": "return"},
+        "mujoco": {"condition": "return", "num_updates": 4_000},  # a robot's logs are of better and worse policies
+    },
     cost_source=lambda config: "world" if follows(config) else "nothing",
     make_windows=make_windows,
     world_settings=world_settings,

@@ -101,6 +101,8 @@ def resolve(spec: PolicySpec) -> Resolved:
     world = run_worlds.of_run(run) if job.reads_world else None
     step, policy = _trained(run, job, world, spec)
     plans = isinstance(policy, TakesPlanOptions)
+    if not plans:
+        _refuse_target(job, dict(spec.plan_options))
     if isinstance(policy, FlowPolicy) and policy.options.barrier_guidance:
         policy = _guided(policy, run, job, world, spec)
     if spec.guarded and spec.barrier == oracle.ORACLE:
@@ -119,6 +121,17 @@ def resolve(spec: PolicySpec) -> Resolved:
     # Homogeneous agents see for themselves anyway.
     spec = dataclasses.replace(spec, execution=None) if job.task.homogeneous else spec
     return Resolved(spec, job, policy, step)
+
+
+def _refuse_target(job: Job, options: dict[str, Any]) -> None:
+    """Whoever draws no plans passes over how they are drawn, but for a return that is asked for in vain."""
+    if "target_return" in options:
+        name = job.algorithm.name
+        remedy = "set it when it is trained" if hasattr(job.config, "target_return") else "leave it out"
+        raise UserError(
+            f"target_return={options['target_return']} asks for a return, and {name} is asked for none when it plays; "
+            f"{remedy}."
+        )
 
 
 def _guided(policy: FlowPolicy, run: Run, job: Job, read: World | None, spec: PolicySpec) -> FlowPolicy:
