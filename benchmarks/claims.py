@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pooled
 from ablations import adjusted
 from attribution import ADAPT, FULL, OF_ROBOTS, QUESTIONS, SHIELD, STEADY, Question, answers
 from evidence import LEVEL, difference, evaluations, mean, of, tasks_of
@@ -244,33 +245,17 @@ def of_robot_pools() -> tuple[bool, str]:
     return signs == [-1, 0, 1], text
 
 
-def robots_of_pools() -> list[Path]:
-    """Results of robots' data."""
-    return [p for p in sorted((ROOT / "results/pooled").glob("*.json")) if p.stem.startswith(("ant_", "halfcheetah_"))]
-
-
-ASKED_ROBOT = "flow, told the return, under adapt"
-BEST_OF_8 = "flow, told the return, the best of 8, under adapt"
-
-
-def of_robots_asked(who: str, wins: int, losses: int = 0):
+def of_robots_asked(who: str, wins: int, losses: int = 0) -> Callable[[], tuple[bool, str]]:
     """What `flow` under `adapt` earns more than a clone under it, on the same resets of every robot's data."""
 
     def found() -> tuple[bool, str]:
-        more, costs = {}, []
-        for file in robots_of_pools():
-            rows = json.loads(file.read_text())["rows"]
-            earned = [
-                np.array(rows[name]["per_episode"]["return"]) for name in (who, "bc, 20,000 updates, under adapt")
-            ]
-            more[file.stem] = mean_of_runs(earned[0] - earned[1])
-            costs.append(rows[who]["cost_mean"])
-        lost = sum(high < 0 for _, high in more.values())
-        won = sum(low > 0 for low, _ in more.values())
-        text = ", ".join(f"{name} [{low:.0f}, {high:.0f}]" for name, (low, high) in more.items())
-        return (won, lost) == (wins, losses) and max(
-            costs
-        ) <= 25, f"{text}; {max(costs):.0f} steps above the limit at most"
+        rows = {r["task"]: r["rows"] for r in pooled.kept(robots=True)}
+        apart = {task: pooled.more(r[who], r[pooled.CLONE])[1] for task, r in rows.items()}
+        cost = max(r[who]["cost_mean"] for r in rows.values())
+        signs = Counter((low > 0) - (high < 0) for low, high in apart.values())
+        text = ", ".join(f"{task} [{low:.0f}, {high:.0f}]" for task, (low, high) in apart.items())
+        holds = (signs[1], signs[-1]) == (wins, losses) and cost <= 25
+        return holds, f"{text}; {cost:.0f} steps above the limit at most"
 
     return found
 
@@ -283,9 +268,9 @@ def of_climbing_robots() -> tuple[bool, str]:
         if r["algorithm"] == "bc" and r["variant"].endswith("+full-learned")
     }
     more = {}
-    for file in robots_of_pools():
-        if file.stem in climbed:
-            more[file.stem] = climbed[file.stem] - json.loads(file.read_text())["rows"][BEST_OF_8]["return_mean"]
+    for found in pooled.kept(robots=True):
+        if found["task"] in climbed:
+            more[found["task"]] = climbed[found["task"]] - found["rows"][pooled.BEST]["return_mean"]
     most = sum(x > 0 for x in more.values()) > len(more) / 2
     return most, ", ".join(f"{name} {x:+.0f}" for name, x in more.items())
 
@@ -800,13 +785,13 @@ CLAIMS = (
         "docs/drivers-results.md",
         "earns more than a clone under the same guard on eight of nine data sets and less on none",
         "results/pooled",
-        of_robots_asked(BEST_OF_8, 8),
+        of_robots_asked(pooled.BEST, 8),
     ),
     Claim(
         "docs/drivers-results.md",
         "**The first proposal alone** earns more on four of nine and less on two",
         "results/pooled",
-        of_robots_asked(ASKED_ROBOT, 4, 2),
+        of_robots_asked(pooled.ASKED, 4, 2),
     ),
     Claim(
         "docs/drivers-results.md",

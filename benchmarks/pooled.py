@@ -9,6 +9,7 @@ each row says its own. At the end the table in docs/drivers-results.md is writte
 
 import argparse
 import json
+import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -103,8 +104,10 @@ ROWS["mpc, under full"] = ("mpc", "default", {}, {"guard": "full"})  # from a ze
 ROWS |= {
     f"flow, the best of {n}": ("flow", "default", FLOW, {"guard": "select", "num_samples": n}) for n in (8, 64, 256)
 }
-BEST_OF_8 = {"num_samples": 8, "select": True}
-ROWS["flow, told the return, the best of 8, under adapt"] = ("flow", "return", FLOW, {"guard": "adapt"} | BEST_OF_8)
+# What is compared on robots' data.
+CLONE, ASKED = "bc, 20,000 updates, under adapt", "flow, told the return, under adapt"
+BEST = "flow, told the return, the best of 8, under adapt"
+ROWS[BEST] = ("flow", "return", FLOW, {"guard": "adapt", "num_samples": 8, "select": True})
 # Rows that say no more than others, and are not in the table.
 UNTOLD = {
     "flow, one driver, its mean",
@@ -173,8 +176,12 @@ def milliseconds(run: Run, store: EpisodeStore, options: dict) -> float:
     return round(1000 * float(np.median(seconds[10:])), 2)
 
 
+def of_robot(task: Task) -> bool:
+    return isinstance(task.env, SafeMuJoCo)
+
+
 def episodes_of(task: Task) -> int:
-    return OF_ROBOTS if isinstance(task.env, SafeMuJoCo) else EPISODES
+    return OF_ROBOTS if of_robot(task) else EPISODES
 
 
 def per_episode(results: list[dict], what: str) -> np.ndarray:
@@ -258,32 +265,30 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
     }
 
 
-def found_of(file: Path) -> dict:
-    return json.loads(file.read_text())
-
-
-def files() -> list[Path]:
-    return sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"})
-
-
-def of_robot(file: Path) -> bool:
-    return isinstance(TASKS[file.stem].env, SafeMuJoCo)
+def kept(robots: bool) -> list[dict]:
+    """What the files hold, of robots' data or of the others'."""
+    files = sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"})
+    return [json.loads(file.read_text()) for file in files if of_robot(TASKS[file.stem]) == robots]
 
 
 def printed(task: str) -> str:
     """What others printed on the public files, which pool five learners, too."""
-    values = {p.name.split(" ")[0]: p.values.get(task.removesuffix("-pooled")) for p in PUBLISHED}
-    told = ", ".join(f"{name} {values[name] / 100:.3f}" for name in ("OMAR", "MADiff-D", "MADiff-C", "CoFlow-C"))
+    public = task.removesuffix("-pooled")
+    values = {p.name.split(" ")[0]: p.values[public] / 100 for p in PUBLISHED if public in p.values}
+    told = ", ".join(f"{name} {values[name]:.3f}" for name in ("OMAR", "MADiff-D", "MADiff-C", "CoFlow-C"))
     return f"| *as printed, on the public files: {told}* | | | | |"
+
+
+def in_words(name: str, algorithm: str) -> str:
+    """What a row is called in the table."""
+    told = name.removeprefix(algorithm).replace("told raw", "given the raw return").replace("told", "given")
+    return f"`{algorithm}`" + re.sub(r"(\S+) asked", r"target \1", told.replace(", raw,", ", raw return,"))
 
 
 def table() -> str:
     """Rows of all tasks but robots' in the order of `ROWS`, the data first."""
     lines = ["| | seeds | return, normalised | cost | of safe starts |", "|---|---|---|---|---|"]
-    for file in files():
-        if of_robot(file):
-            continue
-        found = found_of(file)
+    for found in kept(robots=False):
         lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
         if drivers := found["data"].get("of_drivers"):
             lines.append(f"| its best driver of {len(drivers)} | | {max(drivers):.3f} | | |")
@@ -294,9 +299,9 @@ def table() -> str:
                 r = found["rows"][name]
                 interval = r.get("return_norm_interval")  # older rows tell none
                 within = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
-                words = f"`{r['algorithm']}`{name.removeprefix(r['algorithm'])}".replace("told", "given")
                 cost = f"{r['cost_mean']:.2f} | {r['cost_safe_start']:.2f}"
-                lines.append(f"| {words} | {len(r['seeds'])} | {r['return_norm']:.3f}{within} | {cost} |")
+                earned = f"{len(r['seeds'])} | {r['return_norm']:.3f}{within}"
+                lines.append(f"| {in_words(name, r['algorithm'])} | {earned} | {cost} |")
     return "\n".join(lines)
 
 
@@ -309,19 +314,15 @@ def more(row: dict, other: dict) -> tuple[float, tuple[float, float]]:
 def robots() -> str:
     """A line for each robot's data under `adapt`: a clone, a flow that is asked for a return, and the best of eight of
     its proposals."""
-    clone, asked = "bc, 20,000 updates, under adapt", "flow, told the return, under adapt"
-    best = asked.replace(", under", ", the best of 8, under")
-    columns = [clone, asked, best]
-    heads = ["data set", "logs", "BC", "`flow`", "the best of 8", "`flow`, not BC", "the best, not BC"]
+    heads = ["data set", "logs", "BC", "`flow`", "the best of 8", "`flow` − BC", "the best − BC"]
     lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for file in filter(of_robot, files()):
-        found = found_of(file)
-        rows = [found["rows"].get(name) for name in columns]
+    for found in kept(robots=True):
+        rows = [found["rows"].get(name) for name in (CLONE, ASKED, BEST)]
         cells = ["–" if r is None else f"{r['return_mean']:.0f} / {r['cost_mean']:.0f}" for r in rows]
-        cells += [said(found["rows"], name, clone) for name in (asked, best)]
-        task = TASKS[file.stem]
+        cells += [said(found["rows"], name, CLONE) for name in (ASKED, BEST)]
+        task = TASKS[found["task"]]
         logged = found["data"]["return_norm"] * (task.return_max - task.return_min) + task.return_min
-        lines.append(f"| `{file.stem}` | {logged:.0f} | " + " | ".join(cells) + " |")
+        lines.append(f"| `{found['task']}` | {logged:.0f} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

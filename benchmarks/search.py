@@ -23,7 +23,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 from _pool import finished
 from _rows import append, measured, read
 
@@ -147,21 +146,23 @@ STUDIES = {
 
 def one(job: tuple) -> dict:
     """Train and play one setting; a row of the file."""
-    algorithm, preset, number, changes, name, learner, episodes, planner = job
+    algorithm, preset, number, changes, study = job
+    import numpy as np
+
     from ringfence import algos
     from ringfence.datasets import registry
     from ringfence.datasets.make import make
     from ringfence.evaluation.evaluate import evaluate
     from ringfence.training import loop
 
-    task = registry.get(name)
+    task = registry.get(study.task)
     store, _ = make(task)
     presets = task.presets
-    if learner is not None:  # its episodes alone, by the settings of logs of one learner
-        store = store.select(np.arange(store.episodes) % len(store.card.extra["drivers"]) == learner)
+    if study.learner is not None:  # its episodes alone, by the settings of logs of one learner
+        store = store.select(np.arange(store.episodes) % len(store.card.extra["drivers"]) == study.learner)
         presets = tuple(p for p in presets if p != "pooled")
     begun = time.perf_counter()
-    played = planner if algorithm in ("icbf", "madiff") else "default"
+    played = study.planner if algorithm in ("icbf", "madiff") else "default"
     guard = {"guard": "adapt"} if played == "low_temperature" else {}  # robots' planners
     with tempfile.TemporaryDirectory() as folder:
         (run,) = loop.train(
@@ -174,13 +175,13 @@ def one(job: tuple) -> dict:
             quiet=True,
         )
         seconds = time.perf_counter() - begun
-        r = evaluate(run, episodes=episodes, split="validation", planner=played, **guard)
+        r = evaluate(run, episodes=study.episodes, split="validation", planner=played, **guard)
     return {
         "algorithm": algorithm,
         "preset": preset,
         "setting": number,
         "changes": json.dumps(changes),
-        "task": name if learner is None else f"{name}, learner {learner}",
+        "task": study.name,
         "seed": SEED,
         "split": r["split"],
         "episodes": r["episodes"],
@@ -215,7 +216,7 @@ def main() -> None:
     done = {(r["algorithm"], r["preset"], int(r["setting"]), r["task"]) for r in read(out)}
     if not a.summary:
         jobs = [
-            (name, preset, number, changes, study.task, study.learner, study.episodes, study.planner)
+            (name, preset, number, changes, study)
             for (name, preset), others in study.settings.items()
             if not a.algorithms or name in a.algorithms
             for number, changes in enumerate([{}, *others])

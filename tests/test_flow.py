@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ringfence import algos
 from ringfence.algos import drivers, flow
 from ringfence.errors import UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
 from ringfence.proposals.base import act_with
-from ringfence.proposals.options import PlanOptions
+from ringfence.proposals.options import PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.types import Spec
 from tests.quick import QUICK_WORLD
@@ -306,3 +307,10 @@ def test_guidance_reads_the_world_that_is_given(two_drifts, run, tmp_path):
     )
     with pytest.raises(UserError, match="barrier_guidance=1.0 is of flow"):
         load(plans[0], barrier_guidance=1.0)
+
+
+@pytest.mark.parametrize("name", ["madiff", "flow"])
+def test_a_raw_return_is_asked_for_on_its_own_scale(name):
+    algorithm = algos.get(name)
+    ranked, raw = (algos.configured(algorithm, "default", {"condition": y}) for y in ("return", "raw"))
+    assert plan_defaults(raw) == plan_defaults(ranked) | {"target_return": 0.9}

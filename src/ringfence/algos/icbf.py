@@ -53,9 +53,7 @@ class Config:
     history: Natural = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    condition: conditions.Condition = (
-        "advantage"  # what y is: the window's advantage, or the return-to-go, ranked or raw (MADIFF)
-    )
+    condition: conditions.Condition = "advantage"  # y: the window's advantage, or the return-to-go, ranked or raw
     discount: Share = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
@@ -620,30 +618,18 @@ ICBF = Algorithm(
     from_world=from_world,
     revision=4,
 )
+_PLAIN = {"barrier": False, "barrier_weight": 0.0}
 MADIFF = dataclasses.replace(
     ICBF,
     name="madiff",
     presets={
-        "default": {"barrier": False, "barrier_weight": 0.0, "condition": "return"},
-        "long": {"barrier": False, "barrier_weight": 0.0, "condition": "return", "num_updates": 6000},
+        "default": {**_PLAIN, "condition": "return"},
+        "long": {**_PLAIN, "condition": "return", "num_updates": 6000},
         # MADIFF's condition and rows, at a size for CPUs; play it with the planner `published`
-        "raw-return": {
-            "barrier": False,
-            "barrier_weight": 0.0,
-            "condition": "raw",
-            "discount": 0.99,
-            "horizon": 24,
-            "num_updates": 6000,
-        },
+        "raw-return": {**_PLAIN, "condition": "raw", "discount": 0.99, "horizon": 24, "num_updates": 6000},
         # MADIFF-D: everybody plans for all from its own observation
-        "own": {
-            "barrier": False,
-            "barrier_weight": 0.0,
-            "condition": "return",
-            "view": "decentralized",
-            "observe": "single",
-        },
-        "mujoco": {**_MUJOCO, "barrier": False, "barrier_weight": 0.0},
-        "published": {"barrier": False, "barrier_weight": 0.0, **PRESETS["madiff-unet"]},
+        "own": {**_PLAIN, "condition": "return", "view": "decentralized", "observe": "single"},
+        "mujoco": {**_MUJOCO, **_PLAIN},
+        "published": {**_PLAIN, **PRESETS["madiff-unet"]},
     },
 )

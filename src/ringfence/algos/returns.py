@@ -51,7 +51,7 @@ class Config(bc.Config):
     condition: conditions.Condition = "return"  # what y is: the return-to-go, ranked or raw, or the advantage
     discount: Share = 0.9  # of what y scores
     ahead: AtLeastOne = 8  # rows that an advantage is of
-    target_return: float = 1.5  # y when it acts, as a normal score: the best 7 %
+    target_return: float = 1.5  # y when it acts, as a normal score: the best 7 %; of the largest, if raw
 
 
 class Asking(eqx.Module):

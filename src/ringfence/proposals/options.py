@@ -40,11 +40,12 @@ class TakesPlanOptions(Protocol):
 
 
 def plan_defaults(config) -> dict:
-    """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, and a flow
-    needs few steps."""
+    """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, a flow needs
+    few steps, and of a raw return nine tenths of the largest are asked for at every step, as MADIFF does."""
+    chosen: dict = {"target_return": 0.9} if getattr(config, "condition", "none") == "raw" else {}
     if hasattr(config, "drivers") and not hasattr(config, "diffusion_steps"):
-        return {"sampling_steps": 2}
-    return {"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {}
+        return chosen | {"sampling_steps": 2}
+    return chosen | ({"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {})
 
 
 DEFAULT = "default"
@@ -54,9 +55,8 @@ PLANNERS: dict[str, dict] = {
     DEFAULT: {},
     # Value steers the samples.
     "value_guided": {"sampling_steps": 10, "cfg_scale": 1.0, "value_guidance": 100.0, "persist": 0.5},
-    # MADIFF at inference (Zhu et al. 2024), for runs whose condition is `raw`: nine tenths of the largest return-to-go
-    # are asked for at every step, which most steps cannot earn.
-    "published": {"target_return": 0.9, "temperature": 0.5},
+    # MADIFF at inference (Zhu et al. 2024), for runs whose condition is `raw`.
+    "published": {"temperature": 0.5},
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
     # gradient on value, which rises with the very speed that is limited.
     "low_temperature": {"temperature": 0.3},
