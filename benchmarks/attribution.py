@@ -68,9 +68,8 @@ QUESTIONS = (
             f"the printed losses, λ = {weight}, not MADIFF",
             ("icbf", f"paper{name}"),
             ("madiff", "default"),
-            shown=weight in ("0.1", "10"),
         )
-        for weight, name in (("0.1", ""), ("1", "-1"), ("3", "-3"), ("10", "-10"))
+        for weight, name in (("0.1", ""), ("10", "-10"))
     ),
     Question(
         "diffusion (λ = 0), not return-conditioned BC, under a shield",
@@ -93,7 +92,6 @@ QUESTIONS = (
         ("bc-return", f"default{SHIELD}"),
     ),
     Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
-    Question("centralized, not decentralized BC", ("bc", "joint"), ("bc", "default"), shown=False),
     Question(
         "centralized, not decentralized MADIFF, one plan for all",
         ("madiff", "default"),

@@ -237,7 +237,9 @@ def by_setting(out: Path) -> dict[str, list[dict[str, str]]]:
 
 
 def in_words(setting: str) -> str:
-    """A setting as its faults, e.g. `delay 2`."""
+    """A setting as its faults, e.g. `delay 2`; all of them as five at once."""
+    if setting == "all":
+        return "five at once"
     return ", ".join(f"{name} {value}" for name, value in SETTINGS[setting].items()) or "none"
 
 

@@ -78,12 +78,17 @@ def on_robots(row, paired, more: int, less: int) -> Callable[[], tuple[bool, str
         answered = answers("guards-mujoco", OF_ROBOTS)
         found = next(ds for q, key, ds in answered if (q.row, q.paired) == (row, paired) and key == "return")
         sides = [[f"{d.task} {d.mean:+.0f}" for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1)]
-        text = "; ".join(f"{words}: {', '.join(side) or 'none'}" for words, side in zip(("more", "less"), sides))
-        return (len(found), *map(len, sides)) == (9, more, less), f"{text}; {len(found[0].seeds)} to " + (
-            f"{max(len(d.seeds) for d in found)} seeds"
-        )
+        seeds = {len(d.seeds) for d in found}
+        text = f"{told(sides)}; {min(seeds)} to {max(seeds)} seeds"
+        return (len(found), *map(len, sides)) == (9, more, less), text
 
     return check
+
+
+def told(sides: list[list[str]]) -> str:
+    """On what a row has more, and on what less; of many, how many."""
+    named = [", ".join(side) if 0 < len(side) < 4 else len(side) or "none" for side in sides]
+    return f"more on {named[0]}, less on {named[1]}"
 
 
 def of_a_pool(row: str, verdict: Callable[[dict, dict], bool]) -> Callable[[], tuple[bool, str]]:
@@ -252,10 +257,13 @@ def of_robots_asked(who: str, wins: int, losses: int = 0) -> Callable[[], tuple[
         rows = {r["task"]: r["rows"] for r in pooled.kept(robots=True)}
         apart = {task: pooled.more(r[who], r[pooled.CLONE])[1] for task, r in rows.items()}
         cost = max(r[who]["cost_mean"] for r in rows.values())
-        signs = Counter((low > 0) - (high < 0) for low, high in apart.values())
-        text = ", ".join(f"{task} [{low:.0f}, {high:.0f}]" for task, (low, high) in apart.items())
-        holds = (signs[1], signs[-1]) == (wins, losses) and cost <= 25
-        return holds, f"{text}; {cost:.0f} steps above the limit at most"
+        intervals = {task: f"{task} [{low:.0f}, {high:.0f}]" for task, (low, high) in apart.items()}
+        sides = [
+            [intervals[task] for task, (low, _) in apart.items() if low > 0],
+            [intervals[task] for task, (_, high) in apart.items() if high < 0],
+        ]
+        holds = (*map(len, sides),) == (wins, losses) and cost <= 25
+        return holds, f"{told(sides)} of {len(apart)}; {cost:.0f} steps above the limit at most"
 
     return found
 
@@ -507,17 +515,13 @@ CERTIFICATES = ("certificates", "reference")
 
 
 def full_is_safe() -> tuple[bool, str]:
-    """No contact, and by how much more than the shield alone; beside itself with one margin, climbing anywhere."""
+    """No contact, and by how much more than the shield alone."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+full-learned"
-    wide = f"{key}+trust_radius2.0+margin1.0"
     more = difference(suite, task, ("bc", key), ("bc", "default+shield-learned"), "return")
-    cost = difference(suite, task, ("bc", key), ("bc", wide), "cost")
     share = more.mean / mean(suite, task, ("bc", "default+shield-learned"), "return_mean")
     touched = mean(suite, task, ("bc", key), "violation_rate")
-    text = (
-        f"contact in {100 * touched:g} %, {100 * share:.0f} % more; with one margin, anywhere {-cost.mean:+.2g} steps"
-    )
-    return touched == 0 and 0.23 < share < 0.27 and cost.high < 0 and cost.p < 0.001, text
+    text = f"contact in {100 * touched:g} %, {100 * share:.0f} % more"
+    return touched == 0 and 0.23 < share < 0.27 and more.low > 0, text
 
 
 def limits_learned() -> tuple[bool, str]:

@@ -55,11 +55,6 @@ WAYS = {
     f"bc default{SHIELDED}": "**shield, ℓ and V, 3 steps**",
     "bc default+shield-analytic+horizon15+terminal_valueFalse": "shield, analytic, 15 steps",
     "bc default+full-learned": "**full**",
-    "bc default+full-learned+margin1.0": "full, a margin of 1",
-    "bc default+full-learned+trust_radius2.0+margin1.0": "full, a margin of 1, climbing anywhere",
-    "mpc default+full-learned+trust_radius2.0+margin1.0": (
-        "MPC from a zero proposal (`mpc`), full, a margin of 1, climbing anywhere"
-    ),
 }
 PROPOSALS = {
     "bc default": "BC",

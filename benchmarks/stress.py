@@ -92,7 +92,9 @@ def name_of(faults: dict[str, Any]) -> str:
 
 
 def in_words(name: str) -> str:
-    """`delay2+drop0.3` as delay 2, drop 0.3."""
+    """`delay2+drop0.3` as delay 2, drop 0.3; all of `MIDDLE` as five at once."""
+    if name == name_of(MIDDLE):
+        return "five at once"
     return re.sub(r"([a-z])([\d.]+)", r"\1 \2", name).replace("+", ", ")
 
 
@@ -191,17 +193,23 @@ def play_system(folder: Path, guard: str, episodes: int, out: Path) -> None:
 
 
 def write_systems_table(out: Path) -> None:
-    """Other tasks: return, cost and episodes with a violation of each guard."""
+    """Other tasks, side by side: unsafe steps per episode without a guard, under one, and under one that knows; and of
+    the robot, which nothing ends, what it earns."""
     from readme import put
 
-    rows = _rows.read(out)
-    lines = ["| task | faults | " + " | ".join(KINDS) + " |", "|---" * 5 + "|"]
-    for task, faults in dict.fromkeys((r["task"], r["faults"]) for r in rows):
-        cells = [f"`{task}`", in_words(faults)]
-        played = {kind(r["guard"]): r for r in rows if (r["task"], r["faults"]) == (task, faults)}
-        for name in KINDS:
-            own = played.get(name)
-            cells.append(f"{float(own['return']):.4g}, {float(own['cost']):.3g}" if own else "–")
+    rows = {(r["task"], r["faults"], kind(r["guard"])): r for r in _rows.read(out)}
+    tasks = list(dict.fromkeys(task for task, _, _ in rows))
+    earning = [task for task in tasks if not task.startswith("proving-")]
+    heads = [f"`{task}`" for task in tasks] + [f"return of `{task}`" for task in earning]
+    lines = [f"| faults | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
+    for faults in dict.fromkeys(faults for _, faults, _ in rows):
+        cells = [in_words(faults)]
+        for told, key in ((tasks, "cost"), (earning, "return")):
+            digits = ".3g" if key == "cost" else ".0f"
+            cells += [
+                " / ".join(f"{float(rows[at][key]):{digits}}" for name in KINDS if (at := (task, faults, name)) in rows)
+                for task in told
+            ]
         lines.append(f"| {' | '.join(cells)} |")
     put("docs/stress-results.md", "systems", "\n".join(lines))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
@@ -156,3 +158,18 @@ def test_the_name_of_before_works_and_warns():
 def test_a_mistyped_card_is_refused_before_anything_is_played():
     with pytest.raises(StoreError, match="did you mean 'observation_names'"):
         ringfence.collect(pytest.fail, episodes=1, card={"observation_name": ["x"]})
+
+
+def test_a_simulator_that_tells_no_cost_is_said_so_at_once():
+    class Misspelt(Drift):
+        def step(self, actions):
+            *rest, infos = super().step(actions)
+            return *rest, {a: {"costs": info["cost"]} for a, info in infos.items()}
+
+    with pytest.warns(UserWarning, match="Misspelt tells no cost, its infos costs: .* give each agent's info a 'cost'"):
+        ringfence.collect(Misspelt, lean, episodes=2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ringfence.collect(Misspelt, lean, episodes=2, cost=lambda infos: max(i["costs"] for i in infos.values()))
+        formula = ringfence.SpeedLimit(limit=1.0, features=("own.vx",))
+        ringfence.collect(Misspelt, lean, episodes=2, card={"hazard": formula})

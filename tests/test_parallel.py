@@ -252,7 +252,8 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     monkeypatch.chdir(tmp_path)
     for split in ("test", "validation"):
         app.main(["play", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--split", split])
-    assert "unsafe episodes (95 % ≤)" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "unsafe episodes (95 % ≤)" in told and "its logs" in told
     results = Run(folder).results
     assert [*results] == ["default", "default@validation"]
     assert results["default"]["simulator"] == "theirs.py:Theirs" and results["default"]["guard"] == "none"
@@ -260,7 +261,11 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     assert again["per_episode"] == results["default"]["per_episode"]
     assert results["default@validation"]["per_episode"] != results["default"]["per_episode"]
     app.main(["report", str(folder), "--out", "page.html"])
-    assert f"play {folder} --env theirs.py:Theirs --episodes 2" in html.unescape((tmp_path / "page.html").read_text())
+    page = html.unescape((tmp_path / "page.html").read_text())
+    assert f"play {folder} --env theirs.py:Theirs --episodes 2" in page
+    logs = Run(folder).logs
+    assert f"The data itself has a return of {np.mean(logs['returns']):.1f}" in page, "beside what it was learned from"
+    assert "`ringfence eval" not in page and "ringfence eval RUN" not in page, "nobody here can play it"
     for env, said in (
         ("theirs.py", "names no simulator"),
         ("other.py:Theirs", "'other.py' is no file"),
@@ -357,7 +362,62 @@ def test_anybodys_function_under_guard_is_played(small_world):
     )
     result = play(still, SimpleSpreadParallel, episodes=2)
     assert result["episodes"] == 2 and 0 <= result["infeasible_rate"] <= 1 and 0 <= result["ood_rate"] <= 1
+    alone = guard(lambda seen, state: np.zeros((3, 2)), small_world, guard="none", horizon=1)
+    assert play(alone, SimpleSpreadParallel, episodes=2)["return_mean"] == pytest.approx(_at_rest(), rel=1e-5)
     with pytest.raises(UserError, match="a function under guard has none"):
         play(still, SimpleSpreadParallel, episodes=2, keep=True)
     with pytest.raises(UserError, match="rows was said to ringfence.guard"):
         play(still, SimpleSpreadParallel, episodes=2, rows=3)
+
+
+def _at_rest() -> float:
+    """What nobody's moving earns in the first two episodes."""
+    returns = []
+    for reset in (7_000_001, 7_000_002):
+        env, total = SimpleSpreadParallel(), 0.0
+        env.reset(seed=reset)
+        while env.agents:
+            rewards = env.step({a: np.zeros(2) for a in env.agents})[1]
+            total += float(np.mean(list(rewards.values())))
+        returns.append(total)
+    return float(np.mean(returns))
+
+
+class Counts:
+    """Moves by how often it was asked since its episode began."""
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        self.asked = 0
+
+    def __call__(self, seen, state):
+        self.asked += 1
+        return np.full((3, 2), (-1) ** (self.asked // 4))
+
+
+def test_a_policy_with_a_memory_has_one_in_each_simulator(small_world):
+    """However many are stepped side by side; one that cannot be copied is refused."""
+    alone = [
+        play(guard(Counts(), small_world, guard="none", horizon=1), SimpleSpreadParallel, episodes=3, num_envs=n)
+        for n in (1, 3)
+    ]
+    assert alone[0]["per_episode"] == alone[1]["per_episode"]
+
+    class Held(Counts):
+        def __deepcopy__(self, memo):
+            raise TypeError("cannot pickle 'socket' object")
+
+    with pytest.raises(UserError, match="Held has reset\\(\\), and so a memory, but cannot be copied .*num_envs=1"):
+        play(guard(Held(), small_world, guard="none", horizon=1), SimpleSpreadParallel, episodes=2)
+
+
+def test_what_a_simulator_shows_wrongly_is_said_with_where(run):
+    class Blind(SimpleSpreadParallel):
+        def step(self, actions):
+            seen, *rest = super().step(actions)
+            return seen | {"agent_1": np.where(np.arange(18) == 3, np.nan, seen["agent_1"])}, *rest
+
+    with pytest.raises(UserError, match=r"is nan.*\(Blind, step 1 of the episode with the seed 7000001\)"):
+        play(run, Blind, episodes=1)

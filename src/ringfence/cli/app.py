@@ -6,6 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -16,7 +17,7 @@ from rich.text import Text
 from ringfence.cli import bench as bench_commands
 from ringfence.cli import data as data_commands
 from ringfence.cli import log as log_commands
-from ringfence.cli.console import Refusals, complain, console
+from ringfence.cli.console import Refusals, complain, console, plain_warnings
 from ringfence.cli.doctor import doctor
 from ringfence.cli.faults import NO_FAULTS, Wrong
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
@@ -30,6 +31,7 @@ from ringfence.utils.files import writable
 if TYPE_CHECKING:
     from ringfence.logs.store import EpisodeStore
     from ringfence.training.runs import Run
+    from ringfence.utils.schemas import Outcomes
 
 out = console()
 OFTEN = 0.05  # share of steps without an action that keeps the margin, from which on it is said
@@ -131,6 +133,7 @@ def fit(
     report = None if report is None else writable(report)
     store = _store(data)
     settings: dict[str, Any] = dict(assignments(set))
+    print("Some minutes: values, rewards, dynamics, danger now and to come, then the card.", file=sys.stderr)
     made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
     out.print(lines(str(made.card)), soft_wrap=True)
     if out_file is not None:
@@ -256,8 +259,8 @@ def play(
     compensate: bool = False,
     playing: How = AS_IT_IS,
 ) -> None:
-    """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and keep the result for reports, but
-    behind faults.
+    """Play a trained policy in a simulator of your own, a PettingZoo ParallelEnv, and print it beside its logs. The
+    result is kept for reports, unless faults are asked for.
 
     Args:
         runs: run folders, or folders that hold some.
@@ -297,7 +300,15 @@ def play(
                 if table.row_count:
                     out.print(table)
                 raise
+    if len(found) == 1 and table.row_count and (logs := found[0].logs):
+        table.add_row(*_logged(logs))
     _say(table, refusals, len(found))
+
+
+def _logged(logs: Outcomes) -> list[str]:
+    """The row of what a run was trained on."""
+    unsafe = fmean(cost > 0 for cost in logs["costs"])
+    return ["its logs", "", f"{fmean(logs['returns']):.4g}", f"{fmean(logs['costs']):.3f}", f"{unsafe:.3f}", ""]
 
 
 def _played(run: Run, result: dict[str, Any]) -> list[Text | str]:
@@ -612,6 +623,7 @@ GROUPS: dict[str, tuple[dict[str, Any], str]] = {
 def main(arguments: list[str] | None = None) -> None:
     arguments = rewritten(sys.argv[1:] if arguments is None else arguments)
     interrupts.listen()
+    plain_warnings()
     for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")

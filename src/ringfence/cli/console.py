@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
-from ringfence.errors import UserError
+from ringfence.errors import UserError, plain
 
 if TYPE_CHECKING:
     from ringfence.training.runs import Run
@@ -29,6 +30,11 @@ def console() -> Console:
 def complain(message: str) -> None:
     """Say on stderr what is wrong."""
     Console(stderr=True, highlight=False).print(f"[red]error:[/] {escape(message)}", soft_wrap=True)
+
+
+def plain_warnings() -> None:
+    """Have warnings say what they say, and not where in the code."""
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {plain(str(message))}\n"
 
 
 @dataclass

@@ -12,7 +12,9 @@ from ringfence.errors import UserError
 from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
+from ringfence.problem.slips import slips
 
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
 
@@ -37,8 +39,33 @@ def audit(store: EpisodeStore) -> Audit:
     else:
         danger, warnings = _danger(store, task)
         facts |= danger
-    warnings += [*odd_costs(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
+    warnings += [*odd_costs(store), *odd_names(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
     return Audit(facts, warnings, list(store.card.warnings))
+
+
+def odd_danger(store: EpisodeStore, task: Task) -> list[str]:
+    """What a World of these logs would not know of danger, before it is fitted: names that nobody reads, a formula
+    that cannot be read, no danger at all."""
+    told = store.team_costs.any() or not isinstance(task.hazard, constraints.CostColumn)
+    untold = [] if told else ["No step has a cost and the card has no formula: no guard can use this World."]
+    return [*odd_names(store), *_unread(store, task), *untold]
+
+
+def odd_names(store: EpisodeStore) -> list[str]:
+    """Warnings of names that look misspelt."""
+    card = store.card
+    return [*slips(card.observation_names or ()), *slips(card.state_names or ())]
+
+
+def _unread(store: EpisodeStore, task: Task) -> list[str]:
+    """A warning where somebody's card has a formula of danger that cannot be read."""
+    if task.env is not None:  # a simulator of the package counts what its own formula says
+        return []
+    try:
+        _bound(store, task)
+    except UserError as error:
+        return [f"The card's formula of danger is left aside, and costs alone say what is dangerous. {error}"]
+    return []
 
 
 def _sizes(store: EpisodeStore) -> dict[str, str]:
@@ -94,7 +121,7 @@ def _danger(store: EpisodeStore, task: Task) -> tuple[dict[str, str], list[str]]
     starts = _labels(store, task, store.first_rows)
     share = disagreement(store, task)
     if starts is None or share is None:
-        return {}, []
+        return {}, _unread(store, task)
     facts = {
         "episodes starting unsafe": f"{100 * starts.mean():.2f} %",
         "cost and hazard disagree": f"{100 * share:.2f} % of steps",
@@ -156,8 +183,7 @@ def _of_constraint(store: EpisodeStore, name: str) -> str:
 def _labels(store: EpisodeStore, task: Task, rows: np.ndarray) -> np.ndarray | None:
     """(K,) whether the hazard's formula calls these rows unsafe for anyone; None where it has none."""
     try:
-        view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
-        bound = constraints.bind(task.hazard, view.names, view.plus.shape[0])
+        view, bound = _bound(store, task)
     except UserError:
         return None
     if not bound.has_formula:
@@ -165,6 +191,12 @@ def _labels(store: EpisodeStore, task: Task, rows: np.ndarray) -> np.ndarray | N
     state = None if store.state is None else store.state[rows]
     unsafe, _ = bound.labels(local_features(view, task.homogeneous, store.observations[rows], state))
     return np.any(np.asarray(unsafe).reshape(len(rows), -1), axis=-1)
+
+
+def _bound(store: EpisodeStore, task: Task) -> tuple[FeatureMap, constraints.BoundHazard]:
+    """What the formula of danger reads, and the formula; refused where the logs have no such entries."""
+    view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
+    return view, constraints.bind(task.hazard, view.names, view.plus.shape[0])
 
 
 def disagreement(store: EpisodeStore, task: Task) -> float | None:

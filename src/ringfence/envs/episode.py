@@ -74,6 +74,8 @@ class Episode:
         self.constraints: list[dict[str, float | np.ndarray]] = []
         self.terminated = False
         self.unsafe_start = False
+        self.charged = False  # the simulator told a cost
+        self.told: set[str] = set()  # what its infos tell
         self.running = True
         self.showed_end = True
         begun = env.reset(seed=seed)
@@ -183,8 +185,10 @@ class Episode:
     def _take_cost(self, step: Step, cost: Cost | None) -> None:
         """The step's cost, if there is one: that of `cost`, what `step` gives beside rewards, or what infos hold."""
         charged = cost(dict(step.infos)) if cost is not None else self._team_cost(_costs_by_agent(step))
+        self.told.update(str(key) for info in step.infos.values() if isinstance(info, Mapping) for key in info)
         if charged is None:
             return
+        self.charged = True
         if isinstance(charged, Mapping):
             self._take_constraints(charged)
             charged = np.max(np.broadcast_arrays(*self.constraints[-1].values()), 0)
@@ -253,7 +257,11 @@ class Episode:
         """(N, O) in the order of the agents, or a refusal of what so many of them cannot have seen."""
         rows = [observations[a] for a in self.agents]
         shape = (agents, self.shape.observation)
-        return given_as("observations", rows, shape, origins=self.shape.origins.observations)
+        try:
+            return given_as("observations", rows, shape, origins=self.shape.origins.observations)
+        except UserError as error:
+            where = f"{self.name}, step {len(self.rewards)} of the episode with the seed {self.seed}"
+            raise UserError(f"{str(error).rstrip('.')} ({where}).") from None
 
 
 class Step(NamedTuple):

@@ -21,6 +21,7 @@ from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import renamed
+from ringfence.world.card import Card
 
 _log = logging.getLogger(__name__)
 
@@ -100,10 +101,16 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "execution": worlds.execution_of(resolved.job.task, spec.execution),
         "agents": resolved.job.team,
         "guard_options": {} if guard is None else dataclasses.asdict(guard.options),
-        **({} if guard is None else {"world_settings": dataclasses.asdict(guard.world.card.settings)}),
+        **({} if guard is None else _of_world(guard.world.card)),
         "train_seconds": sum(r["seconds"] for r in run.metrics),
         "parameters": _parameters(resolved.policy),
     }
+
+
+def _of_world(card: Card) -> dict[str, Any]:
+    """What a result says of the World that a guard asks; one of before has no verdict."""
+    verdict = {} if card.verdict is None else {"verdict": card.verdict.word}
+    return {"world_settings": dataclasses.asdict(card.settings), **verdict}
 
 
 def _parameters(policy: Policy) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -155,16 +156,37 @@ def _shape_of(world: World, agents: int) -> Shape:
 
 
 class _OneByOne:
-    """A function under guard that is asked for each simulator by itself; the guard filters all."""
+    """A function under guard that is asked for each simulator by itself; the guard filters all. One with `reset` has a
+    memory: each simulator has its own."""
 
     def __init__(self, policy: Callback):
         self.policy = policy
-        self.initial_state = policy.initial_state
         self.observe_cost = policy.observe_cost
+        self.functions: list[Callable] = []
+
+    def initial_state(self, batch: int) -> PyTree:
+        self.functions = _of_each(self.policy.function, batch)
+        return self.policy.initial_state(batch)
 
     def act(self, carry: PyTree, observations, state, key: Key) -> tuple[PyTree, PolicyStep]:
-        function = self.policy.function
         # Copies: a function that writes into what it sees must not blind its guard.
         copies = ((x.copy(), None if state is None else state[k].copy()) for k, x in enumerate(observations))
-        wanted = [function(*self.policy.origins.measured(*seen)) for seen in copies]
+        asked = zip(self.functions, copies, strict=True)
+        wanted = [function(*self.policy.origins.measured(*seen)) for function, seen in asked]
         return self.policy.decided(carry, observations, state, wanted, key)
+
+
+def _of_each(function: Callable, batch: int) -> list[Callable]:
+    """What acts in each of so many simulators, at the beginning of an episode."""
+    if not callable(getattr(function, "reset", None)):
+        return [function] * batch
+    try:
+        each: list[Any] = [function, *(copy.deepcopy(function) for _ in range(batch - 1))]
+    except Exception as error:
+        raise UserError(
+            f"{type(function).__name__} has reset(), and so a memory, but cannot be copied for each of {batch} "
+            f"simulators ({error}); pass num_envs=1."
+        ) from None
+    for one in each:
+        one.reset()
+    return each

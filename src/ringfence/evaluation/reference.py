@@ -13,11 +13,12 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import PerAgent
 from ringfence.proposals.base import Constant
-from ringfence.training.runs import write_json
+from ringfence.training.runs import Run, write_json
 from ringfence.types import Policy
 from ringfence.utils import schemas, stored
 
 FILE = "reference.json"
+LOGS = "behaviour data"
 SAFE = "data within the limit"
 
 
@@ -36,6 +37,24 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
     result = summarise({name: array[kept] for name, array in played.items()}, task, _unsafe_starts(store, task)[kept])
     del result["per_episode"]  # up to 40 000 episodes: the summary is enough
     return result | {"protocol": PROTOCOL, "task": task.name, "split": "data"}
+
+
+def of_run(run: Run, constants: dict[str, Any]) -> dict[str, Any] | None:
+    """The same of the logs that a run was trained on, as it kept them; None where it did not."""
+    logs = run.logs
+    if logs is None or not logs["returns"]:
+        return None
+    card = run.config["data"]
+    task = Task(run.config["task"], None, constraints.CostColumn(), **constants)
+    played = {
+        "rewards": np.array(logs["returns"])[:, None],
+        "costs": np.array(logs["costs"])[:, None],
+        "steps": np.array(logs["steps"]),
+        "terminated": np.array(logs["terminated"]),
+    }
+    result = summarise(played, task, np.zeros(len(logs["returns"]), bool))
+    del result["per_episode"]
+    return result | {"protocol": PROTOCOL, "task": task.name, "split": "data", "data": card}
 
 
 def _played(store: EpisodeStore) -> dict[str, np.ndarray]:
@@ -65,7 +84,7 @@ def there(task: Task, out: str | Path, episodes: int, transitions: int | None = 
     rows = read(file)
     if not _are_complete(rows, task, episodes):
         return False
-    card = rows.get("behaviour data", {}).get("data", {})
+    card = rows.get(LOGS, {}).get("data", {})
     if card.get("hazard") != constraints.to_dict(task.hazard):
         return False
     wanted = task.transitions if transitions is None else transitions
@@ -91,9 +110,9 @@ def make(
     if file.exists():
         known = read(file)
         same = (SAFE in known) == safe.any() and _are_complete(known, task, episodes)
-        if same and stored.card(known["behaviour data"]["data"]) == store.card.to_dict():
+        if same and stored.card(known[LOGS]["data"]) == store.card.to_dict():
             return known
-    rows = {"behaviour data": of_data(store, task) | {"data": store.card.to_dict()}}
+    rows = {LOGS: of_data(store, task) | {"data": store.card.to_dict()}}
     if safe.any():
         rows[SAFE] = of_data(store, task, safe)
     for name, policy in _policies(task).items():

@@ -31,6 +31,8 @@ from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import policy_of_before, renamed, renamed_values
 from ringfence.world import World
 
+_LOOKS_ON = {"correction_steps": 0, "select": True}  # options of a guard that corrects nothing: of one proposal
+
 
 @jax.jit
 def _decided(guarded: Guarded, carry: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
@@ -163,6 +165,8 @@ def under_guard(
         raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
     if agents not in (None, spec.n_agents) and not spec.homogeneous:
         raise UserError(f"The World is of {spec.n_agents} heterogeneous agents; leave agents={agents} out.")
+    if guard == "none":  # it looks on, whatever the World is worth
+        guard, anyway, options = "shield", True, {**options, **_LOOKS_ON}
     guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
     return Callback(policy, guarded, agents or spec.n_agents)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -84,6 +85,8 @@ def _filled(keeper: _Keeper, player: _Player, rules: _Rules, episodes: int, quie
         try:
             for k in range(begun, episodes):
                 keeper.add(_played(keeper.env, player, rules, keeper.source["first_seed"], k))
+                if k == 0 and "hazard" not in (keeper.card or {}):
+                    _warn_unless_charged(simulator, keeper.fresh)
                 bar.advance(1)
         except KeyboardInterrupt as stopped:
             keeper.keep()
@@ -222,6 +225,8 @@ class _Played:
     by_agent: bool  # some step had a cost of each agent
     state: np.ndarray | None  # (L+1, S)
     terminated: bool
+    charged: bool  # some step told a cost
+    told: frozenset[str]  # what infos tell
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -250,7 +255,9 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         else:
             state = episode.state
             action = player.act(episode.seen.copy(), None if state is None else state.copy())  # it may write there
-        actions.append(space.clipped(given_as("actions", action, shape)))
+        actions.append(
+            space.clipped(given_as("actions", action, shape, "the simulator", "return one action for each agent"))
+        )
         episode.step(actions[-1], rules.cost)
         if episode.skipped:
             return None
@@ -277,6 +284,20 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         by_agent=any(np.ndim(cost) > 0 for cost in episode.costs),
         state=np.stack(known_states) if known_states else None,
         terminated=episode.terminated,
+        charged=episode.charged,
+        told=frozenset(episode.told),
+    )
+
+
+def _warn_unless_charged(simulator: str, first: list[_Played]) -> None:
+    """Say so, before hours are spent, where an episode tells no cost."""
+    if not first or first[0].charged:
+        return
+    told = ", ".join(sorted(first[0].told)[:5])
+    warnings.warn(
+        f"{simulator} tells no cost{f', its infos {told}' if told else ''}: these logs have none and teach no danger; "
+        "give each agent's info a 'cost', pass cost=, a function of the infos, or name a formula in card['hazard'].",
+        stacklevel=4,
     )
 
 

@@ -161,6 +161,16 @@ class EpisodeStore:
         steps = np.split(self.actions, self.episode_ends[:-1])
         return [digest_of((("observations", seen), ("actions", done))) for seen, done in zip(rows, steps)]
 
+    @property
+    def outcomes(self) -> dict[str, list]:
+        """What each episode earned and cost, how long it was and whether the task ended it."""
+        return {
+            "returns": [round(float(x), 4) for x in self.returns],
+            "costs": [round(float(x), 4) for x in self.episode_costs],
+            "steps": [int(n) for n in self.lengths],
+            "terminated": [bool(x) for x in self.episode_terminated],
+        }
+
     def digest(self, *names: str) -> str:
         """Of some of the arrays."""
         arrays = ((name, getattr(self, name)) for name in names)

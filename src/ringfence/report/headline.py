@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ringfence.evaluation import reference, statistics
 from ringfence.evaluation.statistics import Interval
 from ringfence.report.html import share
 from ringfence.report.pooling import Line
@@ -44,11 +45,25 @@ def headline(section: Section[LineT], split: str = "test") -> list[str]:
     safe = [row for row in rows if row.safe]
     sentences = _best(rows, safe, section.references, limit, unit, event) if safe else _nearest(rows, limit)
     for row in section.references:
-        if row.name == "behaviour data":
+        if row.name == reference.LOGS:
             sentences.append(
-                f"The data itself has a return of {row.returns:.1f} and {row.cost:.3f} {unit} per episode."
+                f"The data itself has a return of {row.returns:.1f} and {row.cost:.3f} {unit} per episode, and {event} "
+                f"in {share(row.violation_rate)} of all."
             )
+            sentences += _worse(rows, row, event)
     return sentences
+
+
+def _worse(rows: Sequence[Line], logs: Line, event: str) -> list[str]:
+    """Of the method that leaves what its logs show: what imitates them errs, and then nobody showed it a way back."""
+    most = max(rows, key=lambda row: row.violation_rate)
+    low, _ = statistics.clopper_pearson(most.violations, most.episodes)
+    if low <= 1.5 * logs.violation_rate or low - logs.violation_rate < 0.05:
+        return []
+    return [
+        f"{most.label} has {event} in {share(most.violation_rate)} of its episodes, more than the data: it drifts to "
+        "where the logs do not show what to do."
+    ]
 
 
 def _nearest(rows: Sequence[Line], limit: str) -> list[str]:

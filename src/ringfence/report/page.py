@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ringfence.datasets import registry
+from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.logs.provenance import regenerated
@@ -49,6 +50,17 @@ class SplitTable:
     rows: list[Row]
     references: list[Row]  # of the test split alone
     constraints: list[ConstraintLine]
+    guards: list[GuardLine]
+
+
+@dataclass(frozen=True)
+class GuardLine:
+    """What the guard of a row says of itself."""
+
+    row: Row
+    verdict: str | None  # of its World; None of results of before
+    infeasible: float  # share of the steps in which no action kept the margin
+    ood: float | None  # share of the steps that the logs do not cover
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,9 @@ def _section(section: Section[Row], k: int, out: Path) -> dict[str, Any]:
         "unit": unit,
         "headline": headline(section),
         "tables": [
-            SplitTable(split, rows, section.references if split == "test" else [], constraint_table(rows))
+            SplitTable(
+                split, rows, section.references if split == "test" else [], constraint_table(rows), guard_table(rows)
+            )
             for split, rows in section.tables.items()
         ],
         "constants": section.constants,
@@ -98,6 +112,7 @@ def _section(section: Section[Row], k: int, out: Path) -> dict[str, Any]:
         "players": recorded,
         "films": animation.films(section),
         "film_shows": _film_shows(section),
+        "simulated": _simulated(section) is not None,
         "players_json": Markup(json.dumps(recorded).replace("<", "\\u003c")),
         "commands": made.commands(section, out),
         "differences": made.differences(section.runs),
@@ -107,10 +122,32 @@ def _section(section: Section[Row], k: int, out: Path) -> dict[str, Any]:
     }
 
 
+def _simulated(section: Section[Row]) -> Task | None:
+    """The task, where a simulator of this package plays it."""
+    return registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
+
+
 def _film_shows(section: Section[Row]) -> str:
     """What films of a task show, in words; empty where its simulator draws none."""
-    task = registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
+    task = _simulated(section)
     return "" if task is None else getattr(task.env, "film_shows", "")
+
+
+def guard_table(rows: list[Row]) -> list[GuardLine]:
+    """A line for each row that was played under a guard."""
+    found = []
+    for row in rows:
+        results = [result for _, result in row.members]
+        if all("infeasible_rate" in result for result in results):
+            verdicts = {result.get("verdict") for result in results}
+            line = GuardLine(
+                row=row,
+                verdict=verdicts.pop() if len(verdicts) == 1 else None,
+                infeasible=mean_of(results, "infeasible_rate") or 0.0,
+                ood=mean_of(results, "ood_rate"),
+            )
+            found.append(line)
+    return found
 
 
 def constraint_table(rows: list[Row]) -> list[ConstraintLine]:

@@ -29,7 +29,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, draw
 from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
-from ringfence.training.runs import Run, write_json
+from ringfence.training.runs import LOGS, Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
 from ringfence.utils import stored
 from ringfence.utils.compilation import keep_programs
@@ -443,6 +443,8 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
     else:  # the config last: a folder without one is begun anew
         write_json(run.path / "env.json", environment())
         write_json(run.path / "episodes.json", data.digests_of_episodes)
+        if job.task.env is None:  # rows of a benchmark's data are made with its references
+            write_json(run.path / LOGS, data.outcomes)
         write_json(run.path / "config.json", mine)
 
 

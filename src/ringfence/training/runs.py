@@ -3,6 +3,7 @@
 config.json     algorithm, preset, config, task, spec, hazard, seed, data card
 env.json        versions, hardware, git commit
 episodes.json   digest of every episode that was trained on
+logs.json       what these earned and cost, where the data is of no benchmark
 metrics.jsonl   one line per logged chunk of updates
 ckpt/           step-00004000.safetensors: whole or absent, the last two are kept
 results.json    what `ringfence eval` measured, one entry per variant
@@ -31,6 +32,7 @@ from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 _log = logging.getLogger(__name__)
 
 KEEP = 2  # checkpoints
+LOGS = "logs.json"
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,14 @@ class Run:
         file = self.path / "episodes.json"
         remedy = "holds a damaged episodes.json; delete that file"
         return set(schemas.read(file, list[str], remedy)) if file.exists() else None
+
+    @property
+    def logs(self) -> schemas.Outcomes | None:
+        """What the episodes that it was trained on earned and cost; None where nobody kept it."""
+        file = self.path / LOGS
+        return (
+            schemas.read(file, schemas.Outcomes, f"holds a damaged {LOGS}; delete that file") if file.exists() else None
+        )
 
     @property
     def metrics(self) -> list[dict]:

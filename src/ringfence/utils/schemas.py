@@ -193,6 +193,7 @@ class Result(Before, total=False):
     agents: Few
     guard_options: dict[str, Scalar]
     world_settings: dict[str, Scalar]
+    verdict: str  # of the World that the guard asks
     infeasible_rate: float
     ood_rate: float
     eval_seconds: float
@@ -207,6 +208,15 @@ class Result(Before, total=False):
 
 Results = dict[Variant, Result]
 References = dict[str, Result]
+
+
+class Outcomes(TypedDict):
+    """logs.json of a run: a number of each episode that it was trained on."""
+
+    returns: list[float]
+    costs: list[float]
+    steps: list[Count]
+    terminated: list[bool]
 
 
 class Status(TypedDict, total=False):
