@@ -28,9 +28,6 @@ SPREAD: dict[str, Column] = {
     "shield, decentralized": ("own-sight", ("bc", "default+shield-learned-decentralized")),
     "full, decentralized": ("own-sight", ("bc", "default+full-learned-decentralized")),
 }
-DEFAULTS: dict[str, Column] = {
-    words: ("guards-defaults", row) for words, (suite, row) in SPREAD.items() if suite == "guards" and row[0] == "bc"
-}
 ROBOTS: dict[str, Column] = {
     "BC": ("guards-mujoco", ("bc", "default")),
     "adapt, analytic": ("guards-mujoco", ("bc", "default+adapt-analytic")),
@@ -74,7 +71,6 @@ SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 
 def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
-    put("docs/guard-results.md", "spread-defaults", table(DEFAULTS, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
     put("docs/guard-results.md", "robots-defaults", table(ROBOTS_DEFAULTS, long))
     put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))

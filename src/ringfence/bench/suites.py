@@ -130,7 +130,6 @@ SUITES = {
             Entry("madiff", "own", _ALONE),
             *(Entry(name, evaluations=_ALONE) for name in _RIVALS),
             Entry("bc-return", "advantage", _ALONE),
-            *(Entry("icbf", preset, _ALONE) for preset in ("paper", "paper-10")),
         ),
     ),
     "guards-mujoco": Suite(
