@@ -380,10 +380,12 @@ def shielded_all() -> tuple[bool, str]:
 def same_safety() -> tuple[bool, str]:
     """Learned danger beside the formula, under cloning: Simple Spread's shield and the robots' adapting one."""
     share, left = [], []
-    for task in tasks_of("guards"):
-        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS)
+    for task in tasks_of("guards-defaults"):
+        learned, formula = (
+            mean("guards-defaults", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS
+        )
         share.append(learned / formula)
-        left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
+        left.append(mean("guards-defaults", task, ("bc", "default+shield-learned"), "cost_safe_start"))
     kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in BARRIERS]
     ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
     return ok, (
@@ -608,7 +610,7 @@ def ranks_like(number: str, truth: str, least: float) -> Callable[[], tuple[bool
 
 CLAIMS = (
     Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
-    Claim("docs/tables.md", "learned danger does what the formula does", "guards, guards-mujoco", same_safety),
+    Claim("docs/tables.md", "learned danger does what the formula does", "guards-defaults, guards-mujoco", same_safety),
     Claim(
         "README.md",
         "Climbing learned values from cloned actions earns as much as from its plans",
