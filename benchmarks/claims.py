@@ -190,8 +190,8 @@ def of_shielded_pool() -> tuple[bool, str]:
     pairs = {name: (rows[name], rows[f"{name}, under shield"]) for name in rows if f"{name}, under shield" in rows}
     cost = max(shield["cost_safe_start"] for _, shield in pairs.values())
     more = {name: shield["return_norm"] - alone["return_norm"] for name, (alone, shield) in pairs.items()}
-    found = ", ".join(f"{name} {x:+.3f}" for name, x in more.items())
-    return cost < 0.005 and min(more.values()) > -0.01, f"cost {cost:.3f} at most; {found}"
+    low, high = min(more.values()), max(more.values())
+    return cost < 0.005 and low > -0.01, f"cost {cost:.3f} at most; return {low:+.3f} to {high:+.3f}, of {len(more)}"
 
 
 def of_medium_pool() -> tuple[bool, str]:
@@ -280,7 +280,8 @@ def of_climbing_robots() -> tuple[bool, str]:
         if found["task"] in climbed:
             more[found["task"]] = climbed[found["task"]] - found["rows"][pooled.BEST]["return_mean"]
     most = sum(x > 0 for x in more.values()) > len(more) / 2
-    return most, ", ".join(f"{name} {x:+.0f}" for name, x in more.items())
+    sides = [[f"{name} {x:+.0f}" for name, x in more.items() if x * sign > 0] for sign in (1, -1)]
+    return most, f"{told(sides)} of {len(more)}"
 
 
 def of_selection() -> tuple[bool, str]:

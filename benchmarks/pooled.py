@@ -113,6 +113,7 @@ UNTOLD = {
     "flow, one driver, its mean",
     *(f"{who}, {t} asked" for who in ("flow, told raw", "madiff, long, raw") for t in (0.5, 1.5)),
     "madiff, long, 2.5 asked",
+    *(f"flow, {n} steps" for n in (2, 8)),
 }
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
