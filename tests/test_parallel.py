@@ -399,11 +399,11 @@ class Counts:
 
 def test_a_policy_with_a_memory_has_one_in_each_simulator(small_world):
     """However many are stepped side by side; one that cannot be copied is refused."""
-    alone = [
-        play(guard(Counts(), small_world, guard="none", horizon=1), SimpleSpreadParallel, episodes=3, num_envs=n)
-        for n in (1, 3)
+    one, *others = [
+        play(guard(acts, small_world, guard="none", horizon=1), SimpleSpreadParallel, episodes=3, num_envs=n)
+        for acts, n in ((Counts(), 1), (Counts(), 3), (Counts().__call__, 3))
     ]
-    assert alone[0]["per_episode"] == alone[1]["per_episode"]
+    assert all(other["per_episode"] == one["per_episode"] for other in others)
 
     class Held(Counts):
         def __deepcopy__(self, memo):

@@ -177,16 +177,18 @@ class _OneByOne:
 
 
 def _of_each(function: Callable, batch: int) -> list[Callable]:
-    """What acts in each of so many simulators, at the beginning of an episode."""
-    if not callable(getattr(function, "reset", None)):
+    """What acts in each of so many simulators, at the beginning of an episode: whoever has `reset`, or a method of it,
+    is copied."""
+    owner: Any = function if hasattr(function, "reset") else getattr(function, "__self__", None)
+    if not callable(getattr(owner, "reset", None)):
         return [function] * batch
     try:
-        each: list[Any] = [function, *(copy.deepcopy(function) for _ in range(batch - 1))]
+        owners = [owner, *(copy.deepcopy(owner) for _ in range(batch - 1))]
     except Exception as error:
         raise UserError(
-            f"{type(function).__name__} has reset(), and so a memory, but cannot be copied for each of {batch} "
+            f"{type(owner).__name__} has reset(), and so a memory, but cannot be copied for each of {batch} "
             f"simulators ({error}); pass num_envs=1."
         ) from None
-    for one in each:
+    for one in owners:
         one.reset()
-    return each
+    return owners if owner is function else [getattr(one, function.__name__) for one in owners]

@@ -61,8 +61,8 @@ def _worse(rows: Sequence[Line], logs: Line, event: str) -> list[str]:
     if low <= 1.5 * logs.violation_rate or low - logs.violation_rate < 0.05:
         return []
     return [
-        f"{most.label} has {event} in {share(most.violation_rate)} of its episodes, more than the data: it drifts to "
-        "where the logs do not show what to do."
+        f"{most.label} has {event} in {share(most.violation_rate)} of its episodes: policies drift to where logs do "
+        "not show what to do."
     ]
 
 

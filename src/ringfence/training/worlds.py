@@ -6,7 +6,7 @@ import warnings
 from pathlib import Path
 
 from ringfence.datasets import registry
-from ringfence.datasets.audit import odd_danger
+from ringfence.datasets.audit import odd_danger, odd_names
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, whole_number
 from ringfence.guards import searched
@@ -84,7 +84,7 @@ def fit(
     map = task.feature_map(settings.view, store)
     spec = task.spec(map, store)
     needed = settings.labels == "formula" and settings.barrier
-    for note in [] if needed else odd_danger(store, task):
+    for note in odd_names(store) if needed else odd_danger(store, task):
         warnings.warn(note, stacklevel=3)  # before minutes are spent
     bind = constraints.bind if needed else constraints.bind_or_none
     hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
