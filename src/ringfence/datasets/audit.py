@@ -59,7 +59,7 @@ def odd_names(store: EpisodeStore) -> list[str]:
 
 def _unread(store: EpisodeStore, task: Task) -> list[str]:
     """A warning where somebody's card has a formula of danger that cannot be read."""
-    if task.env is not None:  # a simulator of the package counts what its own formula says
+    if task.env is not None or isinstance(task.hazard, constraints.CostColumn):  # its own formula, or none
         return []
     try:
         _bound(store, task)
