@@ -29,6 +29,7 @@ from typing import Any
 
 import _rows
 import numpy as np
+from stress import MIDDLE, in_words, name_of
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDER = ROOT / "results" / "stress" / "certificates"
@@ -40,7 +41,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "none": {},
     "delay2": {"delay": 2},
     "asynchrony0.667": {"asynchrony": 0.667},
-    "all": {"delay": 2, "drop": 0.3, "noise": 0.005, "gain": 0.8, "asynchrony": 0.5},
+    "all": MIDDLE,
     "delay3": {"delay": 3},
     "drop0.6": {"drop": 0.6},
 }
@@ -236,13 +237,6 @@ def by_setting(out: Path) -> dict[str, list[dict[str, str]]]:
     return found
 
 
-def in_words(setting: str) -> str:
-    """A setting as its faults, e.g. `delay 2`; all of them as five at once."""
-    if setting == "all":
-        return "five at once"
-    return ", ".join(f"{name} {value}" for name, value in SETTINGS[setting].items()) or "none"
-
-
 def picture(out: Path, file: Path) -> None:
     """What certificates allow beside what all episodes of their setting did."""
     import matplotlib
@@ -258,7 +252,7 @@ def picture(out: Path, file: Path) -> None:
         spread = y + 0.22 * np.linspace(-1, 1, len(bounds))
         axis.barh(y, rate, height=0.62, color="#f2b8a0", label="violated, of all episodes" if y == 0 else None)
         axis.scatter(bounds, spread, s=18, color="#1f5fa8", zorder=3, label="allowed, a certificate each" * (y == 0))
-    axis.set_yticks(range(len(found)), [in_words(setting).replace(", noise", ",\nnoise") for setting in found])
+    axis.set_yticks(range(len(found)), [in_words(name_of(SETTINGS[setting])) for setting in found])
     axis.invert_yaxis()
     axis.set_xlim(left=0)
     axis.set_xlabel("episodes with a violation, %")
@@ -280,7 +274,7 @@ def write_table(out: Path) -> None:
         kept = sum(row["kept"] == "True" for row in rows)
         told = sum(row["vacuous"] == "False" for row in rows)
         cells = [
-            in_words(setting),
+            in_words(name_of(SETTINGS[setting])),
             str(int(rows[0]["tested"]) + int(rows[0]["others"])),
             f"{100 * float(rows[0]['pool_rate']):.1f}",
             " to ".join(dict.fromkeys(f"{b:.1f}" for b in (min(bounds), max(bounds)))),

@@ -158,8 +158,9 @@ STUDIES |= {
     for tier in ("expert", "random")
 }
 # What won over the three, on all logs of a tier.
+_ICBF = ("icbf", "split")
 STUDIES["whole"] = replace(
-    STUDIES["simple_spread"], task="simple_spread-expert", learner=None, settings={("icbf", "split"): [{"lr": 1e-3}]}
+    STUDIES["simple_spread"], task="simple_spread-expert", learner=None, settings={_ICBF: _WINNERS[_ICBF]}
 )
 
 

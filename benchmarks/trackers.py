@@ -208,7 +208,7 @@ def judged(store: ringfence.EpisodeStore, episodes: int) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as runs:
         (run,) = ringfence.train("bc", store, seeds=(0,), out=runs)
         guarded = {"guard": "shield", "world": world, "anyway": True}
-        looking = ringfence.guard(naive, world, anyway=True, correction_steps=0, select=True)  # that only looks on
+        looking = ringfence.guard(naive, world, guard="none")  # it looks on
         for who, player, options in (
             ("clone", run, {}),
             ("clone, shield", run, guarded),

@@ -80,7 +80,7 @@ def main() -> None:
                 run, yard.Yard, episodes=episodes, num_envs=100, **asked, **({"world": world} if asked else {})
             )
         else:
-            asked = asked or {"correction_steps": 0, "select": True}  # of one proposal: a guard that only looks on
+            asked = asked or {"guard": "none"}  # it looks on
             pilot = ringfence.guard(naive, world, hazard=hazard, **asked)
             r = ringfence.play(pilot, yard.Yard, episodes=episodes, num_envs=100)
         measured = [r["return_mean"], *r["return_interval"], r["violation_rate"]]

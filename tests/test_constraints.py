@@ -17,6 +17,7 @@ from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.report import build_report
+from ringfence.report.table import sections
 from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
 
@@ -187,12 +188,20 @@ def test_results_and_reports_hold_each_beside_its_limit(logs, tmp_path, capsys):
     run = loop.train("bc", logs, out=tmp_path, changes=changes, quiet=True)[0]
     found = play(run, Sleds, episodes=3, keep=True)["constraints"]
     assert {k: v["limit"] for k, v in found.items()} == LIMITS
+    (data,) = sections([run])[0].references
+    assert data.name == "behaviour data" and data.limits == LIMITS, "the logs are judged by each limit, too"
+    assert data.episodes == logs.episodes and data.violation_rate == pytest.approx((logs.episode_costs > 0).mean())
     page = build_report([run], tmp_path / "page.html").read_text()
     shown = re.findall(r"<td>(wall|fast)</td><td>([\d.]+)</td><td>(\d+)</td>", page)
     assert shown == [(k, f"{found[k]['cost_mean']:.3f}", f"{v:g}") for k, v in LIMITS.items()]
     app.main(["play", str(run.path), "--env", "tests.test_constraints:Sleds", "--episodes", "2"])
     shown = capsys.readouterr().out
     assert "wall" in shown and "fast" in shown
+    (run.path / "logs.json").write_text(
+        '{"returns": [1.0], "costs": [], "steps": [], "terminated": [], "constraints": {}}'
+    )
+    with pytest.raises(UserError, match="holds a damaged logs.json; delete that file"):
+        build_report([run], tmp_path / "page.html")
 
 
 def test_simulators_that_change_their_constraints_are_refused(fitted):

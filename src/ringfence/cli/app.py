@@ -6,7 +6,6 @@ import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
@@ -307,6 +306,8 @@ def play(
 
 def _logged(logs: Outcomes) -> list[str]:
     """The row of what a run was trained on."""
+    from statistics import fmean
+
     unsafe = fmean(cost > 0 for cost in logs["costs"])
     return ["its logs", "", f"{fmean(logs['returns']):.4g}", f"{fmean(logs['costs']):.3f}", f"{unsafe:.3f}", ""]
 

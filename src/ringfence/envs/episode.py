@@ -74,8 +74,7 @@ class Episode:
         self.constraints: list[dict[str, float | np.ndarray]] = []
         self.terminated = False
         self.unsafe_start = False
-        self.charged = False  # the simulator told a cost
-        self.told: set[str] = set()  # what its infos tell
+        self.told: set[str] = set()  # what infos tell that have no cost
         self.running = True
         self.showed_end = True
         begun = env.reset(seed=seed)
@@ -185,10 +184,9 @@ class Episode:
     def _take_cost(self, step: Step, cost: Cost | None) -> None:
         """The step's cost, if there is one: that of `cost`, what `step` gives beside rewards, or what infos hold."""
         charged = cost(dict(step.infos)) if cost is not None else self._team_cost(_costs_by_agent(step))
-        self.told.update(str(key) for info in step.infos.values() if isinstance(info, Mapping) for key in info)
         if charged is None:
+            self.told.update(str(key) for info in step.infos.values() if isinstance(info, Mapping) for key in info)
             return
-        self.charged = True
         if isinstance(charged, Mapping):
             self._take_constraints(charged)
             charged = np.max(np.broadcast_arrays(*self.constraints[-1].values()), 0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
-from ringfence.evaluation import protocol, rollout, statistics
+from ringfence.evaluation import protocol, rollout
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
 from ringfence.evaluation.stress import compensated
@@ -357,17 +357,7 @@ def _summary(player: Player, tables: list[Table]) -> dict[str, Any]:
 def _of_constraint(played: list[Episode], name: str, limits: Mapping[str, float]) -> dict[str, Any]:
     """Of one constraint: the team's cost per episode, its limit, and the share of episodes within it."""
     costs = np.array([sum(float(np.max(c[name])) for c in e.constraints) for e in played])
-    violated = costs > 0
-    found = {
-        "cost_mean": float(costs.mean()),
-        "cost_interval": statistics.bootstrap_mean(costs),
-        "violation_rate": float(violated.mean()),
-        "violation_upper": statistics.upper_bound(int(violated.sum()), len(costs)),
-    }
-    if name in limits:
-        found["limit"] = limits[name]
-        found["limit_satisfied_rate"] = float((costs <= limits[name]).mean())
-    return found
+    return protocol.of_constraint(costs, limits.get(name))
 
 
 def _arrays(played: list[Episode]) -> dict[str, np.ndarray]:

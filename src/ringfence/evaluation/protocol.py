@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import time
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -83,6 +84,20 @@ def summarise(played: dict[str, np.ndarray], task: Task, hazard_at_start: np.nda
             "terminated": [bool(x) for x in terminated],
         },
     }
+
+
+def of_constraint(costs: np.ndarray, limit: float | None) -> dict[str, Any]:
+    """What a result says of a constraint whose costs per episode are (E,), and of its limit, if it has one."""
+    violated = costs > 0
+    found = {
+        "cost_mean": float(costs.mean()),
+        "cost_interval": statistics.bootstrap_mean(costs),
+        "violation_rate": float(violated.mean()),
+        "violation_upper": statistics.upper_bound(int(violated.sum()), len(costs)),
+    }
+    if limit is not None:
+        found |= {"limit": limit, "limit_satisfied_rate": float((costs <= limit).mean())}
+    return found
 
 
 def complete(result: dict, task: Task) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ringfence.datasets.task import Task
-from ringfence.evaluation.protocol import PROTOCOL, complete, evaluate_policy, summarise, unsafe_starts
+from ringfence.evaluation.protocol import PROTOCOL, complete, evaluate_policy, of_constraint, summarise, unsafe_starts
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import PerAgent
@@ -42,9 +42,8 @@ def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> 
 def of_run(run: Run, constants: dict[str, Any]) -> dict[str, Any] | None:
     """The same of the logs that a run was trained on, as it kept them; None where it did not."""
     logs = run.logs
-    if logs is None or not logs["returns"]:
+    if logs is None:
         return None
-    card = run.config["data"]
     task = Task(run.config["task"], None, constraints.CostColumn(), **constants)
     played = {
         "rewards": np.array(logs["returns"])[:, None],
@@ -54,7 +53,10 @@ def of_run(run: Run, constants: dict[str, Any]) -> dict[str, Any] | None:
     }
     result = summarise(played, task, np.zeros(len(logs["returns"]), bool))
     del result["per_episode"]
-    return result | {"protocol": PROTOCOL, "task": task.name, "split": "data", "data": card}
+    limits = run.config["data"].get("constraints") or {}
+    if logs["constraints"]:
+        result["constraints"] = {k: of_constraint(np.array(c), limits.get(k)) for k, c in logs["constraints"].items()}
+    return result | {"split": "data"}
 
 
 def _played(store: EpisodeStore) -> dict[str, np.ndarray]:

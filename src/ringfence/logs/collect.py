@@ -249,6 +249,7 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
     seen = [episode.seen]
     states = [episode.state]
     actions = []
+    charged = False
     while episode.running:
         if player.act is None:
             action = chance.uniform(space.bounds.low, space.bounds.high, shape)
@@ -264,6 +265,7 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         if len(episode.rewards) < len(actions):  # nobody shows where the last action led
             actions.pop()
             break
+        charged = charged or not episode.lacks_cost
         episode.charge(0.0)
         if not episode.showed_end:
             raise UserError(
@@ -284,7 +286,7 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         by_agent=any(np.ndim(cost) > 0 for cost in episode.costs),
         state=np.stack(known_states) if known_states else None,
         terminated=episode.terminated,
-        charged=episode.charged,
+        charged=charged,
         told=frozenset(episode.told),
     )
 

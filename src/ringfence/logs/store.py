@@ -162,13 +162,14 @@ class EpisodeStore:
         return [digest_of((("observations", seen), ("actions", done))) for seen, done in zip(rows, steps)]
 
     @property
-    def outcomes(self) -> dict[str, list]:
-        """What each episode earned and cost, how long it was and whether the task ended it."""
+    def outcomes(self) -> dict[str, list | dict[str, list]]:
+        """What each episode earned and cost, by constraint, too, how long it was and whether the task ended it."""
         return {
             "returns": [round(float(x), 4) for x in self.returns],
             "costs": [round(float(x), 4) for x in self.episode_costs],
             "steps": [int(n) for n in self.lengths],
             "terminated": [bool(x) for x in self.episode_terminated],
+            "constraints": {k: [round(float(x), 4) for x in self.episode_costs_of(k)] for k in self.limits},
         }
 
     def digest(self, *names: str) -> str:

@@ -55,15 +55,12 @@ def headline(section: Section[LineT], split: str = "test") -> list[str]:
 
 
 def _worse(rows: Sequence[Line], logs: Line, event: str) -> list[str]:
-    """Of the method that leaves what its logs show: what imitates them errs, and then nobody showed it a way back."""
+    """Of the method with most violations, where it has clearly more than its logs."""
     most = max(rows, key=lambda row: row.violation_rate)
     low, _ = statistics.clopper_pearson(most.violations, most.episodes)
     if low <= 1.5 * logs.violation_rate or low - logs.violation_rate < 0.05:
         return []
-    return [
-        f"{most.label} has {event} in {share(most.violation_rate)} of its episodes: policies drift to where logs do "
-        "not show what to do."
-    ]
+    return [f"{most.label} has {event} in {share(most.violation_rate)} of its episodes, more than the data has."]
 
 
 def _nearest(rows: Sequence[Line], limit: str) -> list[str]:

@@ -138,15 +138,12 @@ def guard_table(rows: list[Row]) -> list[GuardLine]:
     found = []
     for row in rows:
         results = [result for _, result in row.members]
-        if all("infeasible_rate" in result for result in results):
-            verdicts = {result.get("verdict") for result in results}
-            line = GuardLine(
-                row=row,
-                verdict=verdicts.pop() if len(verdicts) == 1 else None,
-                infeasible=mean_of(results, "infeasible_rate") or 0.0,
-                ood=mean_of(results, "ood_rate"),
-            )
-            found.append(line)
+        infeasible = mean_of(results, "infeasible_rate")
+        if infeasible is None:
+            continue
+        verdicts = {result.get("verdict") for result in results}
+        verdict = verdicts.pop() if len(verdicts) == 1 else None
+        found.append(GuardLine(row, verdict, infeasible, mean_of(results, "ood_rate")))
     return found
 
 

@@ -198,7 +198,6 @@ def _references(runs: list[Run], task: str, leader: Result) -> list[Row]:
             _agree(f"'{file}' row '{name}'", result, leader, runs[0])
             rows.setdefault(name, _reference(name, result))
     if reference.LOGS not in rows and (logs := reference.of_run(runs[0], leader["constants"])) is not None:
-        _agree(f"'{runs[0].path}' logs", logs, leader, runs[0])
         rows[reference.LOGS] = _reference(reference.LOGS, logs)
     return list(rows.values())
 

@@ -83,9 +83,15 @@ class Run:
     def logs(self) -> schemas.Outcomes | None:
         """What the episodes that it was trained on earned and cost; None where nobody kept it."""
         file = self.path / LOGS
-        return (
-            schemas.read(file, schemas.Outcomes, f"holds a damaged {LOGS}; delete that file") if file.exists() else None
-        )
+        if not file.exists():
+            return None
+        remedy = f"holds a damaged {LOGS}; delete that file"
+        logs = schemas.read(file, schemas.Outcomes, remedy)
+        columns = [logs["returns"], logs["costs"], logs["steps"], logs["terminated"], *logs["constraints"].values()]
+        lengths = {len(column) for column in columns}
+        if len(lengths) > 1 or 0 in lengths:
+            raise UserError(f"'{file}' {remedy}.")
+        return logs
 
     @property
     def metrics(self) -> list[dict]:

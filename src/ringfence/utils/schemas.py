@@ -217,6 +217,7 @@ class Outcomes(TypedDict):
     costs: list[float]
     steps: list[Count]
     terminated: list[bool]
+    constraints: dict[str, list[float]]  # costs of each that is named
 
 
 class Status(TypedDict, total=False):
