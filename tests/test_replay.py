@@ -15,7 +15,7 @@ from ringfence.evaluation.replay import judge
 from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film
-from ringfence.evaluation.replay.scene import Names, motion_of, windows_of
+from ringfence.evaluation.replay.scene import motion_of, names_of, windows_of
 from ringfence.evaluation.replay.stage import Stage
 from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.statistics import upper_bound
@@ -25,6 +25,7 @@ from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
 from ringfence.loading.controller import Controller
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem.names import Names
 from ringfence.report import replay_page
 from ringfence.world import save
 from ringfence.world.card import Verdict
@@ -60,7 +61,7 @@ def walkers(reach=2.0, late=0.5, **card) -> EpisodeStore:
 
 
 def stage_of(store: EpisodeStore) -> Stage:
-    names = Names.of(store)
+    names = names_of(store)
     motion = motion_of(store, names)
     cut, _ = windows_of(store, names, motion, np.arange(store.episodes), STEPS, 300, RADIUS, DT)
     return Stage(cut, kinematics_of(None, store, motion, None, DT, 2.7), RADIUS, 0)
@@ -164,7 +165,7 @@ def test_a_world_guards_bad_drivers_in_the_command_and_on_a_page(close, tmp_path
 
 def test_the_radius_is_told_by_the_formula_or_by_costs():
     store = walkers(reach=0.9)
-    motion = motion_of(store, Names.of(store))
+    motion = motion_of(store, names_of(store))
     radius, source = radius_of(store, motion, None)
     assert source == "the logged costs" and radius == pytest.approx(RADIUS, abs=0.1)
     assert radius_of(store, motion, 0.3) == (0.3, "given")
@@ -175,7 +176,7 @@ def test_the_radius_is_told_by_the_formula_or_by_costs():
 def test_the_radius_is_that_of_the_worlds_cause_where_costs_tell_no_distance():
     """Half of the danger is a speed, say, and the World's card knows below what distance the rest of it is."""
     store = walkers(reach=0.9)
-    motion = motion_of(store, Names.of(store))
+    motion = motion_of(store, names_of(store))
     elsewhere = np.random.default_rng(0).random(store.costs.shape) < 0.5
     several = dataclasses.replace(store, costs=np.maximum(store.costs, elsewhere).astype(np.float32))
     near = Cause("length of other.dx, other.dy", ((2, 3),), length=True)
@@ -206,7 +207,7 @@ def test_replays_show_their_progress_unless_they_are_quiet(capsys):
 def test_what_cannot_be_replayed_is_refused_in_a_sentence():
     store = walkers()
     unnamed = store.card.updated(observation_names=None)
-    assert Names.of(dataclasses.replace(store, card=unnamed)).slots == Names.of(store).slots, (
+    assert names_of(dataclasses.replace(store, card=unnamed)).slots == names_of(store).slots, (
         "they are told by the logs"
     )
     noise = np.random.default_rng(0).normal(size=store.observations.shape)
@@ -242,7 +243,7 @@ def test_a_world_of_other_logs_or_unfit_is_refused(close):
 @pytest.mark.parametrize("late", [0.0, 0.5, 1.0])
 def test_bodies_go_with_the_velocity_that_the_logs_have_them_go_with(late):
     store = walkers(late=late)
-    motion = motion_of(store, Names.of(store))
+    motion = motion_of(store, names_of(store))
     assert motion.late == late
     stage = stage_of(store)
     first = stage.windows.driven == 0
@@ -253,7 +254,7 @@ def test_bodies_go_with_the_velocity_that_the_logs_have_them_go_with(late):
 
 def test_kinematics_move_as_they_say():
     store = walkers()
-    motion = motion_of(store, Names.of(store))
+    motion = motion_of(store, names_of(store))
     place, velocity, heading = np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.zeros(1)
     unicycle = kinematics_of("unicycle", store, motion, None, DT, 2.7)
     there, after, turned = unicycle.moved(place, velocity, heading, np.array([[2.0, 1.0]]), None)
@@ -386,6 +387,6 @@ def test_a_guard_of_a_team_decides_for_the_driven_agent_alone(close):
 
 def test_whatever_is_relative_to_a_driven_agent_moves_with_it_and_what_no_name_explains_is_said():
     names = ("own.vx", "own.vy", "other0.dx", "other0.dy", "still_a.dx", "still_a.dy", "wall0.dx", "own.charge", "obs8")
-    found = Names({name: d for d, name in enumerate(names)}, {}, 2)
+    found = Names.of(names, (), 2)
     assert found.things == ["still_a", "wall0"]
     assert found.as_logged == ["own.charge", "obs8"]

@@ -83,6 +83,12 @@ class Own:
         first = RESETS[split] + batch * count * (part == "calibration")
         label = f"{part} in {type(envs[0]).__name__} behind {self.faults.name}, margin {guard.options.margin:.3g}"
         tables: list[Table] = []
+        watches: list[Foresight] = []
+
+        def watch() -> Foresight:
+            watches.append(Foresight(guard, resolved.job.task.homogeneous))
+            return watches[-1]
+
         key = jax.random.key(resolved.run.config["seed"] + batch)
         with Progress(label, count, 0, self.quiet) as bar:
             play_tables(
@@ -93,10 +99,9 @@ class Own:
                 self.cost,
                 key,
                 bar,
-                watch_of=lambda: Foresight(guard, resolved.job.task.homogeneous),
+                watch_of=watch,
             )
         episodes = [episode for table in tables for episode in table.episodes]
-        watches = [table.watch for table in tables if table.watch is not None]
         steps = sum(len(episode.rewards) for episode in episodes)
         infeasible = sum(float(table.counted("infeasible").sum()) for table in tables)
         violated = np.array([sum(float(np.max(cost)) for cost in episode.costs) > 0 for episode in episodes])

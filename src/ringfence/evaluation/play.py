@@ -13,13 +13,15 @@ import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
-from ringfence.evaluation import protocol, rollout
+from ringfence.evaluation import protocol, recordings, rollout
+from ringfence.evaluation.places import recording, watching
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
 from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.loading.controller import Controller
 from ringfence.problem.bounds import Bounds
+from ringfence.problem.names import Names
 from ringfence.proposals.base import with_cost
 from ringfence.training.runs import Run
 from ringfence.types import Array, Key
@@ -63,7 +65,8 @@ def play(
     that were finished before, and so is that of a Ctrl-C (`errors.Interrupted`). `planner` and `options` (guard,
     barrier, execution, world, ...) are as in `ringfence.load`. `faults` lie between policy and simulator, and
     `compensate` tells the guard of them, both as in `ringfence.stress`. `keep` adds the result to the run's
-    results.json, as `ringfence eval` does, for reports.
+    results.json, as `ringfence eval` does, for reports, and keeps a film of the first four episodes where names tell
+    where agents are (own.x and own.y, or agent0.x of the state).
 
     A step's reward is the mean over agents. Its cost is `cost(infos)` if that is given, else the largest of the
     agents' costs (in their infos, or the third of six results, as Safety-Gymnasium's `step` has them); costs in a
@@ -89,11 +92,12 @@ def play(
     envs = simulators_of(make_env, min(num_envs, episodes), player)
     begun = time.perf_counter()
     tables: list[Table] = []
+    watches, watch = watching(_names_of(player, envs[0]), len(envs)) if keep else ([], None)
     try:
         with Progress(f"{player.name} in {type(envs[0]).__name__}", episodes, 0, quiet) as bar:
             resets = range(rollout.RESETS[split], rollout.RESETS[split] + episodes)
             key = jax.random.key(seed)
-            play_tables(tables, player, envs, resets, cost, key, bar, max_episode_steps, early_ends)
+            play_tables(tables, player, envs, resets, cost, key, bar, max_episode_steps, early_ends, watch)
     except UserError as error:
         raise _with_finished(error, player, tables) from error
     except KeyboardInterrupt as stopped:
@@ -104,6 +108,8 @@ def play(
     if keep and isinstance(player, RunPlayer):
         of_file = {"split": split, "simulator": name_of(make_env, envs[0])}
         _add_to_run(player, summary | about | of_file)
+        film = recording(watches, [episode for table in tables for episode in table.episodes])
+        recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}
     return shown | about | {"cost_limit": player.task.cost_limit}
 
@@ -126,6 +132,13 @@ def _compensated(run: Run | str | Controller, faults: Faults, options: dict[str,
     if isinstance(run, Controller):
         raise UserError("compensate is of a run's guard; give delay, max_age and hold to ringfence.guard() itself.")
     return compensated(run, faults, options)
+
+
+def _names_of(player: Player, env: Any) -> Names:
+    """What names say of entries that the player reads."""
+    card = player.run.config["data"] if isinstance(player, RunPlayer) else {}
+    states = card.get("state_names") if player.shape.state else None
+    return Names.of(player.observation_names, states or (), len(env.possible_agents))
 
 
 def _add_to_run(player: RunPlayer, result: dict[str, Any]) -> None:
@@ -236,7 +249,7 @@ def play_tables(
     bar: Progress,
     max_episode_steps: int | None = None,
     early_ends: str = "refuse",
-    watch_of: Callable[[], Watch] | None = None,
+    watch_of: Callable[[], Watch | None] | None = None,
 ) -> None:
     """Episodes of these resets, as many side by side as there are simulators. A table is among `tables` as soon as it
     has begun, so that who interrupts it loses none of its episodes."""
@@ -258,8 +271,6 @@ class Watch(Protocol):
     def step(
         self, info: Mapping[str, Array], counts: np.ndarray, observations: np.ndarray, state: np.ndarray | None
     ) -> None: ...
-
-    def shortfall(self) -> np.ndarray: ...
 
 
 class Table:

@@ -1,4 +1,5 @@
-"""What the rollout player needs, packed: positions and plans in millimetres, as base64 of little-endian int16."""
+"""What the rollout player needs, packed: positions and plans in millimetres or coarser, as base64 of little-endian
+int16."""
 
 from __future__ import annotations
 
@@ -20,6 +21,7 @@ from ringfence.utils.files import regular, within
 EPISODES = 4  # per variant
 VARIANTS = 2  # per task
 LARGEST = 2**26  # bytes of a film
+MILLIMETRE = 1e-3
 NUMBERS = 20_000  # of an episode's plans; more plans than fit are left out, never the chosen one
 
 
@@ -105,47 +107,119 @@ def _film(run: Run, file: Path) -> bytes:
     return content
 
 
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """What a film shows of R episodes."""
+
+    places: np.ndarray  # (R, L+1, N, 2), nan after an episode's end
+    landmarks: np.ndarray  # (R, K, 2)
+    steps: list[int]  # of each episode
+    middle: np.ndarray  # (R, 1, 2) of what is shown
+    arena: float | None  # half of its width, where it has walls
+    radius: float | None  # of bodies, where it is known
+    plans: np.ndarray | None  # (R, L, P, H, N, 2)
+    speeds: dict[str, float]  # steps per second, by name
+    shows: str  # in words
+
+
 def player(section: Section[Row], recorded: Recorded) -> dict[str, Any] | None:
-    """One variant's episodes, or None where the states are not those of agents on a plane with landmarks."""
+    """One variant's episodes, or None where nobody can be shown on a plane."""
     config = recorded.run.config
-    arrays = recorded.arrays
-    n = config["spec"]["n_agents"]
-    states = arrays["states"][:EPISODES].astype(np.float64)
-    if states.shape[-1] != 6 * n or "radius" not in section.hazard:
+    moved = (_of_places if "places" in recorded.arrays else _of_states)(section, recorded)
+    if moved is None:
         return None
-    plans = tracks(arrays, config["spec"]["feature_names"], n, config["config"].get("history", 0))
-    env = registry.TASKS[section.task].env if section.task in registry.TASKS else None
-    arena = getattr(env, "half_width", 1.0)
+    contact = None if moved.radius is None else 2 * moved.radius
     return {
         "label": recorded.row.label,
         "seed": config["seed"],
-        "agents": n,
-        "steps": states.shape[1] - 1,
-        "arena": arena,
-        "radius": section.hazard["radius"] / 2,
-        "contact": section.hazard["radius"],
-        "total": int(plans.shape[2]) if plans is not None else 0,
-        "episodes": [_episode(arrays, states[e], plans, e, n, arena) for e in range(len(states))],
+        "agents": moved.places.shape[2],
+        "arena": moved.arena,
+        "radius": moved.radius,
+        "contact": contact,
+        "total": int(moved.plans.shape[2]) if moved.plans is not None else 0,
+        "speeds": moved.speeds,
+        "shows": moved.shows,
+        "episodes": [_episode(recorded.arrays, moved, e) for e in range(len(moved.places))],
     }
 
 
-def _episode(
-    arrays: recordings.Recording, states: np.ndarray, plans: np.ndarray | None, e: int, n: int, arena: float
-) -> dict[str, Any]:
-    """The e-th episode, of states (L+1, S)."""
-    positions = states[:, : 2 * n]
-    landmarks = states[0, 4 * n :]
-    reach = np.abs(np.concatenate([positions.ravel(), landmarks])).max()
+def _of_states(section: Section[Row], recorded: Recorded) -> Moved | None:
+    """States of agents on a plane with landmarks."""
+    config = recorded.run.config
+    n = config["spec"]["n_agents"]
+    states = recorded.arrays["states"][:EPISODES].astype(np.float64)
+    if states.shape[-1] != 6 * n or "radius" not in section.hazard:
+        return None
+    env = registry.TASKS[section.task].env if section.task in registry.TASKS else None
+    episodes, rows = states.shape[:2]
+    return Moved(
+        places=states[..., : 2 * n].reshape(episodes, rows, n, 2),
+        landmarks=states[:, 0, 4 * n :].reshape(episodes, n, 2),
+        steps=[rows - 1] * episodes,
+        middle=np.zeros((episodes, 1, 2)),
+        arena=getattr(env, "half_width", 1.0),
+        radius=section.hazard["radius"] / 2,
+        plans=tracks(recorded.arrays, config["spec"]["feature_names"], n, config["config"].get("history", 0)),
+        speeds={"slow": 1, "normal": 3, "real time": 10},
+        shows="Circles are agents at their true radius, crosses are landmarks, red is contact. Thick coloured "
+        "lines are the plan that is followed, faint ones the plans that were drawn and rejected.",
+    )
+
+
+def _of_places(section: Section[Row], recorded: Recorded) -> Moved:
+    """Where agents were in a simulator of somebody's own."""
+    arrays = recorded.arrays
+    places = arrays["places"][:EPISODES].astype(np.float64)
+    landmarks = arrays["resting"][:EPISODES].astype(np.float64)
+    begun = np.concatenate([places[:, 0], landmarks], 1)
+    dt = section.card.get("dt")
+    per_second = 10.0 if dt is None else 1 / dt
+    radius = section.hazard["radius"] / 2 if "radius" in section.hazard else None
+    charged = "agents that are charged a cost" if "agent_costs" in arrays else "who is too near"
+    return Moved(
+        places=places,
+        landmarks=landmarks,
+        steps=[int(n) for n in np.isfinite(arrays["rewards"][:EPISODES]).sum(1)],
+        middle=(begun.min(1, keepdims=True) + begun.max(1, keepdims=True)) / 2,
+        arena=None,
+        radius=radius,
+        plans=None,
+        speeds={"slow": per_second / 4, "normal" if dt is None else "real time": per_second, "fast": 4 * per_second},
+        shows="Agents where their observations put them, from above; crosses are goals and what else rests."
+        + (f" Red are {charged}." if radius is not None or "agent_costs" in arrays else ""),
+    )
+
+
+def _episode(arrays: recordings.Recording, moved: Moved, e: int) -> dict[str, Any]:
+    """The e-th episode."""
+    steps = moved.steps[e]
+    positions = _kept_on(moved.places[e]) - moved.middle[e]
+    landmarks = moved.landmarks[e] - moved.middle[e]
+    reach = float(np.abs(np.concatenate([positions.reshape(-1, 2), landmarks])).max())
+    shown = reach * 1.1 + 1e-3 if moved.arena is None else max(moved.arena, reach) + 0.2
+    unit = max(MILLIMETRE, float(f"{shown / 30_000:.1e}"))
     episode: dict[str, Any] = {
-        "reach": round(max(arena, float(reach)) + 0.2, 2),  # half the width of what is shown
-        "positions": pack(positions),
-        "landmarks": pack(landmarks),
-        "rewards": [round(float(x), 2) for x in arrays["rewards"][e]],
-        "costs": [round(float(x), 2) for x in arrays["costs"][e]],
+        "reach": float(f"{shown:.3g}") if moved.arena is None else round(shown, 2),  # half the width of what is shown
+        "unit": unit,
+        "steps": steps,
+        "positions": pack(positions, unit),
+        "landmarks": pack(landmarks, unit),
+        "rewards": [round(float(x), 2) for x in np.nan_to_num(arrays["rewards"][e, :steps])],
+        "costs": [round(float(x), 2) for x in np.nan_to_num(arrays["costs"][e, :steps])],
     }
-    if plans is not None:
-        episode |= few(plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
+    if moved.radius is None and "agent_costs" in arrays:
+        charged = arrays["agent_costs"][e, :steps] > 0
+        episode["charged"] = [[], *([int(i) for i in np.flatnonzero(one)] for one in charged)]
+    if moved.plans is not None:
+        episode |= few(moved.plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
     return episode
+
+
+def _kept_on(places: np.ndarray) -> np.ndarray:
+    """Places (L+1, N, 2) where who is not shown any more stays where he was; the first row is known."""
+    known = np.isfinite(places).all(-1)
+    last = np.maximum.accumulate(np.where(known, np.arange(len(places))[:, None], 0), 0)
+    return np.take_along_axis(places, last[..., None], 0)
 
 
 def tracks(arrays: recordings.Recording, names: list[str], n: int, history: int) -> np.ndarray | None:
@@ -178,12 +252,12 @@ def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict[str, Any]:
     return {"plans": pack(kept), "shape": [steps, keep, horizon, n]}
 
 
-def pack(metres: np.ndarray) -> str:
-    """Rounded to millimetres."""
-    whole = np.clip(np.nan_to_num(np.round(metres * 1000)), -32768, 32767).astype("<i2")
+def pack(metres: np.ndarray, unit: float = MILLIMETRE) -> str:
+    """Rounded to millimetres, or to another unit."""
+    whole = np.clip(np.nan_to_num(np.round(metres / unit)), -32768, 32767).astype("<i2")
     return base64.b64encode(whole.tobytes()).decode()
 
 
 def unpack(text: str) -> np.ndarray:
     """Inverse of `pack`, flat."""
-    return np.frombuffer(base64.b64decode(text), "<i2") / 1000
+    return np.frombuffer(base64.b64decode(text), "<i2") * MILLIMETRE

@@ -208,7 +208,7 @@ def _lonely_state(run: Run, n: int) -> np.ndarray | None:
     """A recorded state in which nobody but one other agent is near agent 0; None where none was kept."""
     for variant in run.results:
         recorded = recordings.read(run.path, variant)
-        if recorded is not None:
+        if recorded is not None and "states" in recorded:
             states = recorded["states"]
             return figures.lonely_state(states, n) if states.shape[-1] == 6 * n else None
     return None

@@ -1,6 +1,6 @@
 "use strict";
 (function () {
-  const millimetres = (text) => {
+  const whole = (text) => {
     const raw = atob(text), bytes = new Uint8Array(raw.length);
     for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
     return new Int16Array(bytes.buffer);
@@ -13,21 +13,23 @@
     const canvas = box.querySelector("canvas"), ink = canvas.getContext("2d");
     const play = box.querySelector(".play"), scrub = box.querySelector(".scrub"), status = box.querySelector(".status");
     const episode = box.querySelector(".episode"), speed = box.querySelector(".speed"), toggle = box.querySelector(".plans");
-    const n = recording.agents, steps = recording.steps;
+    const n = recording.agents;
     const read = recording.episodes.map((e) => ({
-      positions: millimetres(e.positions), landmarks: millimetres(e.landmarks),
-      plans: e.plans ? millimetres(e.plans) : null, shape: e.shape, reach: e.reach, rewards: e.rewards, costs: e.costs,
+      ...e, positions: whole(e.positions), landmarks: whole(e.landmarks), plans: e.plans ? whole(e.plans) : null,
     }));
+    const chosen = () => read[+episode.value];
     let now = 0, playing = false, last = 0;
 
     const at = (e, t, i) => {
-      const s = Math.min(Math.floor(t), steps), f = Math.min(s + 1, steps), w = t - s, k = 2 * i;
+      const s = Math.min(Math.floor(t), e.steps), f = Math.min(s + 1, e.steps), w = t - s, k = 2 * i;
       const a = 2 * n * s + k, b = 2 * n * f + k, p = e.positions;
-      return [(p[a] * (1 - w) + p[b] * w) / 1000, (p[a + 1] * (1 - w) + p[b + 1] * w) / 1000];
+      return [(p[a] * (1 - w) + p[b] * w) * e.unit, (p[a + 1] * (1 - w) + p[b + 1] * w) * e.unit];
     };
 
-    function touching(points) {
+    function touching(points, charged) {  // by distance where bodies have a radius, else by what each was charged
       const hit = new Array(n).fill(false);
+      for (const i of charged || []) hit[i] = true;
+      if (!recording.contact) return hit;
       for (let i = 0; i < n; i++) for (let j = i + 1; j < n; j++)
         if (Math.hypot(points[i][0] - points[j][0], points[i][1] - points[j][1]) < recording.contact) hit[i] = hit[j] = true;
       return hit;
@@ -36,7 +38,7 @@
     function draw() {
       const size = Math.max(1, Math.round(canvas.clientWidth * (window.devicePixelRatio || 1)));
       if (canvas.width !== size) canvas.width = canvas.height = size;
-      const e = read[+episode.value], scale = size / (2 * e.reach), unit = size / 560;
+      const e = chosen(), scale = size / (2 * e.reach), unit = size / 560;
       const X = (x) => size / 2 + x * scale, Y = (y) => size / 2 - y * scale;
       const dark = variable("--ink"), rule = variable("--rule"), danger = variable("--danger");
       const colours = [0, 1, 2, 3, 4, 5, 6].map((c) => variable("--c" + c));
@@ -44,11 +46,12 @@
       ink.lineJoin = ink.lineCap = "round";
       ink.strokeStyle = rule;
       ink.lineWidth = 1.2 * unit;
-      ink.strokeRect(X(-recording.arena), Y(recording.arena), 2 * recording.arena * scale, 2 * recording.arena * scale);
+      const half = recording.arena || e.reach;
+      ink.strokeRect(X(-half), Y(half), 2 * half * scale, 2 * half * scale);
       ink.strokeStyle = dark;
       ink.lineWidth = 2 * unit;
       for (let k = 0; k < e.landmarks.length; k += 2) {
-        const x = X(e.landmarks[k] / 1000), y = Y(e.landmarks[k + 1] / 1000), r = 6 * unit;
+        const x = X(e.landmarks[k] * e.unit), y = Y(e.landmarks[k + 1] * e.unit), r = 6 * unit;
         ink.beginPath();
         ink.moveTo(x - r, y - r); ink.lineTo(x + r, y + r); ink.moveTo(x - r, y + r); ink.lineTo(x + r, y - r);
         ink.stroke();
@@ -66,11 +69,13 @@
         ink.stroke();
         ink.setLineDash([]);
       }
-      const hit = touching(points);
+      const done = Math.floor(now + 1e-6);
+      const hit = touching(points, e.charged && e.charged[done]);
+      const bodySize = recording.radius ? recording.radius * scale : 8 * unit;
       for (let i = 0; i < n; i++) {  // bodies
         const colour = hit[i] ? danger : colours[i % 7];
         ink.beginPath();
-        ink.arc(X(points[i][0]), Y(points[i][1]), recording.radius * scale, 0, 2 * Math.PI);
+        ink.arc(X(points[i][0]), Y(points[i][1]), bodySize, 0, 2 * Math.PI);
         ink.globalAlpha = hit[i] ? 0.5 : 0.22;
         ink.fillStyle = colour;
         ink.fill();
@@ -80,7 +85,7 @@
         ink.stroke();
       }
       if (e.plans && toggle.checked) {
-        const step = Math.min(Math.floor(now), steps - 1), [, p, h, m] = e.shape;
+        const step = Math.min(Math.floor(now), e.steps - 1), [, p, h, m] = e.shape;
         for (let q = p - 1; q >= 0; q--) for (let i = 0; i < m; i++) {  // the chosen plan, the first, on top
           const followed = q === 0;
           ink.globalAlpha = followed ? 1 : 0.3;
@@ -88,14 +93,14 @@
           ink.strokeStyle = ink.fillStyle = colours[i % 7];
           ink.beginPath();
           for (let r = 0; r < h; r++) {
-            const k = 2 * (i + m * (r + h * (q + p * step))), x = X(e.plans[k] / 1000), y = Y(e.plans[k + 1] / 1000);
+            const k = 2 * (i + m * (r + h * (q + p * step))), x = X(e.plans[k] * 1e-3), y = Y(e.plans[k + 1] * 1e-3);
             r ? ink.lineTo(x, y) : ink.moveTo(x, y);
           }
           ink.stroke();
           if (followed) {
             const k = 2 * (i + m * (h - 1 + h * (q + p * step)));
             ink.beginPath();
-            ink.arc(X(e.plans[k] / 1000), Y(e.plans[k + 1] / 1000), 3.4 * unit, 0, 2 * Math.PI);
+            ink.arc(X(e.plans[k] * 1e-3), Y(e.plans[k + 1] * 1e-3), 3.4 * unit, 0, 2 * Math.PI);
             ink.fill();
           }
         }
@@ -106,13 +111,17 @@
       ink.textAlign = "center";
       ink.textBaseline = "middle";
       for (let i = 0; i < n; i++) ink.fillText(String(i), X(points[i][0]), Y(points[i][1]));
-      const done = Math.floor(now + 1e-6);
       let reward = 0, cost = 0;
       for (let s = 0; s < done; s++) { reward += e.rewards[s]; cost += e.costs[s]; }
       const latest = done ? `reward ${e.rewards[done - 1].toFixed(1)}, so far ${reward.toFixed(1)}` : "reward –";
-      status.textContent = `step ${done} of ${steps}  ·  ${latest}  ·  cost ${cost.toFixed(0)}  `;
-      if (hit.some(Boolean)) { const b = document.createElement("b"); b.textContent = "contact"; status.append(b); }
-      scrub.setAttribute("aria-valuetext", `step ${done} of ${steps}`);
+      status.textContent = `step ${done} of ${e.steps}  ·  ${latest}  ·  cost ${cost.toFixed(0)}  `;
+      const unsafe = recording.contact ? hit.some(Boolean) : done && e.costs[done - 1] > 0;
+      if (unsafe) {
+        const b = document.createElement("b");
+        b.textContent = recording.contact ? "contact" : "unsafe";
+        status.append(b);
+      }
+      scrub.setAttribute("aria-valuetext", `step ${done} of ${e.steps}`);
     }
 
     function show(on) {
@@ -123,6 +132,7 @@
 
     function tick(time) {
       if (!playing) return;
+      const steps = chosen().steps;
       now = Math.min(steps, now + Math.max(0, time - last) / 1000 * speed.value);
       last = time;
       scrub.value = now;
@@ -130,18 +140,18 @@
       if (now >= steps) show(false); else requestAnimationFrame(tick);
     }
 
-    play.addEventListener("click", () => { if (!playing && now >= steps) now = 0; show(!playing); });
+    play.addEventListener("click", () => { if (!playing && now >= chosen().steps) now = 0; show(!playing); });
     scrub.addEventListener("input", () => { show(false); now = +scrub.value; draw(); });
     scrub.addEventListener("keydown", (event) => {  // whole steps from the keyboard
       const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
       if (!way) return;
       event.preventDefault();
       show(false);
-      now = Math.min(steps, Math.max(0, way > 0 ? Math.floor(now + 1e-6) + 1 : Math.ceil(now - 1e-6) - 1));
+      now = Math.min(chosen().steps, Math.max(0, way > 0 ? Math.floor(now + 1e-6) + 1 : Math.ceil(now - 1e-6) - 1));
       scrub.value = now;
       draw();
     });
-    episode.addEventListener("change", () => { now = 0; scrub.value = 0; draw(); });
+    episode.addEventListener("change", () => { now = 0; scrub.max = chosen().steps; scrub.value = 0; draw(); });
     if (toggle) toggle.addEventListener("change", draw);
     redraws.push(draw);
     draw();

@@ -76,7 +76,7 @@ def film(run: Run, variant: str) -> Path:
 def recorded(run: Run, variant: str) -> recordings.Recording:
     """An evaluation's recording; `UserError` where it kept none."""
     kept = recordings.read(run.path, variant)
-    if kept is None:
+    if kept is None or "states" not in kept:
         raise UserError(f"'{run.path}' holds no recording of {variant}; evaluate it with --num-recorded 1 or more.")
     return kept
 

@@ -16,7 +16,7 @@ from ringfence.errors import LAST_SEED, UserError, known, whole_number
 from ringfence.evaluation.replay.drivers import DRIVERS
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film, ReplayResult, Row
-from ringfence.evaluation.replay.scene import NOBODY, Motion, Names, motion_of, windows_of
+from ringfence.evaluation.replay.scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
 from ringfence.evaluation.replay.stage import Driven, Stage
 from ringfence.evaluation.rollout import FORESEEN
 from ringfence.evaluation.stress import compensated
@@ -28,6 +28,7 @@ from ringfence.loading.resolve import resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.problem.names import Names
 from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.types import Policy
@@ -160,8 +161,8 @@ class Logs:
         """Logs that can be replayed, and are of the run's task; others are refused."""
         task = registry.from_store(store)
         store = task.logs(store)
-        names = Names.of(store)
-        names.check(store.card.task)
+        names = names_of(store)
+        require_replayable(names, store.card.task)
         if run is not None and run.config["task"] != store.card.task:
             raise UserError(
                 f"The run is of '{run.config['task']}', the logs are of '{store.card.task}'; replay its own."

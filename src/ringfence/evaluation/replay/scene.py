@@ -13,86 +13,26 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem.features import others
 from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
+from ringfence.problem.names import Names
 
 NOBODY = 1e6  # m: how far away is who is not there
 
 
-@dataclass(frozen=True, eq=False)
-class Names:
-    """Which entries of observations (O) and of the state (S) say what."""
+def names_of(store: EpisodeStore) -> Names:
+    """What names say of a store's entries; names that nobody gave are told from the logs."""
+    given = inferred_names(store.observations, store.entry_names, store.first_rows)
+    return Names.of(given, store.card.state_names or () if store.state is not None else (), store.n_agents)
 
-    observation: dict[str, int]
-    state: dict[str, int]
-    agents: int
 
-    @classmethod
-    def of(cls, store: EpisodeStore) -> Names:
-        names = inferred_names(store.observations, store.entry_names, store.first_rows)
-        states = store.card.state_names or () if store.state is not None else ()
-        return cls({n: d for d, n in enumerate(names)}, {n: d for d, n in enumerate(states)}, store.n_agents)
-
-    @cached_property
-    def axes(self) -> str:
-        """Along which agents move: a plane, or space where something is logged along z."""
-        along_z = [*self.observation, *self.state]
-        return "xyz" if any(re.fullmatch(r"own\.v?z|other0\.dz|agent0\.v?z", name) for name in along_z) else "xy"
-
-    def pair(self, pattern: str) -> list[int] | None:
-        """Entries of x and y (and z in space), where all are observed; `pattern` as own.v{}."""
-        found = [self.observation.get(pattern.format(axis)) for axis in self.axes]
-        return None if None in found else [d for d in found if d is not None]
-
-    def state_pair(self, pattern: str) -> list[int] | None:
-        found = [self.state.get(pattern.format(axis)) for axis in self.axes]
-        return None if None in found else [d for d in found if d is not None]
-
-    def pairs(self, pattern: str, count: int) -> list[list[int]] | None:
-        """The pairs of `count` things, e.g. other{}.d{{}}, where all are observed."""
-        found = [self.pair(pattern.format(j)) for j in range(count)]
-        return None if None in found else [pair for pair in found if pair is not None]
-
-    def state_pairs(self, pattern: str) -> list[list[int]] | None:
-        """The same of every agent in the state."""
-        found = [self.state_pair(pattern.format(j)) for j in range(self.agents)]
-        return None if None in found else [pair for pair in found if pair is not None]
-
-    @cached_property
-    def slots(self) -> int:
-        """How many others are observed relative to an agent."""
-        count = 0
-        while self.pair(f"other{count}.d{{}}") is not None:
-            count += 1
-        return count
-
-    @cached_property
-    def things(self) -> list[str]:
-        """What else is observed relative to an agent, e.g. goal and landmark0."""
-        found = [m[1] for name in self.observation if (m := re.fullmatch(r"(\w+)\.d[xyz]", name))]
-        return [name for name in dict.fromkeys(found) if not re.fullmatch(r"own|other\d+", name)]
-
-    @cached_property
-    def as_logged(self) -> list[str]:
-        """Entries of a driven agent that stay as they were logged: no name says how they follow from its motion."""
-        known = re.compile(r"own\.(v?[xyz]|v|speed|cos|sin|heading|yaw|theta)|other\d+\.(dv?[xyz]|seen)|\w+\.dv?[xyz]")
-        return [name for name in self.observation if not known.fullmatch(name)]
-
-    @cached_property
-    def placed(self) -> bool:
-        """Whether everybody's place is known."""
-        named = self.pair("own.{}") is not None and self.agents > 1
-        return named or (self.agents > 1 and self.state_pairs("agent{}.{{}}") is not None)
-
-    def check(self, task: str) -> None:
-        """Refuse logs that cannot be replayed."""
-        if not self.slots and self.agents < 2:
-            raise UserError(
-                f"'{task}' has one agent and observes no other, so nobody can be replayed; give logs of two."
-            )
-        if not self.slots and not self.placed:
-            raise UserError(
-                f"The logs of '{task}' hold no places: name entries other0.dx and other0.dy, or own.x and own.y, or "
-                "agent0.x and agent0.y of the state."
-            )
+def require_replayable(names: Names, task: str) -> None:
+    """Refuse logs that cannot be replayed."""
+    if not names.slots and names.agents < 2:
+        raise UserError(f"'{task}' has one agent and observes no other, so nobody can be replayed; give logs of two.")
+    if not names.slots and not names.placed:
+        raise UserError(
+            f"The logs of '{task}' hold no places: name entries other0.dx and other0.dy, or own.x and own.y, or "
+            "agent0.x and agent0.y of the state."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,12 +50,8 @@ def motion_of(store: EpisodeStore, names: Names) -> Motion:
     """The motion in all rows of a store."""
     x = np.asarray(store.observations, np.float64)
     n = store.n_agents
-    place = None
-    if own := names.pair("own.{}"):
-        place = x[..., own]
-    elif store.state is not None and (where := names.state_pairs("agent{}.{{}}")):
-        place = np.asarray(store.state, np.float64)[:, where]
-    elif goal := names.pair("goal.d{}"):
+    place = names.place(x, None if store.state is None else np.asarray(store.state, np.float64))
+    if place is None and (goal := names.pair("goal.d{}")):
         place = -x[..., goal]
     seen = np.ones((len(x), n, names.slots or n - 1), bool)
     if names.slots:
