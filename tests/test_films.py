@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import re
 
@@ -84,7 +85,10 @@ def test_a_report_shows_where_agents_were_in_a_simulator_of_ones_own(tmp_path):
     np.testing.assert_array_equal(kept["agent_costs"][0, 0] > 0, kept["places"][0, 1, :, 0] < FAR)
     assert kept["costs"].sum() == sum(result["per_episode"]["cost"][:4])
 
-    film = shown(build_report([run], tmp_path / "page.html").read_text())
+    page = build_report([run], tmp_path / "page.html").read_text()
+    again = html.unescape(page)
+    assert f"--env {__name__}:Field --episodes 6 --num-envs 3" in again and "--early-ends" not in again
+    film = shown(page)
     assert film["speeds"] == {"slow": 1.25, "real time": 5.0, "fast": 20.0} and film["radius"] is None
     for e, (episode, steps) in enumerate(zip(film["episodes"], lengths)):
         places = animation.unpack(episode["positions"]).reshape(8, 3, 2) * 1000 * episode["unit"]

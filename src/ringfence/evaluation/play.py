@@ -107,6 +107,7 @@ def play(
     about |= {"compensated": compensate} if faults.given else {}
     if keep and isinstance(player, RunPlayer):
         of_file = {"split": split, "simulator": name_of(make_env, envs[0])}
+        of_file |= {"num_envs": num_envs, "early_ends": early_ends}
         _add_to_run(player, summary | about | of_file)
         film = recording(watches, [episode for table in tables for episode in table.episodes])
         recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))

@@ -24,6 +24,7 @@ from ringfence.utils import schemas, stored
 from ringfence.utils.escape import shell
 
 LONGEST = 400  # letters of a fact; the file itself lies in the run folder
+USUAL_IN_A_SIMULATOR = {"num_envs": 16, "early_ends": "refuse"}  # of `ringfence play`
 
 
 # --- commands ---
@@ -124,8 +125,11 @@ def _playing(section: Section[Row]) -> list[str]:
 
 
 def _how(result: Result, run: Run) -> list[Any]:
-    """The options of `ringfence eval` that gave a result."""
+    """The options of `ringfence eval`, or `ringfence play`, that gave a result."""
     words: list[Any] = ["--episodes", result["episodes"]]
+    for name, usual in USUAL_IN_A_SIMULATOR.items():
+        if result.get(name, usual) != usual:
+            words += [f"--{name.replace('_', '-')}", result[name]]
     if result["split"] == "validation":
         words += ["--split", "validation"]
     if not of_last_step(result, run.config["config"]):
