@@ -415,6 +415,12 @@ def test_a_killed_runner_loses_no_finished_cell(tmp_path):
     assert first.status(g.out)["attempts"] == 1
 
 
+def test_workers_keep_to_cores_of_their_own_only_where_they_fill_the_machine():
+    assert local.slots_of([0, 1, 2, 3], 2, 2) == [[0, 1], [2, 3]]
+    assert local.slots_of([0, 1], 3, 1) == [[0], [1], []]
+    assert local.slots_of([0, 1], 1, 1) == [[]], "another grid beside it would keep to the same core"
+
+
 def test_one_runner_per_folder(tmp_path):
     g = make_grid("simple_spread", tmp_path / "out", only=["bc"], **QUICK)
     g.open()

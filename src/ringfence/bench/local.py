@@ -26,6 +26,14 @@ from ringfence.utils.progress import Progress
 DEATHS = 2  # of workers on one cell, after which it is left
 
 
+def slots_of(cores: list[int], workers: int, threads: int) -> list[list[int]]:
+    """The cores that each worker keeps to; none where they leave some, since two grids that were started beside each
+    other with a worker each would both keep to the first core."""
+    if workers * threads < len(cores):
+        return [[]] * workers
+    return [cores[i * threads : (i + 1) * threads] for i in range(workers)]
+
+
 def run_local(
     grid: Grid, *, workers: int | None = None, threads: int = 1, memory: float | None = None, quiet: bool = False
 ) -> dict[str, int]:
@@ -51,7 +59,7 @@ def run_local(
         total = sum(len(g) for g in groups)
         with Progress(f"{grid.suite}: cells", total, 0, quiet) as bar:
             pool = _Pool(grid, jobs, bar, threads, memory, lock)
-            slots = [cores[i * threads : (i + 1) * threads] for i in range(workers)]
+            slots = slots_of(cores, workers, threads)
             hands = [threading.Thread(target=pool.serve, args=(slot,), daemon=True) for slot in slots]
             for hand in hands:
                 hand.start()
