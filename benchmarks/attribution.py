@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from evidence import Difference, Row, difference, family, mean, of, tasks_of, variant
 from readme import put
 
+# Rows by guards of before. There are more seeds of them, and no guard changes what a proposal does alone.
+ALONE, GUARDED = "guards-before", "guards"
 # Proposals that the page shows: their words, and their row without a guard. `ringfence bench results
 # results/guards` prints all others, too.
 PROPOSALS: dict[str, Row] = {
@@ -45,7 +47,7 @@ class Question:
     paired: Row
     keys: tuple[str, ...] = ("return", "cost_safe_start")
     shown: bool = True  # on the page
-    suite: str = ""  # another one than that of the other questions
+    suite: str = ""  # another one than that of the other questions, e.g. of more seeds where nobody is guarded
 
 
 SHIELD, FULL = "+shield-learned", "+full-learned"
@@ -61,7 +63,9 @@ QUESTIONS = (
     Question("BC under `full`, not MPC from a zero proposal", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
     Question("ICBF under `full`, not BC", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
     Question("ICBF under a shield, not BC", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
-    Question("the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0")),
+    Question(
+        "the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0"), suite=ALONE
+    ),
     Question("the barrier in training, under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
     Question(
         "the printed losses, λ = 0.1, not MADIFF", ("icbf", "paper"), ("madiff", "default"), suite="simple_spread"
@@ -77,7 +81,7 @@ QUESTIONS = (
         ("bc-return", f"default{SHIELD}"),
         shown=False,
     ),
-    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default"), shown=False),
+    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default"), shown=False, suite=ALONE),
     Question(
         "four times MADIFF's updates, under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")
     ),
@@ -92,6 +96,7 @@ QUESTIONS = (
         ("madiff", "default"),
         ("madiff", "own"),
         shown=False,
+        suite=ALONE,
     ),
     Question(
         "centralized, not decentralized MADIFF, one plan for all, under a shield",
@@ -153,8 +158,8 @@ OF_ROBOTS = (
 
 
 def main() -> None:
-    put("docs/attribution.md", "crossed", crossed("guards"))
-    put("docs/attribution.md", "questions", questions("guards"))
+    put("docs/attribution.md", "crossed", crossed(GUARDED))
+    put("docs/attribution.md", "questions", questions(GUARDED))
     put("docs/attribution.md", "robots", robots("guards-mujoco"))
     put("docs/attribution.md", "robot-questions", counted("guards-mujoco"))
 
@@ -179,13 +184,18 @@ def crossed(suite: str) -> str:
             text += f" → {guarded:z.2f}" if guarded is not None else ""
             cells.append((text, seeds if row[1] != "reference" else 0))
         lines.append((words, cells))
-    usual = [Counter(cells[i][1] for _, cells in lines if cells[i][1]).most_common(1)[0][0] for i in range(len(names))]
+    usual = [_usual([cells[i][1] for _, cells in lines]) for i in range(len(names))]
     heads = [f"{name.partition('-')[2]} [{seeds}]" for name, seeds in zip(names, usual)]
     out = ["| proposal | " + " | ".join(heads) + " |", "|---" * (1 + len(names)) + "|"]
     for words, cells in lines:
         marked = [text + (f" [{n}]" if n and n != seeds else "") for (text, n), seeds in zip(cells, usual)]
         out.append("| " + " | ".join([words, *marked]) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])
+
+
+def _usual(counts: list[int]) -> int:
+    """The most common number of seeds."""
+    return Counter(n for n in counts if n).most_common(1)[0][0]
 
 
 # Robots' proposals under `adapt`, danger learned, and the one that only climbs: their words and rows. Cloning under
@@ -206,7 +216,7 @@ def robots(suite: str) -> str:
     out = ["| | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
     for words, row in ROBOTS.items():
         made = [cell(suite, task, row, ("return_mean", "cost_mean"), (0, 1)) for task in names]
-        usual = Counter(seeds for _, seeds in made if seeds).most_common(1)[0][0]
+        usual = _usual([seeds for _, seeds in made])
         cells = [text + (f" [{seeds}]" if seeds not in (0, usual) else "") for text, seeds in made]
         out.append(f"| {words} [{usual}] | " + " | ".join(cells) + " |")
     return "\n".join([*out, "", "[n]: of n seeds, but where a cell says another number."])

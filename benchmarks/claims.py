@@ -30,6 +30,7 @@ from ringfence.utils import stored
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
+ALONE = "results/guards-before/table.csv"  # more seeds, and nobody is guarded in what is read of it
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 MEDIUM_POOL = "results/pooled/simple_spread-medium-pooled.json"
 RANDOM_POOL = "results/pooled/simple_spread-random-pooled.json"
@@ -347,9 +348,9 @@ PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 
 PRIOR = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}+trust_radius2.0"), 9, 0)
 
 
-def within(bound: float) -> Callable[[list], bool]:
-    """No interval reaches farther than `bound` from 0: as good as the same."""
-    return lambda found: all(max(-d.low, d.high) <= bound for d in found)
+def below(bound: float) -> Callable[[list], bool]:
+    """No interval reaches above `bound`: hardly more, if at all."""
+    return lambda found: all(d.high <= bound for d in found)
 
 
 def chance(found: list) -> bool:
@@ -365,8 +366,8 @@ def higher(found: list) -> bool:
 
 
 def shielded_all() -> tuple[bool, str]:
-    """No proposal under the learned shield has more cost left than that on any tier, nor less return by more than 2 %
-    of the range."""
+    """No proposal under the learned shield has any cost left on any tier, nor less return by more than 2 % of the
+    range."""
     left, lost = [], []
     for (task, algorithm, variant), runs in evaluations("guards").items():
         alone = of("guards", task, (algorithm, variant.removesuffix(SHIELD)))
@@ -375,18 +376,16 @@ def shielded_all() -> tuple[bool, str]:
             both = set(runs) & set(alone)
             lost.append(np.mean([alone[s]["return_norm"] - runs[s]["return_norm"] for s in both]))
     text = f"{len(left)} proposals and tiers: at most {max(left):.3f} cost left, {max(lost):.3f} normalised return lost"
-    return max(left) <= 0.03 and max(lost) <= 0.02, text
+    return max(left) == 0 and max(lost) <= 0.02, text
 
 
 def same_safety() -> tuple[bool, str]:
     """Learned danger beside the formula, under cloning: Simple Spread's shield and the robots' adapting one."""
     share, left = [], []
-    for task in tasks_of("guards-defaults"):
-        learned, formula = (
-            mean("guards-defaults", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS
-        )
+    for task in tasks_of("guards"):
+        learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS)
         share.append(learned / formula)
-        left.append(mean("guards-defaults", task, ("bc", "default+shield-learned"), "cost_safe_start"))
+        left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
     kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in BARRIERS]
     ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
     return ok, (
@@ -611,17 +610,17 @@ def ranks_like(number: str, truth: str, least: float) -> Callable[[], tuple[bool
 
 CLAIMS = (
     Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
-    Claim("docs/tables.md", "learned danger does what the formula does", "guards-defaults, guards-mujoco", same_safety),
+    Claim("docs/tables.md", "learned danger does what the formula does", "guards, guards-mujoco", same_safety),
     Claim(
         "README.md",
-        "Climbing learned values from cloned actions earns as much as from its plans",
+        "Climbing learned values from cloned actions earns at least as much as from its plans",
         SPREAD,
-        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", within(15)),
+        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", below(20)),  # a twentieth of the range
     ),
     Claim(
         "docs/tables.md",
         "losses as printed (λ = 0.1) do not lower its cost",
-        SPREAD,
+        "results/simple_spread/table.csv",
         tested(("icbf", "paper"), ("madiff", "default"), "cost_safe_start", chance),
     ),
     Claim(
@@ -718,13 +717,13 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
-        "it earns more on three tiers and less on none",
+        "After 6000 it earns more on two and less on none",
         SPREAD,
         tested(
             ("madiff", f"long{SHIELD}"),
             ("bc-return", f"default{SHIELD}"),
             "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 3 and not any(d.holds and d.mean > 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 2 and not any(d.holds and d.mean > 0 for d in ds),
         ),
     ),
     Claim(
@@ -741,8 +740,19 @@ CLAIMS = (
     Claim(
         "docs/attribution.md",
         "The barrier in training lowers the cost of plans that are followed as they are",
-        SPREAD,
+        ALONE,
         tested(("icbf", "split"), ("icbf", "split-0"), "cost_safe_start", lower),
+    ),
+    Claim(
+        "docs/attribution.md",
+        "Under a shield it earns a little less on two tiers",
+        SPREAD,
+        tested(
+            ("icbf", f"split{SHIELD}"),
+            ("icbf", f"split-0{SHIELD}"),
+            "return",
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 2 and not any(d.holds and d.mean > 0 for d in ds),
+        ),
     ),
     Claim(
         "docs/attribution.md",

@@ -20,11 +20,11 @@ RESULTS = Path(__file__).resolve().parent.parent / "results"
 Column = tuple[str, Row]  # a suite, and a row of it
 # Columns: their heads, and where their rows are.
 SPREAD: dict[str, Column] = {
-    "BC": ("guards-defaults", ("bc", "default")),
-    "shield, analytic": ("guards-defaults", ("bc", "default+shield-analytic")),
-    "**shield**": ("guards-defaults", ("bc", "default+shield-learned")),
-    "**full**": ("guards-defaults", ("bc", "default+full-learned")),
-    "MPC from a zero proposal, full": ("guards-defaults", ("mpc", "default+full-learned")),
+    "BC": ("guards", ("bc", "default")),
+    "shield, analytic": ("guards", ("bc", "default+shield-analytic")),
+    "**shield**": ("guards", ("bc", "default+shield-learned")),
+    "**full**": ("guards", ("bc", "default+full-learned")),
+    "MPC from a zero proposal, full": ("guards", ("mpc", "default+full-learned")),
     "shield, decentralized": ("own-sight", ("bc", "default+shield-learned-decentralized")),
     "full, decentralized": ("own-sight", ("bc", "default+full-learned-decentralized")),
 }

@@ -204,24 +204,24 @@ SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         ("mujoco", "ma-td3bc-lag", ""),
         ("crossing-guards", "ma-td3bc-lag", "default"),
     ),
-    "our MADIFF, 6000 updates": (("guards", "madiff", "long"), ("mujoco", "madiff", ""), None),
+    "our MADIFF, 6000 updates": (("guards-before", "madiff", "long"), ("mujoco", "madiff", ""), None),
     "ICBF-Diffuser, losses as printed, 1500 (robots 6000)": (
         ("simple_spread", "icbf", "paper"),
         ("mujoco", "icbf", "mujoco-paper"),
         None,
     ),
     "BC + guard, *analytic*": (
-        ("guards-defaults", "bc", "default+shield-analytic"),
+        ("guards", "bc", "default+shield-analytic"),
         ("guards-mujoco", "bc", "+adapt-analytic"),
         None,
     ),
     "**BC + guard**": (
-        ("guards-defaults", "bc", "default+shield-learned"),
+        ("guards", "bc", "default+shield-learned"),
         ("guards-mujoco", "bc", "+adapt-learned"),
         ("crossing", "bc", "default+shield-learned"),
     ),
     "**BC + guard that also climbs values** (`full`)": (
-        ("guards-defaults", "bc", "default+full-learned"),
+        ("guards", "bc", "default+full-learned"),
         ("guards-mujoco", "bc", "+full-learned"),
         ("crossing-guards", "bc", "default+full-learned"),
     ),
@@ -230,7 +230,7 @@ SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
 
 def summary() -> str:
     """One line per method: all tiers, all robots and Crossing in a cell each."""
-    data = {s: grouped(s) for s in ("simple_spread", "guards", "guards-defaults", "crossing", "crossing-guards")}
+    data = {s: grouped(s) for s in ("simple_spread", "guards", "guards-before", "crossing", "crossing-guards")}
     robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
     logs = [data["simple_spread"][f"simple_spread-{t}", "behaviour data", "reference"][0] for t in TIERS]
     logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
