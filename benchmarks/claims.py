@@ -348,13 +348,12 @@ PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 
 PRIOR = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}+trust_radius2.0"), 9, 0)
 
 
-def below(bound: float) -> Callable[[list], bool]:
-    """No interval reaches above `bound`: hardly more, if at all."""
-    return lambda found: all(d.high <= bound for d in found)
-
-
 def chance(found: list) -> bool:
     return not any(d.holds for d in found)
+
+
+def no_gain(found: list) -> bool:
+    return not any(d.holds and d.mean > 0 for d in found)
 
 
 def lower(found: list) -> bool:
@@ -613,9 +612,9 @@ CLAIMS = (
     Claim("docs/tables.md", "learned danger does what the formula does", "guards, guards-mujoco", same_safety),
     Claim(
         "README.md",
-        "Climbing learned values from cloned actions earns at least as much as from its plans",
+        "Climbing learned values from its plans earns no more, beyond chance, than from cloned actions",
         SPREAD,
-        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", below(20)),  # a twentieth of the range
+        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", no_gain),
     ),
     Claim(
         "docs/tables.md",

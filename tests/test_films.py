@@ -14,6 +14,7 @@ from pettingzoo import ParallelEnv
 from ringfence import collect, play
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
+from ringfence.problem import constraints
 from ringfence.problem.names import Names
 from ringfence.report import animation, build_report
 from ringfence.report.video import recorded
@@ -110,6 +111,40 @@ def test_an_end_that_is_not_shown_is_left_where_it_was_seen_last(tmp_path):
     (episode,) = shown(build_report([run], tmp_path / "page.html").read_text())["episodes"]
     places = animation.unpack(episode["positions"]).reshape(-1, 6)
     np.testing.assert_array_equal(places[-1], places[-2])
+
+
+def test_red_is_what_the_page_says_it_is(tmp_path):
+    run = trained(tmp_path, NAMES)
+    play(run, Field, episodes=1, keep=True)
+    config = json.loads((run.path / "config.json").read_text())
+    for hazard, red, radius in (
+        (constraints.CostColumn(), "charged a cost", None),
+        (constraints.Separation(3.0), "nearer than is allowed", 1.5),
+    ):
+        (run.path / "config.json").write_text(json.dumps(config | {"hazard": constraints.to_dict(hazard)}))
+        film = shown(build_report([run], tmp_path / "page.html").read_text())
+        assert red in film["shows"] and film["radius"] == radius
+        assert ("charged" in film["episodes"][0]) == (radius is None)
+
+
+@pytest.mark.parametrize(
+    "name, instead, said",
+    [
+        ("places", np.zeros((1, 3, 2, 3)), "not pairs of numbers"),
+        ("places", np.full((1, 3, 2, 2), np.nan), "nobody knows where"),
+        ("places", np.zeros((1, 2, 2, 2)), "'places' begins with"),
+        ("agent_costs", np.zeros((1, 2, 5)), "another number of agents"),
+        ("resting", np.zeros((2, 1, 2)), "'resting' begins with"),
+    ],
+)
+def test_damaged_places_are_refused(tmp_path, name, instead, said):
+    good = {"places": np.zeros((1, 3, 2, 2)), "resting": np.zeros((1, 1, 2)), "agent_costs": np.zeros((1, 2, 2))}
+    good |= {"costs": np.zeros((1, 2)), "rewards": np.zeros((1, 2))}
+    recordings.write(tmp_path, "good", good, 1)
+    assert recordings.read(tmp_path, "good") is not None
+    np.savez_compressed(tmp_path / "rollout-bad.npz", **(good | {name: instead}))
+    with pytest.raises(UserError, match=said):
+        recordings.read(tmp_path, "bad")
 
 
 def test_nothing_is_filmed_where_no_name_says_where_agents_are(tmp_path):

@@ -175,7 +175,8 @@ def _of_places(section: Section[Row], recorded: Recorded) -> Moved:
     dt = section.card.get("dt")
     per_second = 10.0 if dt is None else 1 / dt
     radius = section.hazard["radius"] / 2 if "radius" in section.hazard else None
-    charged = "agents that are charged a cost" if "agent_costs" in arrays else "who is too near"
+    red = "agents that are charged a cost" if "agent_costs" in arrays else ""
+    red = red if radius is None else "agents nearer than is allowed"  # as the player marks them
     return Moved(
         places=places,
         landmarks=landmarks,
@@ -186,7 +187,7 @@ def _of_places(section: Section[Row], recorded: Recorded) -> Moved:
         plans=None,
         speeds={"slow": per_second / 4, "normal" if dt is None else "real time": per_second, "fast": 4 * per_second},
         shows="Agents where their observations put them, from above; crosses are goals and what else rests."
-        + (f" Red are {charged}." if radius is not None or "agent_costs" in arrays else ""),
+        + (f" Red are {red}." if red else ""),
     )
 
 
