@@ -487,7 +487,7 @@ def test_own_data_without_a_simulator(own_store, tmp_path):
     (run.path / "config.json").write_text(json.dumps(told))
     pilot = Controller(run, sampling_steps=2)
     assert pilot.act(store.observations[0]).shape == (3, 2)
-    with pytest.raises(UserError, match="has 3 entries, this run reads entry"):
+    with pytest.raises(UserError, match="This run reads entry .* of observations with 3"):
         pilot.act(store.observations[0][:, :3])
     loop.train("icbf", store, out=tmp_path, **how)  # is still that run
 

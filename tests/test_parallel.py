@@ -24,9 +24,12 @@ from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate
 from ringfence.loading import resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.training import loop
+from ringfence.logs.collect import collect
+from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 from ringfence.utils.progress import Progress
+from ringfence.world import save
+from tests.quick import QUICK_WORLD
 
 TINY = {"num_updates": 2, "batch": 16, "width": 16, "depth": 1}
 
@@ -368,6 +371,29 @@ def test_anybodys_function_under_guard_is_played(small_world):
         play(still, SimpleSpreadParallel, episodes=2, keep=True)
     with pytest.raises(UserError, match="rows was said to ringfence.guard"):
         play(still, SimpleSpreadParallel, episodes=2, rows=3)
+
+
+def test_a_world_that_reads_observations_and_the_state(tmp_path):
+    """Logs whose state tells what no observation does: their World is kept, and guards who was trained and anybody."""
+    rng = np.random.default_rng(0)
+    store = collect(SimpleSpreadParallel, lambda seen, state: rng.uniform(-1, 1, (3, 2)), episodes=40, quiet=True)
+    world = worlds.fit(store, **QUICK_WORLD)
+    assert world.map.reads == ("observations", "state") and world.map.width > max(world.widths)
+    save(world, tmp_path / "kept.world")
+    kept = worlds.load(tmp_path / "kept.world")
+    run = loop.train("bc", store, out=tmp_path, changes=TINY, quiet=True)[0]
+    cheap = {"horizon": 1, "correction_steps": 1, "correction_restarts": 0}
+    assert play(run, SimpleSpreadParallel, episodes=2, guard="shield", world=kept, **cheap)["episodes"] == 2
+    still = guard(lambda seen, state: np.zeros((3, 2)), kept, **cheap)
+    assert play(still, SimpleSpreadParallel, episodes=2)["episodes"] == 2
+    seen, state = store.observations[0], store.state[0]
+    for given, said in (
+        ((seen[:, :17], state), "observations has shape .3, 17."),
+        ((seen, None), "reads the global state .18 entries., and there is none"),
+        ((seen, state[:5]), "state has shape .5,."),
+    ):
+        with pytest.raises(UserError, match=said):
+            still.act(*given)
 
 
 def _at_rest() -> float:

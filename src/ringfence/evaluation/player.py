@@ -150,9 +150,9 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
 def _shape_of(world: World, agents: int) -> Shape:
     """What a simulator must show to a World."""
     width, state_width = world.widths
-    if world.map.reads_state:
-        return Shape(agents, None, state_width, world.spec.homogeneous, world.origins)
-    return Shape(agents, width, 0, world.spec.homogeneous, world.origins)
+    observation = width if "observations" in world.map.reads else None
+    state = state_width if world.map.reads_state else 0
+    return Shape(agents, observation, state, world.spec.homogeneous, world.origins)
 
 
 class _OneByOne:

@@ -74,10 +74,9 @@ class Callback:
         """What one environment shows, (N, O) and (S,) or None: copies, of the widths that the World was fitted to."""
         world = self.guarded.guard.world
         width, state_width = world.widths
-        needed = int(world.map.plus.max()) + 1
         reads_state = world.map.reads_state
         remedy = "pass what its logs hold"
-        shape = (self.agents, None if reads_state else width)
+        shape = (self.agents, width if "observations" in world.map.reads else None)
         origins = world.origins
         shown = given_as("observations", observations, shape, "this World", remedy, origins.observations)
         if reads_state and state is None:
@@ -86,10 +85,9 @@ class Callback:
         if state is not None:
             shape = (state_width if reads_state else None,)
             whole = given_as("state", state, shape, "this World", remedy, origins.state)
-        there = len(whole) if reads_state and whole is not None else shown.shape[-1]
-        if there < needed:
-            name = "state" if reads_state else "observations"
-            raise UserError(f"{name} has {there} entries, this World reads {needed}; {remedy}.")
+        beyond = world.map.beyond(shown.shape[-1], None if whole is None else len(whole))
+        if beyond is not None:
+            raise UserError(f"This World reads {beyond}; {remedy}.")
         return shown, whole
 
     def _wanted(self, wanted: Any, batch: int) -> np.ndarray:

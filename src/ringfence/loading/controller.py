@@ -275,7 +275,7 @@ class _TrainedRun:
                 "This run's data has no global state, but act() was given one; pass the observations alone."
             )
         view = self.job.feature_map
-        if state is None and view.source == "state":
+        if state is None and view.reads_state:
             raise UserError(
                 f"act() got no state, but this run's view '{view.view}' reads it; pass the global state"
                 + (f" ({state_width} entries)." if state_width else ".")
@@ -293,18 +293,9 @@ class _TrainedRun:
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
         """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
-        view = self.job.feature_map
-        last = int(self.job.feature_map.plus.max())
-        name = "observations"
-        there = seen.shape[-1]
-        if view.source == "state":
-            name = "state"
-            there = last + 1 if state is None else len(state)
-        elif state is not None:
-            name = "observations and state"
-            there = there + len(state)
-        if last >= there:
-            raise UserError(f"{name} has {there} entries, this run reads entry {last}; pass what its data holds.")
+        beyond = self.job.feature_map.beyond(seen.shape[-1], None if state is None else len(state))
+        if beyond is not None:
+            raise UserError(f"This run reads {beyond}; pass what its data holds.")
 
 
 class _Function:

@@ -196,9 +196,10 @@ def load_job(run: Run, agents: int | None = None) -> Job:
 
 def _check_width(job: Job, map: features.FeatureMap, who: str) -> None:
     """Refuse a view that reads beyond the end of what there is: JAX would read the last entry in its place."""
-    name, width = ("state", job.widths[1]) if map.reads_state else ("observations", job.widths[0])
-    if width is not None and map.width > width > 0:
-        raise UserError(f"{who} reads entry {map.width - 1} of {name} with {width}; it is of other data.")
+    observation, state = job.widths
+    beyond = map.beyond(observation, state or None)  # 0 where nobody reads it
+    if beyond is not None:
+        raise UserError(f"{who} reads {beyond}; it is of other data.")
 
 
 def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:

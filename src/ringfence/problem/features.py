@@ -75,13 +75,27 @@ class FeatureMap:
         return (*tables, *rest)
 
     @property
+    def reads(self) -> tuple[Source, ...]:
+        """What its entries are of, in the order in which they are counted."""
+        return (self.source,)
+
+    @property
     def reads_state(self) -> bool:
-        return self.source == "state"
+        return "state" in self.reads
 
     @property
     def width(self) -> int:
-        """Entries that its source must have at least."""
+        """Entries that what it reads must have at least."""
         return int(max(self.plus.max(initial=-1), self.minus.max(initial=-1))) + 1
+
+    def beyond(self, observation: int | None, state: int | None) -> str | None:
+        """In words, the last entry it reads, where an observation and the state of these widths have no such entry.
+        None where they have it, or a width is not known."""
+        known = {"observations": observation, "state": state}
+        there = sum(known[source] or 0 for source in self.reads)
+        if any(known[source] is None for source in self.reads) or self.width <= there:
+            return None
+        return f"entry {self.width - 1} of {' and '.join(self.reads)} with {there}"
 
     def __call__(self, observations: X | None, state: X | None) -> X:
         """observations (..., N, O) and state (..., S) in, features (..., N, D) out; NumPy in gives NumPy out. Only the
@@ -546,8 +560,8 @@ class _Joint(FeatureMap):
     """Features read from each agent's observation with the global state appended to it."""
 
     @property
-    def reads_state(self) -> bool:
-        return True
+    def reads(self) -> tuple[Source, ...]:
+        return ("observations", "state")
 
     def __call__(self, observations: X | None, state: X | None) -> X:
         if state is None:

@@ -13,6 +13,7 @@ import numpy as np
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
+from ringfence.evaluation.places import LONGEST
 from ringfence.report.pooling import Result
 from ringfence.report.table import Row, Section
 from ringfence.training.runs import Run
@@ -177,17 +178,19 @@ def _of_places(section: Section[Row], recorded: Recorded) -> Moved:
     radius = section.hazard["radius"] / 2 if "radius" in section.hazard else None
     red = "agents that are charged a cost" if "agent_costs" in arrays else ""
     red = red if radius is None else "agents nearer than is allowed"  # as the player marks them
+    steps = [int(n) for n in np.isfinite(arrays["rewards"][:EPISODES]).sum(1)]
     return Moved(
         places=places,
         landmarks=landmarks,
-        steps=[int(n) for n in np.isfinite(arrays["rewards"][:EPISODES]).sum(1)],
+        steps=steps,
         middle=(begun.min(1, keepdims=True) + begun.max(1, keepdims=True)) / 2,
         arena=None,
         radius=radius,
         plans=None,
         speeds={"slow": per_second / 4, "normal" if dt is None else "real time": per_second, "fast": 4 * per_second},
         shows="Agents where their observations put them, from above; crosses are goals and what else rests."
-        + (f" Red are {red}." if red else ""),
+        + (f" Red are {red}." if red else "")
+        + (f" An episode's first {LONGEST} steps are kept." if max(steps) >= LONGEST else ""),
     )
 
 

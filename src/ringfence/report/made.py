@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -12,6 +13,7 @@ from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown, whole_number
+from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import of_last_step
 from ringfence.guards import GUARDS, GuardOptions, options_of
 from ringfence.logs.provenance import regenerated
@@ -24,7 +26,7 @@ from ringfence.utils import schemas, stored
 from ringfence.utils.escape import shell
 
 LONGEST = 400  # letters of a fact; the file itself lies in the run folder
-USUAL_IN_A_SIMULATOR = {"num_envs": 16, "early_ends": "refuse"}  # of `ringfence play`
+IN_A_SIMULATOR = ("num_envs", "early_ends")  # options of `ringfence play` that results name
 
 
 # --- commands ---
@@ -127,7 +129,8 @@ def _playing(section: Section[Row]) -> list[str]:
 def _how(result: Result, run: Run) -> list[Any]:
     """The options of `ringfence eval`, or `ringfence play`, that gave a result."""
     words: list[Any] = ["--episodes", result["episodes"]]
-    for name, usual in USUAL_IN_A_SIMULATOR.items():
+    for name in IN_A_SIMULATOR:
+        usual = inspect.signature(play).parameters[name].default
         if result.get(name, usual) != usual:
             words += [f"--{name.replace('_', '-')}", result[name]]
     if result["split"] == "validation":

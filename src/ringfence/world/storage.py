@@ -120,16 +120,10 @@ def _read(path: Path, map_of: MapOf) -> World:
     if map.names != spec.feature_names:
         raise UserError(f"'{path}' is a World of another view; fit it again.")
     names = (card.data.constraints or ()) if settings.labels == "costs" else ()
-    if not map.source == "state" and card.data.observation_width is not None:
-        _check_width(path, map, card.data.observation_width)
-    if map.source == "state" and card.data.state_width is not None:
-        _check_width(path, map, card.data.state_width)
+    beyond = map.beyond(card.data.observation_width, card.data.state_width)
+    if beyond is not None:
+        raise UserError(f"'{path}' reads {beyond} in its logs; fit it again.")
     if map.plus.shape[0] != spec.n_agents:
         raise UserError(f"'{path}' is of {spec.n_agents} agents and sees {map.plus.shape[0]}; fit it again.")
     arrays = stored.world_arrays(raw)
     return as_tree(arrays, blank_world(map, spec, settings, names, card), path)
-
-
-def _check_width(path: Path, map: features.FeatureMap, width: int) -> None:
-    if map.width > width:
-        raise UserError(f"'{path}' reads entry {map.width - 1} of {width} in its logs; fit it again.")
