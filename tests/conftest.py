@@ -46,11 +46,15 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.world import validate
 
-# A card asks of a hundred entries into danger, from nine times before each, whether actions could have avoided them:
-# more than half of what a small World's fit takes. Tests ask of fewer.
+# What judges a World, and not what it is made of, takes a third of a small fit: whether actions could have avoided
+# danger, and what a guard's search would call safe. Worlds of tests are judged where `@pytest.mark.judged` says so,
+# of fewer entries and by a search that never begins again.
 validate.ENTERED = 20
-# Nor do they let the search that judges a World begin again: compiling that takes as long as the rest of a small fit.
 searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
+JUDGES = {"false_safe": searched, "_avoidable": validate}
+JUDGED = {name: getattr(module, name) for name, module in JUDGES.items()}
+for name, module in JUDGES.items():
+    setattr(module, name, lambda *_: None)
 
 # Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(50_000, 20, 20)
@@ -138,5 +142,8 @@ def small_world(small_store):
 def insist(request, monkeypatch):
     """Worlds of tests are fitted in a second and unfit to guard by, so guards insist on them; but where a test is of
     verdicts (`@pytest.mark.verdicts`)."""
+    if request.node.get_closest_marker("judged") is not None:
+        for name, module in JUDGES.items():
+            monkeypatch.setattr(module, name, JUDGED[name])
     if request.node.get_closest_marker("verdicts") is None:
         monkeypatch.setattr("ringfence.guards.policy.require", lambda card, anyway=False: None)

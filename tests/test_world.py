@@ -95,6 +95,7 @@ class Head(eqx.Module):
         return after[..., 0]
 
 
+@pytest.mark.judged
 def test_the_card_says_how_far_ahead_danger_is_decided():
     """Cars that close in at 1 m/s stop in half a metre: from five steps before it is too late, from seven it is not."""
     gap = 1.93 - 0.1 * np.arange(21)
