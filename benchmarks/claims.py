@@ -452,13 +452,14 @@ def rows_of(file: str, **where: str) -> list[dict[str, str]]:
     return [r for r in rows if all(r[k] == v for k, v in where.items())]
 
 
-def one_barrier_keeps() -> tuple[bool, str]:
+def one_keeps_both() -> tuple[bool, str]:
     """No contact and no step too fast by one barrier for both or by one each, whose return lies below the first's."""
     none, one, each = (rows_of("constraints.csv", guard=g, barriers=b)[0] for g, b in TWO)
     contact = [float(r["contact"]) for r in (none, one, each)]
     kept = contact[0] > 0 and all(float(r[key]) == 0 for r in (one, each) for key in ("contact", "fast"))
     lost = float(one["return"]) - float(each["return"])
-    text = " / ".join(f"{100 * c:.1f} %" for c in contact) + f" without a guard, with one, with each; {lost:.2f} of return"
+    shares = " / ".join(f"{100 * c:.1f} %" for c in contact)
+    text = f"{shares} without a guard, with one, with each; {lost:.2f} of return"
     return kept and float(each["return_high"]) < float(one["return_low"]), text
 
 
@@ -671,7 +672,7 @@ CLAIMS = (
     Claim("docs/ablations.md", "a guess of what others do is worth 10 %", "results/ablations.csv", guess_is_worth),
     Claim("docs/frontiers.md", "safety costs next to nothing", "results/frontiers.csv", guards_price),
     Claim("docs/frontiers.md", "keeps 9 of 10 limits on Simple Spread", "results/frontiers.csv", limits_learned),
-    Claim("docs/guard-results.md", "One barrier for both keeps both limits", "results/constraints.csv", one_barrier_keeps),
+    Claim("docs/guard-results.md", "One barrier for both keeps both limits", "results/constraints.csv", one_keeps_both),
     Claim("docs/guard-results.md", "and not for who never brakes", "results/yard.csv", brakes_in_time),
     Claim(
         "docs/guard-results.md", "it knows what is dangerous, not what will be", "results/yard.csv", learned_sees_more
