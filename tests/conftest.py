@@ -44,17 +44,18 @@ from ringfence.envs import SimpleSpread
 from ringfence.guards import searched
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.world import validate
+from ringfence.world import margins, validate
 
 # What judges a World, and not what it is made of, takes a third of a small fit: whether actions could have avoided
-# danger, and what a guard's search would call safe. Worlds of tests are judged where `@pytest.mark.judged` says so,
-# of fewer entries and by a search that never begins again.
+# danger, what a guard's search would call safe, what rows far ahead ask for. Worlds of tests are judged where
+# `@pytest.mark.judged` says so, of fewer entries and by a search that never begins again.
 validate.ENTERED = 20
 searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
-JUDGES = {"false_safe": searched, "_avoidable": validate}
-JUDGED = {name: getattr(module, name) for name, module in JUDGES.items()}
-for name, module in JUDGES.items():
-    setattr(module, name, lambda *_: None)
+JUDGES = {(searched, "false_safe"): lambda *_: None, (validate, "_avoidable"): lambda *_: None}
+JUDGES |= {(margins, "AHEAD"): margins.AHEAD[:1]}
+JUDGED = {place: getattr(*place) for place in JUDGES}
+for place, quick in JUDGES.items():
+    setattr(*place, quick)
 
 # Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(50_000, 20, 20)
@@ -143,7 +144,7 @@ def insist(request, monkeypatch):
     """Worlds of tests are fitted in a second and unfit to guard by, so guards insist on them; but where a test is of
     verdicts (`@pytest.mark.verdicts`)."""
     if request.node.get_closest_marker("judged") is not None:
-        for name, module in JUDGES.items():
-            monkeypatch.setattr(module, name, JUDGED[name])
+        for place, whole in JUDGED.items():
+            monkeypatch.setattr(*place, whole)
     if request.node.get_closest_marker("verdicts") is None:
         monkeypatch.setattr("ringfence.guards.policy.require", lambda card, anyway=False: None)

@@ -149,10 +149,12 @@ def fit_dynamics(
     next. The loss is Huber's, in standard deviations of the step: it keeps the kicks of contacts, which dwarf
     everything else, from owning the model."""
     key_nets, key_states, key_fit = jax.random.split(key, 3)
-    some = row[jax.random.randint(key_states, (min(STATES, 4 * len(row)),), 0, len(row))]
+    drawn = jax.random.randint(key_states, (min(STATES, 4 * len(row)),), 0, len(row))
+    some = np.asarray(row)[np.asarray(drawn)]
     shown = slice(0, 1) if map.joint else slice(None)
-    before = np.asarray(features[some, shown], np.float64).reshape(-1, features.shape[-1])
-    after = np.asarray(features[some + 1, shown], np.float64).reshape(before.shape)
+    states = np.asarray(features)[:, shown]
+    before = states[some].reshape(-1, states.shape[-1]).astype(np.float64)
+    after = states[some + 1].reshape(before.shape).astype(np.float64)
     model = _standardised(blank_dynamics(map, actions.shape[-1], num_ensemble, width), before, after)
     nets = _networks(key_nets, map, actions.shape[-1], num_ensemble, width)
     whose = others(map.plus.shape[0])

@@ -247,13 +247,12 @@ def _dynamics(
 ) -> dynamics.Dynamics:
     """Of these steps."""
     settings = parts.settings
-    arrays = logged.arrays
 
     def fit(key: Key) -> dynamics.Dynamics:
         return dynamics.fit_dynamics(
-            arrays["features"],
-            arrays["actions"][steps],
-            arrays["row"][steps],
+            logged.arrays["features"],
+            jnp.asarray(logged.picked("actions", steps)),
+            jnp.asarray(logged.picked("row", steps)),
             blank.map,
             key,
             num_ensemble=settings.num_ensemble,
@@ -466,9 +465,10 @@ def _label(
 
 def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier:
     """The barrier with mean and deviation of states and of steps, from some of the fitted ones."""
-    rows = logged.arrays["row"][logged.fitted_steps]
-    some = rows[jax.random.randint(key, (min(STATES, 4 * len(rows)),), 0, len(rows))]
-    before, after = (np.asarray(logged.arrays["features"][row], np.float64) for row in (some, some + 1))
+    steps = logged.fitted_steps
+    drawn = jax.random.randint(key, (min(STATES, 4 * len(steps)),), 0, len(steps))
+    some = steps[np.asarray(drawn)]
+    before, after = (x.astype(np.float64) for x in (logged.before(some), logged.after(some)))
     width = before.shape[-1]
     moved = (after - before).reshape(-1, width)
     flat = after.reshape(-1, width)

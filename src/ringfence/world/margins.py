@@ -167,23 +167,29 @@ def in_own_margins(
     """The scores of causes, each in units of the margin that its own entries into danger ask for, so that a margin of
     one is as safe as the same of another: of a distance it is a length."""
     bad, fine = _ends_and_safe(logged, WINDOWS, rng)
-    features = logged.arrays["features"]
-    row = np.asarray(logged.arrays["row"])
-    by_each = np.stack([np.asarray(lowest(worst([net], features[row[bad] + 1]))) for net in nets], -1)
+    ended = logged.after(bad)
+    stayed = logged.after(fine)
+    by_each = np.stack([np.asarray(_least(net, ended)) for net in nets], -1)
     blamed = by_each.argmin(-1)
     found = []
     for k, net in enumerate(nets):
         explained = by_each[:, k] < least_margin(net)  # no margin foresees the rest
         ends = bad[(blamed == k) & explained]
-        found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, features[row[fine] + 1]))
+        found.append(net if not len(ends) else _in_own_margin(net, dynamics, logged, ends, stayed))
     return tuple(found)
 
 
-def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: Array) -> Score:
-    of_ends = [lowest(worst([net], after)) for _, after in predicted_ends(dynamics, logged, ends)]
+@jax.jit
+def _least(net: Score, x: Array) -> Array:
+    """(W,) the score of the agent in most danger by one cause."""
+    return lowest(worst([net], x))
+
+
+def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: np.ndarray) -> Score:
+    of_ends = [_least(net, after) for _, after in predicted_ends(dynamics, logged, ends)]
     predicted = np.concatenate([np.asarray(part) for part in of_ends])
     missed = max(MISSED, OUTLIERS / len(predicted))
-    of_safe = np.asarray(lowest(worst([net], safe)))
+    of_safe = np.asarray(_least(net, safe))
     bearable = float(np.quantile(of_safe, 1 - BEARABLE))  # what cannot be foreseen is not bought by any margin
     margin = min(conformal(predicted, 1 - missed), bearable)
     return with_margin(net, max(margin, least_margin(net)))

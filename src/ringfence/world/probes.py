@@ -114,22 +114,25 @@ def _axis(low: float, high: float) -> np.ndarray:
     return np.linspace(low - reach, high + reach, SIDE)
 
 
-def _own_speed(barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], unit: float) -> list[Probe]:
+def _own_speed(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequence[str], unit: float) -> list[Probe]:
     """Median scores of the first agent along its own speed, where names tell it; all else stays as it was."""
     entries = next((found for found in OWN_SPEED if set(found) <= set(names)), None)
     if entries is None:
         return []
     index = np.array([list(names).index(name) for name in entries])
-    velocity = np.asarray(states[:, 0, index])
+    velocity = states[:, 0, index]
     speed = np.maximum(np.sqrt((velocity**2).sum(-1, keepdims=True)), 1e-6)
     at = np.linspace(0.0, 1.25 * np.quantile(speed, 0.999), POINTS)
-    put = [states.at[:, 0, index].set(value * velocity / speed) for value in at]
-    scores = [np.median(np.asarray(_scores_of_all(barrier, states, x))[:, 0]) for x in put]
+    scores = []
+    for value in at:
+        put = states.copy()
+        put[:, 0, index] = value * velocity / speed
+        scores.append(np.median(np.asarray(_scores_of_all(barrier, states, put))[:, 0]))
     name = f"own speed ({', '.join(entries)}), put into held-out states"
     return [_along(name, at, np.array(scores) / unit)]
 
 
-def _own_place(barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], unit: float) -> list[ProbeMap]:
+def _own_place(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequence[str], unit: float) -> list[ProbeMap]:
     """Median scores of the first agent over its own place, where names tell it; all else stays as it was."""
     if not set(OWN_PLACE) <= set(names):
         return []
@@ -138,10 +141,11 @@ def _own_place(barrier: Barrier | MinBarrier, states: Array, names: Sequence[str
     axes = [_axis(*np.quantile(states[:, 0, d], (0.0, 1.0))) for d in index]
     rows = []
     for y in axes[1]:
-        places = jnp.asarray([(x, y) for x in axes[0]], jnp.float32)  # (SIDE, 2)
-        there = jnp.broadcast_to(places[:, None], (SIDE, len(some), 2)).reshape(-1, 2)
-        before = jnp.tile(some, (SIDE, 1, 1))
-        scores = _scores_of_all(barrier, before, before.at[:, 0, index].set(there))
+        places = np.array([(x, y) for x in axes[0]])  # (SIDE, 2)
+        before = np.tile(some, (SIDE, 1, 1))
+        put = before.copy()
+        put[:, 0, index] = np.repeat(places, len(some), 0)
+        scores = _scores_of_all(barrier, before, put)
         rows.append(np.median(np.asarray(scores)[:, 0].reshape(SIDE, -1), 1))
     return [_over(f"{', '.join(OWN_PLACE)}, put into held-out states", axes, np.array(rows) / unit)]
 
@@ -161,32 +165,34 @@ def _radius(cause: Cause, logged: Logged) -> Edge:
     return cause_edges.radius(x, logged.label[steps], logged.store.episode_of_step[steps], cause)
 
 
-def _states(logged: Logged, rng: np.random.Generator) -> Array:
+def _states(logged: Logged, rng: np.random.Generator) -> np.ndarray:
     """(W, N, D) where held-out safe steps led."""
     held = logged.held_steps
     fine = held[~logged.unsafe[held]]
     fine = rng.choice(fine, min(STATES, len(fine)), replace=False)
-    return jnp.asarray(logged.after(fine))
+    return logged.after(fine)
 
 
 def _put(
-    barrier: Barrier | MinBarrier, states: Array, names: Sequence[str], cause: Cause, distance: float
+    barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequence[str], cause: Cause, distance: float
 ) -> np.ndarray:
     """(1 or 2, W) scores of the first agent that the cause is about, with its thing at that distance: at rest, and
     closing where names tell its velocity."""
     agent, thing = cause.who[0] if cause.who else (0, 0)
     place = np.array(cause.things[thing])
     offset = states[:, agent, place]
-    length = jnp.maximum(jnp.sqrt((offset**2).sum(-1, keepdims=True)), 1e-6)
+    length = np.maximum(np.sqrt((offset**2).sum(-1, keepdims=True)), 1e-6)
     direction = offset / length
-    put = states.at[:, agent, place].set(direction * distance)
+    put = states.copy()
+    put[:, agent, place] = direction * distance
     speed = _speed_entries(names, place)
     found = []
     for share in CLOSING if speed is not None else CLOSING[:1]:
         moved = put
         if speed is not None:
-            fastest = jnp.quantile(jnp.sqrt((states[..., speed] ** 2).sum(-1)), 0.99)
-            moved = put.at[:, agent, speed].set(-share * fastest * direction)
+            fastest = np.quantile(np.sqrt((states[..., speed] ** 2).sum(-1)), 0.99)
+            moved = put.copy()
+            moved[:, agent, speed] = -share * fastest * direction
         found.append(np.asarray(_scores_of_all(barrier, states, moved))[:, agent])
     return np.stack(found)
 

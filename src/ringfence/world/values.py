@@ -103,7 +103,8 @@ def fit_values(
         goal = (earned[pick] - mean) / scale
         return ((team_mean(out, alone) - goal) ** 2).mean()
 
-    data = arrays["features"], arrays["actions"][picked], arrays["row"][picked], rewards[picked]
+    some = (np.asarray(x)[np.asarray(picked)] for x in (arrays["actions"], arrays["row"], rewards))  # on the host
+    data = arrays["features"], *(jnp.asarray(x) for x in some)
     label = "" if quiet else "rewards, what steps are worth"
     reward = regress(loss, net, data, len(picked), key_reward, updates, 512, 4e-3, label)
     return Values(critic, reward, discount, map.joint, alone)
@@ -113,7 +114,8 @@ def _targets(arrays: dict[str, Array], rewards: Array, picked: Array) -> tuple[A
     """States, the reward on arriving in each and the return-to-go from it: the critic's two targets are those of a
     state that was arrived in by a step and left by another. First rows take the reward of their own first step, a fair
     stand-in. An episode that ended for good left a state that nothing follows; guards predict such states, too."""
-    over = picked[np.flatnonzero(np.asarray(arrays["terminated"])[np.asarray(picked)])]
+    steps = np.asarray(picked)
+    over = steps[np.asarray(arrays["terminated"])[steps]]
     return _targets_of(arrays, rewards, picked, over)
 
 
