@@ -13,13 +13,15 @@ import pytest
 
 from ringfence import guard, play
 from ringfence.cli import app
+from ringfence.datasets.registry import TASKS
 from ringfence.envs import SimpleSpread
+from ringfence.envs.episode import Episode
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
 from ringfence.evaluation.certify import certify
 from ringfence.evaluation.own_trials import Foresight
 from ringfence.evaluation.play import play_tables
-from ringfence.evaluation.player import player_of_run
+from ringfence.evaluation.player import player_of_run, shape_of
 from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate
 from ringfence.loading import resolve
@@ -394,6 +396,22 @@ def test_a_world_that_reads_observations_and_the_state(tmp_path):
     ):
         with pytest.raises(UserError, match=said):
             still.act(*given)
+
+
+def test_a_function_is_shown_the_state_that_its_logs_had(small_world):
+    """Though the World reads observations alone; a simulator without one is played all the same."""
+
+    class Bare(SimpleSpreadParallel):
+        def state(self):
+            raise NotImplementedError  # as PettingZoo's base class does
+
+    own = dataclasses.replace(small_world, map=TASKS["simple_spread-random"].feature_map("decentralized"))
+    shape = shape_of(own, 3)
+    for env, state in ((SimpleSpreadParallel(), (18,)), (Bare(), None)):
+        seen = Episode(env, shape, 0, 25).state
+        assert (None if seen is None else seen.shape) == state
+    with pytest.raises(UserError, match="reads a global state, which Bare lacks"):
+        Episode(Bare(), shape_of(small_world, 3), 0, 25)
 
 
 def _at_rest() -> float:

@@ -37,6 +37,7 @@ class Shape:
     state: int | None = 0  # entries of the global state, 0: it is not asked for
     homogeneous: bool = False  # any number of agents could play
     origins: Origins = NOWHERE  # of what is shown, which is taken from it
+    needs_state: bool = True  # a simulator without a state that is asked for is refused
 
 
 def check(env: Any, *names: str) -> None:
@@ -68,7 +69,7 @@ class Episode:
         self._check_agents()
         self._read_state: Callable[[], Any] | None = getattr(env, "state", None) if shape.state != 0 else None
         if shape.state != 0 and self._read_state is None:
-            raise UserError(f"The run reads a global state, which {self.name} lacks; give it a state() method.")
+            self._refuse_without_state()
         self.rewards: list[np.ndarray] = []
         self.costs: list[float | np.ndarray] = []
         self.constraints: list[dict[str, float | np.ndarray]] = []
@@ -248,8 +249,17 @@ class Episode:
         self.seen = self._rows(observations, len(self.agents))
         self.state = None
         if self._read_state is not None:
-            state = self._read_state()
+            try:
+                state = self._read_state()
+            except NotImplementedError:  # the method of PettingZoo's base class
+                self._refuse_without_state()
+                self._read_state = None
+                return
             self.state = given_as("state", state, (self.shape.state,), origins=self.shape.origins.state)
+
+    def _refuse_without_state(self) -> None:
+        if self.shape.needs_state:
+            raise UserError(f"The run reads a global state, which {self.name} lacks; give it a state() method.")
 
     def _rows(self, observations: ByAgent, agents: int | None) -> np.ndarray:
         """(N, O) in the order of the agents, or a refusal of what so many of them cannot have seen."""

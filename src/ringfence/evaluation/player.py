@@ -137,7 +137,7 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
         policy=_OneByOne(callback),
         act=act_with,
         task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
-        shape=_shape_of(world, callback.agents),
+        shape=shape_of(world, callback.agents),
         episode_length=spec.episode_length,
         action_dim=spec.action_dim,
         observation_names=(),
@@ -147,12 +147,18 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
     )
 
 
-def _shape_of(world: World, agents: int) -> Shape:
-    """What a simulator must show to a World."""
+def shape_of(world: World, agents: int) -> Shape:
+    """What a simulator must show to a World. The function is shown the state that logs had, too, where there is one."""
     width, state_width = world.widths
-    observation = width if "observations" in world.map.reads else None
-    state = state_width if world.map.reads_state else 0
-    return Shape(agents, observation, state, world.spec.homogeneous, world.origins)
+    needed = world.map.reads_state
+    return Shape(
+        agents=agents,
+        observation=width if "observations" in world.map.reads else None,
+        state=state_width if needed else state_width or 0,
+        homogeneous=world.spec.homogeneous,
+        origins=world.origins,
+        needs_state=needed,
+    )
 
 
 class _OneByOne:
