@@ -102,6 +102,45 @@ def test_an_interrupted_collection_goes_on(tmp_path, monkeypatch):
     assert np.abs(whole.actions).max() > 1.5
 
 
+class Mapped(Drift):
+    """The same, half a million metres from 0."""
+
+    def shown(self):
+        return {a: np.array([5e5 + self.x[i], self.t], np.float64) for i, a in enumerate(self.possible_agents)}
+
+
+def test_what_lies_far_from_0_is_kept_as_it_was_shown(tmp_path):
+    """Policies are shown it in double precision, and an interrupted collection goes on from the same place."""
+    shown = []
+
+    def watch(observations, state):
+        shown.append(observations)
+        return lean(observations - [5e5, 0], state)
+
+    near, far = ringfence.collect(Drift, lean, episodes=4), ringfence.collect(Mapped, watch, episodes=4)
+    assert shown[0].dtype == np.float64 and far.observations.dtype == np.float32
+    assert any("moved towards 0" in said for said in far.card.warnings)
+    measured, _ = far.card.origins.measured(far.observations, None)
+    np.testing.assert_allclose(measured - [5e5, 0], near.observations, atol=1e-5)
+    for episodes in (2, 4):
+        parts = ringfence.collect(Mapped, watch, episodes=episodes, out=tmp_path / "far.h5")
+    assert parts.content == far.content and parts.card.origins == far.card.origins
+
+
+def test_homogeneous_agents_have_costs_of_their_own():
+    """Also where all of them happen to be charged alike, and where nobody is charged at all."""
+
+    class Alike(Drift):
+        def step(self, actions):
+            seen, *rest, infos = super().step(actions)
+            return seen, *rest, {a: {"cost": 1.0} for a in infos}
+
+    store = ringfence.collect(Alike, lean, episodes=3, card={"homogeneous": True})
+    assert store.costs.ndim == 2 and (store.split_agents().costs == 1).all()
+    free = ringfence.collect(Alike, lean, episodes=3, cost=lambda infos: 0.0, card={"homogeneous": True})
+    assert free.costs.ndim == 1 and free.split_agents().costs.shape == (2 * free.steps,)
+
+
 def test_states_and_policies_with_a_memory_are_collected():
     class Counting:
         begun = 0

@@ -367,6 +367,8 @@ def test_anybodys_function_under_guard_is_played(small_world):
     )
     result = play(still, SimpleSpreadParallel, episodes=2)
     assert result["episodes"] == 2 and 0 <= result["infeasible_rate"] <= 1 and 0 <= result["ood_rate"] <= 1
+    unsaid = play(still, Own, episodes=2)  # it tells no cost: the formula of the World's logs does
+    assert unsaid["cost_mean"] == result["cost_mean"]
     alone = guard(lambda seen, state: np.zeros((3, 2)), small_world, guard="none", horizon=1)
     assert play(alone, SimpleSpreadParallel, episodes=2)["return_mean"] == pytest.approx(_at_rest(), rel=1e-5)
     with pytest.raises(UserError, match="a function under guard has none"):

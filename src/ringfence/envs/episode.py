@@ -38,6 +38,7 @@ class Shape:
     homogeneous: bool = False  # any number of agents could play
     origins: Origins = NOWHERE  # of what is shown, which is taken from it
     needs_state: bool = True  # a simulator without a state that is asked for is refused
+    double: bool = False  # what is shown in double precision stays in it
 
 
 def check(env: Any, *names: str) -> None:
@@ -255,7 +256,12 @@ class Episode:
                 self._refuse_without_state()
                 self._read_state = None
                 return
-            self.state = given_as("state", state, (self.shape.state,), origins=self.shape.origins.state)
+            self.state = self._given("state", state, (self.shape.state,), self.shape.origins.state)
+
+    def _given(
+        self, name: str, value: Any, shape: tuple[int | None, ...], origins: tuple[float, ...] | None
+    ) -> np.ndarray:
+        return given_as(name, value, shape, origins=origins, double=self.shape.double)
 
     def _refuse_without_state(self) -> None:
         if self.shape.needs_state:
@@ -266,7 +272,7 @@ class Episode:
         rows = [observations[a] for a in self.agents]
         shape = (agents, self.shape.observation)
         try:
-            return given_as("observations", rows, shape, origins=self.shape.origins.observations)
+            return self._given("observations", rows, shape, self.shape.origins.observations)
         except UserError as error:
             where = f"{self.name}, step {len(self.rewards)} of the episode with the seed {self.seed}"
             raise UserError(f"{str(error).rstrip('.')} ({where}).") from None

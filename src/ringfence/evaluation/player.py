@@ -20,11 +20,12 @@ from ringfence.guards.wrap import Callback
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.problem.constraints import CostColumn
+from ringfence.problem import constraints
+from ringfence.problem.constraints import BoundHazard
+from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
 from ringfence.proposals.base import act_with
 from ringfence.proposals.options import DEFAULT
-from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
 from ringfence.utils.precision import in_float32
@@ -102,7 +103,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         episode_length=job.spec.episode_length,
         action_dim=job.spec.action_dim,
         observation_names=_names_of(resolved),
-        unsafe=_unsafe_by_formula(job) if job.hazard.has_formula else None,
+        unsafe=_unsafe_by_formula(job.hazard, job.feature_map, job.task.homogeneous),
         about={"step": resolved.step} | evaluate.about(resolved),
         limits=resolved.run.config["data"].get("constraints") or {},
         run=resolved.run,
@@ -116,10 +117,13 @@ def _names_of(resolved: Resolved) -> tuple[str, ...]:
     return tuple(names) if len(names) == resolved.job.widths[0] else ()
 
 
-def _unsafe_by_formula(job: Job) -> Unsafe:
+def _unsafe_by_formula(hazard: BoundHazard | None, map: FeatureMap, homogeneous: bool) -> Unsafe | None:
+    if hazard is None or not hazard.has_formula:
+        return None
+
     @jax.jit
     def unsafe(observations, state):
-        found, _ = job.hazard.labels(local_features(job.feature_map, job.task.homogeneous, observations, state))
+        found, _ = hazard.labels(local_features(map, homogeneous, observations, state))
         return found.reshape(len(observations), -1).any(-1)
 
     return in_float32(lambda observations, state: np.asarray(unsafe(observations, state)))
@@ -132,16 +136,19 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
         raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
     world = callback.guarded.guard.world
     spec = world.spec
+    told = world.card.data.hazard
+    hazard = constraints.from_dict(told) if told else constraints.CostColumn()
+    bound = constraints.bind_or_none(hazard, spec.feature_names, spec.n_agents)
     return Player(
         name="a function under guard",
         policy=_OneByOne(callback),
         act=act_with,
-        task=Task(spec.task, None, CostColumn(), action_low=spec.action_low, action_high=spec.action_high),
+        task=Task(spec.task, None, hazard, action_low=spec.action_low, action_high=spec.action_high),
         shape=shape_of(world, callback.agents),
         episode_length=spec.episode_length,
         action_dim=spec.action_dim,
         observation_names=(),
-        unsafe=None,
+        unsafe=_unsafe_by_formula(bound, world.map, spec.homogeneous),
         about={"guard": "own"},
         limits=world.limits,
     )

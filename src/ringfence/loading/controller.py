@@ -270,6 +270,8 @@ class _TrainedRun:
         width, state_width = self.job.widths
         origins = self.job.origins
         seen = given_as("observations", observations, (self.job.team, width), origins=origins.observations)
+        if self.job.task.homogeneous:
+            state = None  # which agents who see for themselves do not read
         if state is not None and state_width == 0:
             raise UserError(
                 "This run's data has no global state, but act() was given one; pass the observations alone."

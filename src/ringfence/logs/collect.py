@@ -17,6 +17,8 @@ from ringfence.errors import Interrupted, StoreError, UserError, known, whole_nu
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
+from ringfence.problem.origins import FIELDS as ORIGINS
+from ringfence.problem.origins import Origins
 from ringfence.utils.files import writable
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
@@ -68,7 +70,7 @@ def collect(
         return kept
     rules = _Rules(
         space=_space(env),
-        shape=Shape(state=None if _has_state(env, seed) else 0),
+        shape=Shape(state=None if _has_state(env, seed) else 0, double=True),
         cost=cost,
         max_steps=max_episode_steps,
         early_ends=early_ends,
@@ -131,8 +133,10 @@ class _Keeper:
     def keep(self) -> None:
         """Join and write what is fresh."""
         if self.fresh:
-            by_agent = self.kept is not None and self.kept.costs.ndim == 2
-            made = _store(self.fresh, self.env, self.bounds, self.source, self.card, by_agent)
+            how = self.env, self.bounds, self.source, self.card
+            # The first episode says by what all are moved, wherever a collection was interrupted.
+            like = self.kept or _store(self.fresh[:1], *how, None)
+            made = _store(self.fresh, *how, like)
             self.kept = made if self.kept is None else self.kept.followed_by(made)
             self.fresh = []
         if self.kept is not None and self.skipped != _skipped(self.kept):
@@ -309,20 +313,34 @@ def _of_every_agent(costs: Sequence[float | np.ndarray], n_agents: int) -> np.nd
 
 
 def _store(
-    played: list[_Played], env: Any, bounds: Bounds, source: dict[str, Any], card: dict | None, by_agent: bool
+    played: list[_Played],
+    env: Any,
+    bounds: Bounds,
+    source: dict[str, Any],
+    card: dict | None,
+    like: EpisodeStore | None,
 ) -> EpisodeStore:
-    """The store of these episodes; costs are of each agent where episodes before were, or agents' costs differ."""
+    """The store of these episodes, moved `like` others; costs are of each agent where theirs are, where agents are
+    homogeneous, or where agents' costs differ."""
     simulator = source["simulator"]
     if len({one.shapes for one in played}) > 1:
         raise UserError(f"{simulator} changes its agents or what they see between episodes; keep them the same.")
     names = list(played[0].constraints)
     if any(list(one.constraints) != names for one in played):
         raise UserError(f"{simulator} names other constraints in some episodes; name the same ones in all.")
-    differ = any(one.by_agent for one in played) and not all(one.one_cost for one in played)
+    told = any(one.by_agent for one in played)
+    of_each = told and (bool((card or {}).get("homogeneous")) or not all(one.one_cost for one in played))
+    of_each = of_each or (like is not None and like.costs.ndim == 2)
 
     def charged(parts: list[np.ndarray]) -> np.ndarray:
         costs = np.concatenate(parts)
-        return costs if by_agent or differ else costs[:, 0]
+        return costs if of_each else costs[:, 0]
+
+    card = card or {}
+    if like is not None:
+        said = {name: value for name in (*ORIGINS, "warnings") if (value := getattr(like.card, name))}
+        card = card | said
+        played = [_moved(one, like.card.origins) for one in played]
 
     constraints = {name: charged([one.constraints[name] for one in played]) for name in names}
     states = [one.state for one in played if one.state is not None]
@@ -344,9 +362,15 @@ def _store(
             "agents": [str(agent) for agent in env.possible_agents],
             "action_low": bounds.low,
             "action_high": bounds.high,
-            **(card or {}),
+            **card,
         },
     )
+
+
+def _moved(played: _Played, origins: Origins) -> _Played:
+    """The episode in single precision, moved as others were."""
+    observations, state = origins.taken(played.observations, played.state)
+    return replace(played, observations=observations, state=state)
 
 
 def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> EpisodeStore | None:

@@ -242,7 +242,7 @@ class EpisodeStore:
         """Every agent's own logs, as of a team of one: first the episodes of agent 0, then those of agent 1, and so on.
         `team` of the card tells how many they were. The global state is nobody's own, so it is left out."""
         n = self.n_agents
-        if self.costs.ndim == 1 and n > 1:
+        if self.costs.ndim == 1 and n > 1 and (self.costs.any() or self.constraints is not None):
             raise StoreError(
                 f"The agents of '{self.card.task}' are homogeneous and learn from what each of them meets, but its "
                 "costs are the team's; give costs (T, N)."
@@ -255,7 +255,7 @@ class EpisodeStore:
             own(self.observations),
             own(self.actions),
             own(self.rewards),
-            self.costs if self.costs.ndim == 1 else self.costs.T.reshape(-1),
+            np.tile(self.costs, n) if self.costs.ndim == 1 else self.costs.T.reshape(-1),
             np.tile(self.terminated, n),
             np.tile(self.truncated, n),
             np.concatenate([self.episode_ends + i * self.steps for i in range(n)]),

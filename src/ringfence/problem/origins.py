@@ -30,6 +30,14 @@ class Origins:
     def __bool__(self) -> bool:
         return self.observations is not None or self.state is not None
 
+    def taken(self, observations: np.ndarray, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+        """The inverse of `measured`, in single precision."""
+        if self.observations is not None:
+            observations = observations - np.asarray(self.observations)
+        if self.state is not None and state is not None:
+            state = state - np.asarray(self.state)
+        return observations.astype(np.float32), None if state is None else state.astype(np.float32)
+
     def measured(self, observations: np.ndarray, state: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
         """Observations (..., N, O) and state (..., S) as they were measured, in double precision where they were moved:
         what a function of somebody else's is asked with."""

@@ -20,11 +20,12 @@ def given_as(
     who: str = "this run",
     remedy: str = "pass what its data holds",
     origins: Sequence[float] | None = None,
+    double: bool = False,
 ) -> np.ndarray:
     """A new float32 array of the expected shape, with finite numbers alone; None stands for a width that nobody knows.
 
     It is a copy: whoever gave it may go on writing into theirs. `origins` of its last axis are taken from it, in double
-    precision.
+    precision. What comes in `double` precision stays in it, where that is asked for.
     """
     letters = LETTERS[len(expected)]
     wanted = f"({', '.join(letter if n is None else str(n) for letter, n in zip(letters, expected))})"
@@ -40,7 +41,7 @@ def given_as(
         if origins is not None and array.shape[-1:] == (len(origins),):
             array = array.astype(np.float64) - np.asarray(origins)
         with np.errstate(over="ignore"):
-            array = np.array(array, np.float32)
+            array = np.array(array, np.float64 if double and array.dtype.itemsize > 4 else np.float32)
     except (TypeError, ValueError):
         raise UserError(f"{name} is no array of numbers; pass one of shape {wanted}.") from None
     if array.ndim != len(expected) or any(n not in (None, m) for m, n in zip(array.shape, expected)):
