@@ -188,14 +188,15 @@ def _labels(store: EpisodeStore, task: Task, rows: np.ndarray) -> np.ndarray | N
         return None
     if not bound.has_formula:
         return None
-    state = None if store.state is None else store.state[rows]
+    state = None if store.state is None or task.homogeneous else store.state[rows]
     unsafe, _ = bound.labels(local_features(view, task.homogeneous, store.observations[rows], state))
     return np.any(np.asarray(unsafe).reshape(len(rows), -1), axis=-1)
 
 
 def _bound(store: EpisodeStore, task: Task) -> tuple[FeatureMap, constraints.BoundHazard]:
     """What the formula of danger reads, and the formula; refused where the logs have no such entries."""
-    view = task.feature_map("pruned" if store.state is not None else "decentralized", store)
+    logs = task.logs(store) if task.env is None else store
+    view = task.feature_map("pruned" if logs.state is not None else "decentralized", logs)
     return view, constraints.bind(task.hazard, view.names, view.plus.shape[0])
 
 

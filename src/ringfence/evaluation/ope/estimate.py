@@ -21,7 +21,7 @@ from ringfence.evaluation.ope.model_rollout import rollout
 from ringfence.evaluation.ope.responses import Respondent, behaviour
 from ringfence.evaluation.ope.result import LogsRead, OPEResult
 from ringfence.evaluation.ope.safety import safety
-from ringfence.loading.resolve import resolve
+from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.origins import Origins
@@ -73,6 +73,7 @@ def ope(
     check(run, store)
     spec = PolicySpec.of(run, planner=planner, **options)
     resolved = resolve(spec)
+    _refuse_without_state(resolved, store)
     world = evaluation_world or worlds.fit(store, seed=seed + 1, execution=spec.execution, quiet=quiet)
     if not (world.card.data.content == store.content and world.spec.action_dim == store.actions.shape[2]):
         raise UserError("evaluation_world is of other logs; leave it out, and one is fitted to these.")
@@ -194,6 +195,13 @@ def check(run: Run, store: EpisodeStore) -> None:
         raise UserError(
             f"The run is of steps of {here:g} s, the logs of {there:g} s; bring the logs to the run's steps."
         )
+
+
+def _refuse_without_state(resolved: Resolved, store: EpisodeStore) -> None:
+    """Before a World is fitted to them."""
+    read = [resolved.job.feature_map] + ([] if resolved.guard is None else [resolved.guard.world.map])
+    if store.state is None and any(map.reads_state for map in read):
+        raise UserError("The run reads the global state, and the logs hold none; evaluate it by logs that have it.")
 
 
 def _check_names(data: Mapping[str, Any], store: EpisodeStore) -> None:

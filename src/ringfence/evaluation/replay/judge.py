@@ -259,7 +259,12 @@ def check_view(world: World, store: EpisodeStore) -> None:
     there = 0 if store.state is None else store.state.shape[1]
     shape = (store.n_agents, store.observations.shape[2], store.actions.shape[2])
     wanted = (world.spec.n_agents, width or shape[1], world.spec.action_dim)
-    if shape != wanted or (world.map.reads_state and there < (state_width or 1)):
+    if world.map.reads_state and there < (state_width or 1):
+        raise UserError(
+            f"The World reads a global state of {state_width or 'some'} entries, the logs hold {there or 'none'}; "
+            "fit a World to these logs."
+        )
+    if shape != wanted:
         raise UserError(
             f"The World reads {wanted[0]} agents of {wanted[1]} entries and {wanted[2]} actions, the logs hold "
             f"{shape[0]} of {shape[1]} and {shape[2]}; fit a World to these logs."
