@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.training import loop, worlds
 from ringfence.types import Array
 from ringfence.world import World
-from ringfence.world.barrier import Barrier
+from ringfence.world.barrier import Barrier, Widening
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "ablations.csv"
 FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible_rate")
@@ -58,12 +58,28 @@ class Simulated(eqx.Module):
         after, _ = self.env.step(self.env.from_global_state(flat), action)
         return self.map(self.env.observe(after), self.env.global_state(after)), jnp.zeros(action.shape[:-1])
 
+    @property
+    def size(self) -> int:
+        return 1
+
+    def members(self, index: Array) -> Array:
+        return index
+
+    def by_members(self, nets: Array) -> Simulated:
+        return self
+
 
 class Ahead(Barrier):
     """A barrier that knows danger by its value alone."""
 
     def of_steps(self, before: Array, after: Array) -> Array:
         return self.ahead(after)
+
+    def along(self, rows: Array, widening: Sequence[Widening] = ()) -> Array:
+        return self.ahead_apart(rows[..., 1:, :, :])
+
+    def parts(self, rows: Array, widening: Sequence[Widening] = ()) -> Array:
+        return self.along(rows)
 
 
 def by_value(world: World) -> World:

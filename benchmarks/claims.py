@@ -40,7 +40,8 @@ DRAWN = "results/proving/drawn"
 CROWD = "results/replay/students03.json"
 PEDESTRIANS = "results/stress/pedestrians.csv"
 SYSTEMS = "results/stress/systems.csv"
-ROBOTS_NOW = "results/guards-mujoco-defaults/table.csv"
+NOW = "guards-mujoco-defaults"
+ROBOTS_NOW = f"results/{NOW}/table.csv"
 TRACKERS = "results/proving/trackers.json"
 STRESS = "results/stress/crossing.csv"
 SHOWN = 80  # letters of a sentence in the table
@@ -147,13 +148,6 @@ def of_trackers() -> tuple[bool, str]:
     clones = max(row["clone, shield"]["violation_rate"] for row in rows.values())
     falls = naive["as it is"] < 0.3 * naive["not who is seen"] < 0.3 * naive["nor what is an angle"]
     return falls and clones == 0, f"{naive}, clones {clones} at most"
-
-
-def of_limits_by_defaults() -> tuple[bool, str]:
-    """Unsafe steps of robots under guards of today's defaults."""
-    rows = [r for r in stored.table(ROOT / ROBOTS_NOW) if r["guard"] in ("adapt", "full")]
-    most = max(float(r["cost_mean"]) for r in rows)
-    return most <= 25 and len({r["task"] for r in rows}) == 7, f"{most:.1f} at most, of {len(rows)}"
 
 
 def of_late_systems() -> tuple[bool, str]:
@@ -385,7 +379,7 @@ def same_safety() -> tuple[bool, str]:
         learned, formula = (mean("guards", task, ("bc", f"default+shield-{d}"), "return_mean") for d in BARRIERS)
         share.append(learned / formula)
         left.append(mean("guards", task, ("bc", "default+shield-learned"), "cost_safe_start"))
-    kept = [limits("guards-mujoco", "bc", f"default+adapt-{d}") for d in BARRIERS]
+    kept = [limits(NOW, "bc", f"default+adapt-{d}") for d in BARRIERS]
     ok = min(share) > 0.98 and max(left) < 0.05 and kept[0] >= kept[1]
     return ok, (
         f"at least {100 * min(share):.1f} % of the return on every tier, at most {max(left):.3f} cost left; robots' "
@@ -612,7 +606,7 @@ def ranks_like(number: str, truth: str, least: float) -> Callable[[], tuple[bool
 
 CLAIMS = (
     Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
-    Claim("docs/tables.md", "learned danger does what the formula does", "guards, guards-mujoco", same_safety),
+    Claim("docs/tables.md", "learned danger does what the formula does", f"guards, {NOW}", same_safety),
     Claim(
         "README.md",
         "Climbing learned values from its plans earns no more, beyond chance, than from cloned actions",
@@ -627,9 +621,9 @@ CLAIMS = (
     ),
     Claim(
         "docs/tables.md",
-        "one robot limit of 18 is not kept",
-        "results/guards-mujoco/table.csv",
-        robots_kept("bc", "default+full-learned", 17),
+        "two robot limits of 18 are not kept",
+        ROBOTS_NOW,
+        robots_kept("bc", "default+full-learned", 16, NOW),
     ),
     Claim(
         "docs/crossing-results.md",
@@ -679,13 +673,13 @@ CLAIMS = (
     ),
     Claim(
         "docs/guard-results.md",
-        "A shield of each agent's own leaves 0.006 collision steps at most",
+        "A shield of each agent's own leaves no collision step",
         "results/own-sight/table.csv",
-        own_shield_leaves(0.0065),
+        own_shield_leaves(0.0005),
     ),
     Claim(
         "docs/guard-results.md",
-        "keeps 17 of 18 limits",
+        "By guards of before, with three to five seeds, `full` kept 17",
         "results/guards-mujoco/table.csv",
         robots_kept("bc", "default+full-learned", 17),
     ),
@@ -905,9 +899,9 @@ CLAIMS = (
     ),
     Claim(
         "docs/guard-results.md",
-        "Today's defaults keep each of these limits",
+        "intervals included, by learned danger and by the formula",
         ROBOTS_NOW,
-        of_limits_by_defaults,
+        robots_kept("bc", "default+adapt-learned", 17, NOW),
     ),
     Claim(
         "docs/proving-ground.md",
