@@ -13,6 +13,7 @@ from ringfence.datasets.audit import audit
 from ringfence.errors import UserError
 from ringfence.evaluation import ope
 from ringfence.evaluation.replay.judge import check_view
+from ringfence.loading.resolve import load, load_job
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
 from tests.quick import QUICK_WORLD
@@ -59,3 +60,18 @@ def test_logs_without_the_state_that_is_read_are_refused(small_store, small_worl
         ope.ope(run, blind)
     with pytest.raises(UserError, match="reads a global state of 18 entries, the logs hold none"):
         check_view(small_world, blind)
+
+
+def test_a_formula_that_the_state_alone_tells_guards_who_does_not_see_it(small_store, tmp_path):
+    """And a World is cached by all that its card tells."""
+    card = small_store.card.updated(task="mine", hazard={"kind": "Separation", "radius": 0.3})
+    own = dataclasses.replace(small_store, card=card)
+    world = worlds.fit(own, **QUICK_WORLD)
+    tiny = {"num_updates": 2, "batch": 16, "width": 16, "depth": 1}
+    run = loop.train("bc", own, out=tmp_path, changes=tiny, quiet=True)[0]
+    assert load_job(run).hazard.has_formula is False
+    cheap = {"horizon": 1, "correction_steps": 1, "correction_restarts": 0, "within_logs": False}
+    assert load(run, guard="shield", barrier="analytic", world=world, **cheap)[1].guard.barrier.hazard.has_formula
+    wider = dataclasses.replace(own, card=card.updated(task="theirs", dt=0.1, hazard={"kind": "CostColumn"}))
+    told = worlds.fit(wider, **QUICK_WORLD).card.data
+    assert (told.task, told.dt, told.hazard["kind"]) == ("theirs", 0.1, "CostColumn")

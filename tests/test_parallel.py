@@ -22,6 +22,7 @@ from ringfence.evaluation.certify import certify
 from ringfence.evaluation.own_trials import Foresight
 from ringfence.evaluation.play import play_tables
 from ringfence.evaluation.player import player_of_run, shape_of
+from ringfence.evaluation.simulators import simulator
 from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate
 from ringfence.loading import resolve
@@ -283,6 +284,12 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     with pytest.raises(SystemExit):
         app.main(["eval", str(folder)])
     assert "--env FILE.py:NAME" in capsys.readouterr().err
+
+
+def test_a_file_may_be_called_as_a_module_is(tmp_path):
+    (tmp_path / "queue.py").write_text("class Mine:\n    said = 'here'\n")
+    named = simulator(f"{tmp_path / 'queue.py'}:Mine")
+    assert named().said == "here" and simulator(named.name)().said == "here"
 
 
 @pytest.mark.parametrize(

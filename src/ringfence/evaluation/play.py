@@ -330,8 +330,8 @@ class Table:
         """The last step costs 1 where the run's hazard calls the state unsafe."""
         if self.player.unsafe is None:
             raise UserError(
-                "step() tells no cost, and the run's hazard has no formula to say what is unsafe; pass "
-                "cost=, a function of the agents' infos."
+                "step() tells no cost, and no formula says of what the policy sees whether it is unsafe; pass cost=, a "
+                "function of the agents' infos."
             )
         for episode, unsafe in zip(self.episodes, self.player.unsafe(*self._seen())):
             episode.charge(float(unsafe))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import importlib.util
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -45,6 +47,26 @@ def name_of(make_env: Callable[[], Any], env: Any = None) -> str:
     return f"{made.__module__}:{getattr(made, '__qualname__', type(made).__qualname__)}"
 
 
+def _of_file(file: Path) -> ModuleType:
+    """The module of a file; one whose name another module has already, e.g. `queue`, gets a name of its own."""
+    known = sys.modules.get(file.stem)
+    if known is None or getattr(known, "__file__", None) == str(file):
+        return importlib.import_module(file.stem)
+    name = f"{file.stem}_{hashlib.blake2b(str(file).encode(), digest_size=4).hexdigest()}"
+    if name in sys.modules:
+        return sys.modules[name]
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None, "a file that ends in .py"
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
 def _imported(where: str, attribute: str) -> ModuleType:
     """The module of a file, or of a name that is found from the working folder."""
     file = Path(where)
@@ -53,7 +75,7 @@ def _imported(where: str, attribute: str) -> ModuleType:
         raise UserError(f"'{where}' is no file; give the one that holds {attribute}.")
     sys.path.insert(0, str(file.resolve().parent if is_file else Path.cwd()))
     try:
-        return importlib.import_module(file.stem if is_file else where)
+        return _of_file(file.resolve()) if is_file else importlib.import_module(where)
     except Exception as error:  # it is anybody's code
         raise UserError(f"'{where}' cannot be imported ({type(error).__name__}: {error}); repair it first.") from error
     finally:

@@ -104,6 +104,7 @@ def fit_view(
         *_bounds(store),
     ]
     content += [settings.miscoverage, settings.barrier]
+    content += [store.card.task, store.card.hazard, store.card.dt]  # which the card tells
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
     heading = Heading.of(map.names)
