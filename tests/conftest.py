@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import gc
 import os
 import shutil
@@ -41,21 +40,14 @@ import pytest
 
 from ringfence.datasets.behaviour import collect
 from ringfence.envs import SimpleSpread
-from ringfence.guards import searched
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
-from ringfence.world import margins, validate
+from tests import quick
 
 # What judges a World, and not what it is made of, takes a third of a small fit: whether actions could have avoided
 # danger, what a guard's search would call safe, what rows far ahead ask for. Worlds of tests are judged where
 # `@pytest.mark.judged` says so, of fewer entries and by a search that never begins again.
-validate.ENTERED = 20
-searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
-JUDGES = {(searched, "false_safe"): lambda *_: None, (validate, "_avoidable"): lambda *_: None}
-JUDGES |= {(margins, "AHEAD"): margins.AHEAD[:1]}
-JUDGED = {place: getattr(*place) for place in JUDGES}
-for place, quick in JUDGES.items():
-    setattr(*place, quick)
+quick.judge_little()
 
 # Tracing makes many objects that stay; looking through them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(50_000, 20, 20)
@@ -134,9 +126,8 @@ def small_store(played) -> EpisodeStore:
 def small_world(small_store):
     """The World of the small store."""
     from ringfence.training import worlds
-    from tests.quick import QUICK_WORLD
 
-    return worlds.fit(small_store, **QUICK_WORLD)
+    return worlds.fit(small_store, **quick.QUICK_WORLD)
 
 
 @pytest.fixture(autouse=True)
@@ -144,7 +135,6 @@ def insist(request, monkeypatch):
     """Worlds of tests are fitted in a second and unfit to guard by, so guards insist on them; but where a test is of
     verdicts (`@pytest.mark.verdicts`)."""
     if request.node.get_closest_marker("judged") is not None:
-        for place, whole in JUDGED.items():
-            monkeypatch.setattr(*place, whole)
+        quick.judge_in_full(monkeypatch)
     if request.node.get_closest_marker("verdicts") is None:
         monkeypatch.setattr("ringfence.guards.policy.require", lambda card, anyway=False: None)

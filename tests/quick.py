@@ -1,8 +1,13 @@
 """What several test files ask for by name."""
 
+import dataclasses
 import functools
 
 import jax
+import pytest
+
+from ringfence.guards import searched
+from ringfence.world import margins, validate
 
 # A World that is fitted in a second and knows little.
 QUICK_WORLD = dict(
@@ -14,6 +19,28 @@ QUICK_WORLD = dict(
     barrier_width=8,
     future_updates=20,
 )
+
+# What judges a World, and what stands for it in tests.
+_LITTLE = {
+    (searched, "false_safe"): lambda *_: None,
+    (validate, "_avoidable"): lambda *_: None,
+    (margins, "AHEAD"): margins.AHEAD[:1],
+}
+_IN_FULL = {place: getattr(*place) for place in _LITTLE}
+
+
+def judge_little() -> None:
+    """Worlds that are fitted from now on are hardly judged; where they are, of few entries and by a short search."""
+    validate.ENTERED = 20
+    searched.SHIELD = dataclasses.replace(searched.SHIELD, correction_restarts=0)
+    for place, little in _LITTLE.items():
+        setattr(*place, little)
+
+
+def judge_in_full(patch: pytest.MonkeyPatch) -> None:
+    """Worlds are judged by all that judges them, until the patch ends."""
+    for place, whole in _IN_FULL.items():
+        patch.setattr(*place, whole)
 
 
 def in_one_program(function, *arguments):

@@ -136,14 +136,12 @@ def _of_function(callback: Policy, planner: str, options: dict[str, Any]) -> Pla
         raise UserError(f"{[*options, 'planner'][0]} was said to ringfence.guard(), or not at all; leave it out here.")
     world = callback.guarded.guard.world
     spec = world.spec
-    told = world.card.data.hazard
-    hazard = constraints.from_dict(told) if told else constraints.CostColumn()
-    bound = constraints.bind_or_none(hazard, spec.feature_names, spec.n_agents)
+    bound = constraints.bind_or_none(world.hazard, spec.feature_names, spec.n_agents)
     return Player(
         name="a function under guard",
         policy=_OneByOne(callback),
         act=act_with,
-        task=Task(spec.task, None, hazard, action_low=spec.action_low, action_high=spec.action_high),
+        task=Task(spec.task, None, world.hazard, action_low=spec.action_low, action_high=spec.action_high),
         shape=shape_of(world, callback.agents),
         episode_length=spec.episode_length,
         action_dim=spec.action_dim,

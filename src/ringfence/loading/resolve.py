@@ -117,8 +117,8 @@ def resolve(spec: PolicySpec) -> Resolved:
         if spec.agents:  # another team has other places to be than the logs' had
             options = {"within_logs": False} | options
         hazard = job.hazard.hazard
-        if isinstance(hazard, constraints.CostColumn) and world.card.data.hazard:
-            hazard = constraints.from_dict(world.card.data.hazard)  # which the World may see, where the policy does not
+        if isinstance(hazard, constraints.CostColumn):
+            hazard = world.hazard  # which the World may see, where the policy does not
         policy = build(policy, world, hazard, spec.guard, spec.barrier, usual, spec.anyway, **options)
     spec = spec if plans else spec.without_plans()
     # Homogeneous agents see for themselves anyway.

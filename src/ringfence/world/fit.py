@@ -104,7 +104,8 @@ def fit_view(
         *_bounds(store),
     ]
     content += [settings.miscoverage, settings.barrier]
-    content += [store.card.task, store.card.hazard, store.card.dt]  # which the card tells
+    # What the card tells beside; `content` of agents who see for themselves is of the whole team's logs.
+    content += [store.card.task, store.card.hazard, store.card.dt, store.card.content]
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
     heading = Heading.of(map.names)

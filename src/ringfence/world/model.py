@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import equinox as eqx
 
+from ringfence.problem.constraints import CostColumn, Hazard, from_dict
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
@@ -26,6 +27,12 @@ class World(eqx.Module):
     spec: Spec = eqx.field(static=True)
     alone: bool = eqx.field(static=True)  # of each agent's own view, for decentralized execution
     card: Card = eqx.field(static=True)
+
+    @property
+    def hazard(self) -> Hazard:
+        """What the logs' card says is dangerous; costs alone where an older World does not say."""
+        told = self.card.data.hazard
+        return from_dict(told) if told else CostColumn()
 
     @property
     def limits(self) -> dict[str, float]:
