@@ -128,7 +128,7 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     found = [json.loads(file.read_text()) for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
     systems = [one["rows"] for one in found if one["verdict"] != "unfit"]
     for words, danger, way in (
-        (f"{len(systems)} other systems: a clone of the logs", NO_GUARD, "none"),
+        (f"{len(systems)} of {len(found)} other systems, one being refused: a clone of the logs", NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),
         ("the same clones under a guard", "the true formula and motion", "shield oracle"),
     ):
@@ -139,13 +139,16 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
 
 
 def _front_replay() -> tuple[str, str, str, str]:
-    """A recording of pedestrians, all its drivers together."""
-    rows = json.loads((RESULTS / "replay" / "zara02.json").read_text())["rows"]
-    contacts = {way: sum(r["contacts"] for r in rows if r["filter"] == way) for way in ("none", "shield")}
-    windows = sum(r["windows"] for r in rows if r["filter"] == "none")
-    alone, guarded = (100 * contacts[way] / windows for way in ("none", "shield"))
-    words = "Five drivers, each put among pedestrians as they were filmed"
-    return words, "a cost column made of distances", f"{alone:.2g} % alone, {guarded:.2g} % under a guard", "–"
+    """Recordings of pedestrians, all drivers of each together."""
+    shares = {"none": [], "shield": []}
+    for name in RECORDINGS:
+        rows = json.loads((RESULTS / "replay" / f"{name}.json").read_text())["rows"]
+        for way, found in shares.items():
+            mine = [r for r in rows if r["filter"] == way]
+            found.append(100 * sum(r["contacts"] for r in mine) / sum(r["windows"] for r in mine))
+    alone, guarded = (f"{min(found):.2g} to {max(found):.2g} %" for found in shares.values())
+    words = f"Filmed pedestrians, {len(RECORDINGS)} recordings: five drivers put among them"
+    return words, "a cost column made of distances", f"{alone} alone, {guarded} under a guard", "–"
 
 
 # Filters of a replay: their words, and where their rows are.

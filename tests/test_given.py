@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from ringfence.errors import Interrupted, NoSafeAction, UserError
 from ringfence.logs.collect import collect
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
+from ringfence.utils.functions import of_both
 from ringfence.utils.given import cost_given, given_as
 from tests.quick import QUICK_WORLD
 
@@ -111,9 +114,36 @@ def test_actions_that_are_none_are_refused(actions, world, store):
         ringfence.guard(lambda o, s: actions, world).act(store.observations[0])
 
 
-def test_a_function_of_one_argument_is_refused_at_once(world):
-    with pytest.raises(UserError, match=r"policy takes \(observations, state\); give it a second argument"):
-        ringfence.guard(lambda observations: observations, world)
+def test_a_function_of_observations_alone_acts_as_one_that_reads_no_state(world, store):
+    one, two = (
+        ringfence.guard(f, world).act(store.observations[3])
+        for f in (lambda seen: 0.3 * np.ones((2, 2)), lambda seen, state: 0.3 * np.ones((2, 2)))
+    )
+    np.testing.assert_array_equal(one, two)
+    for nothing in (lambda: 0, lambda observations, state, key: 0):
+        with pytest.raises(UserError, match=r"policy takes observations, or \(observations, state\)"):
+            ringfence.guard(nothing, world)
+
+
+def test_a_memory_of_a_function_of_observations_is_copied_and_reset():
+    class Counts:
+        n = 0
+
+        def reset(self):
+            self.n = 0
+
+        def step(self, observations):
+            self.n += 1
+            return self.n
+
+    counts = Counts()
+    first = of_both(counts.step)
+    assert first(None, None) == 1
+    second = copy.deepcopy(first)
+    assert (first(None, None), second(None, None)) == (2, 2)
+    second.reset()
+    assert (first(None, None), second(None, None), counts.n) == (3, 1, 3)
+    assert not hasattr(of_both(lambda observations: 0), "reset")
 
 
 def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):

@@ -35,8 +35,9 @@ class Playing:
     """a file of `ringfence fit --out`, needed for data of your own; else that of the run's data and seed."""
     anyway: bool = False
     """guard by a World whose verdict is unfit, too."""
-    planner: Literal["default", "value_guided", "low_temperature"] = "default"
-    """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots."""
+    planner: Literal["default", "value_guided", "low_temperature", "published"] = "default"
+    """how diffusion planners draw plans: value_guided lets value steer them, low_temperature is for robots, published
+    is MADIFF's (preset raw-return)."""
     num_samples: int | None = None
     """proposals that the guard asks for."""
     margin: float | None = None

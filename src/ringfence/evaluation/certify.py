@@ -1,10 +1,11 @@
 """A margin is calibrated behind faults, and what it then promises is counted on fresh episodes.
 
-The score of an episode is the most by which reality fell short of foresight: over its steps, the least score of the
-state that an action was foreseen to lead to, less that of the state it led to. A guard whose margin covers it keeps
-that state's score at 0 or above, wherever it could keep its margin. The quantile over episodes is conformal (Vovk et
-al. 2005), but another margin makes other episodes. So it is raised until a fresh batch agrees, and frozen. Then new
-episodes are played, and the bound is exact (Clopper and Pearson 1934), whatever the calibration was worth.
+The score of an episode is the most by which a state scored less than was predicted of it: over its steps, the least
+score of the state that an action was predicted to lead to, less that of the state it led to. A guard whose margin
+covers it keeps that state's score at 0 or above, wherever it could keep its margin. The quantile over episodes is
+conformal (Vovk et al. 2005), but another margin makes other episodes. So it is raised until a fresh batch agrees, and
+frozen. Then new episodes are played, and the bound is exact (Clopper and Pearson 1934), whatever the calibration was
+worth.
 """
 
 from __future__ import annotations

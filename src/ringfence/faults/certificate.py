@@ -56,7 +56,7 @@ class Certificate:
             + (f"; in {self.simulator}." if self.simulator else "."),
             f"The margin is {self.guard['margin']:.3g} after {len(self.rounds)} batch{'es' * (len(self.rounds) > 1)}; "
             f"{agreed}.",
-            f"In {100 * self.held:.1f} % of the fresh {what} reality fell short of foresight by no more than that.",
+            f"In {100 * self.held:.1f} % of the fresh {what} no state scored below its prediction by more than that.",
             *self._replay(),
             f"It holds for {what} drawn as these were, not for each state, another simulator or an adversary.",
         )

@@ -43,9 +43,11 @@ class BarrierSource(eqx.Module):
         if self.source != "learned":
             self._check_analytic()
         if self.source != "analytic" and self.world.barrier is None:
+            formula = self.hazard is not None and self.hazard.has_formula
+            remedy = "use barrier='analytic', or " if formula else ""
             raise UserError(
-                f"barrier='{self.source}' needs a barrier, but this World was fitted without labels of danger; use "
-                "barrier='analytic', or fit a World on logs with costs."
+                f"barrier='{self.source}' needs a barrier, but this World was fitted without labels of danger; "
+                f"{remedy}fit a World on logs with costs."
             )
 
     def _check_analytic(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +25,7 @@ from ringfence.problem.origins import Origins
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils import stored
+from ringfence.utils.functions import of_both
 from ringfence.utils.given import NUMBERS, given_as
 from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import policy_of_before, renamed, renamed_values
@@ -155,9 +155,9 @@ def under_guard(
         return build(policy, world, hazard, guard, barrier, anyway=anyway, **options)
     if not callable(policy):
         raise UserError(
-            f"guard() got a {type(policy).__name__}; give a callable (observations, state) -> actions, or a policy."
+            f"guard() got a {type(policy).__name__}; give a callable, observations -> actions, or a policy."
         )
-    _check_takes_two(policy)
+    function = of_both(policy)
     spec = world.spec
     if agents is None and spec.homogeneous:
         raise UserError("The World is of homogeneous agents; say with agents= how many of them there are.")
@@ -166,21 +166,7 @@ def under_guard(
     if guard == "none":  # it looks on, whatever the World is worth
         guard, anyway, options = "shield", True, {**options, **_LOOKS_ON}
     guarded = build(Nothing(), world, hazard, guard, barrier, anyway=anyway, **options)
-    return Callback(policy, guarded, agents or spec.n_agents)
-
-
-def _check_takes_two(function: Callable) -> None:
-    """Refuse a function that cannot be called with observations and state; what has no signature is taken as it is."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return
-    try:
-        signature.bind(None, None)
-    except TypeError:
-        raise UserError(
-            "policy takes (observations, state); give it a second argument, e.g. lambda observations, state: …"
-        ) from None
+    return Callback(function, guarded, agents or spec.n_agents)
 
 
 def guarded_of(policy: Any) -> Guarded | None:

@@ -243,10 +243,10 @@ def guard(
     """Any policy under guard.
 
     policy: a policy of the library (with `initial_state` and `act`), which gives a `Guarded`; or any callable
-    (observations (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, e.g. a PyTorch network, which
-    gives a `Controller`, for a team of `agents` where the World is of homogeneous agents. `guard` is a name in GUARDS,
-    `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines the analytic one, where that
-    is to be used. A World whose verdict is unfit is refused, unless `anyway`.
+    (observations (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, or of observations alone, e.g.
+    a PyTorch network, which gives a `Controller`, for a team of `agents` where the World is of homogeneous agents.
+    `guard` is a name in GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines
+    the analytic one, where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
     """
     found = under_guard(
         policy, world, guard=guard, barrier=barrier, hazard=hazard, agents=agents, anyway=anyway, **options

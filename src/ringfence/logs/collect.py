@@ -20,6 +20,7 @@ from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
 from ringfence.utils.files import writable
+from ringfence.utils.functions import of_both
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
 from ringfence.utils.renamed import deprecated, renamed
@@ -42,11 +43,12 @@ def collect(
 ) -> EpisodeStore:
     """The logs of `episodes` episodes of `make_env()`, a PettingZoo `ParallelEnv` whose agents begin and end together.
 
-    `policy` takes observations (N, O) and the state (S,), or None where the simulator has none, and gives actions
-    (N, A). One with `act` and `reset` (a `Controller`, a guarded callable) is reset with every episode. None draws
-    actions uniformly within the action spaces' bounds. Episode k is reset with `seed` + k, and its draws follow from
-    that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where there are none, 0. A
-    dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0 by default).
+    `policy` takes observations (N, O) and, if it has a second argument, the state (S,), or None where the simulator
+    has none, and gives actions (N, A). One with `act` and `reset` (a `Controller`, a guarded callable) is reset with
+    every episode. None draws actions uniformly within the action spaces' bounds. Episode k is reset with `seed` + k,
+    and its draws follow from that. Costs are `cost(infos)` of the team, else each agent's `cost` in its infos; where
+    there are none, 0. A dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0
+    by default).
 
     With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy's name
     and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept.
@@ -186,7 +188,7 @@ class _Player:
         if code is not None:  # two lambdas have one name
             content = code.co_code + repr(code.co_consts).encode()
             name += "-" + hashlib.blake2b(content, digest_size=3).hexdigest()
-        return cls(name, getattr(policy, "act", policy), getattr(policy, "reset", lambda: None))
+        return cls(name, of_both(getattr(policy, "act", policy)), getattr(policy, "reset", lambda: None))
 
 
 @dataclass(frozen=True)
