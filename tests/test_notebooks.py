@@ -38,3 +38,14 @@ def test_it_runs(file, tmp_path, monkeypatch, capsys):
             assert {k for k in SMALL if k in space}, "the cell names what can be made smaller"
             space |= {k: v for k, v in SMALL.items() if k in space}
     assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda f: f.stem)
+def test_kept_outputs_are_of_todays_words(file):
+    """A card that is printed in a notebook was printed by this version: it has causes, and ends with the verdict."""
+    cells = [cell for cell in json.loads(file.read_text())["cells"] if cell["cell_type"] == "code"]
+    for cell in cells:
+        assert cell["outputs"] or "print" not in "".join(cell["source"])
+        if "print(world.card)" in "".join(cell["source"]):
+            said = "".join(line for out in cell["outputs"] for line in out.get("text", ()))
+            assert "Danger" in said and "VERDICT" in said

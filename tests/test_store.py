@@ -567,3 +567,44 @@ def test_a_card_reads_as_the_dictionary_that_it_was(small_store):
             assert read() == wanted
     with pytest.warns(FutureWarning, match=r"card\['wheels'\] of a store is called card.extra\['wheels'\] now"):
         card["wheels"]
+
+
+def test_episodes_are_selected_by_flags_or_numbers(small_store):
+    flags = np.arange(small_store.episodes) % 7 == 0
+    one, two = small_store.select(flags), small_store.select(np.flatnonzero(flags))
+    np.testing.assert_array_equal(one.observations, two.observations)
+    for wrong in (flags[:-1], [small_store.episodes], [0.5], [[0]]):
+        with pytest.raises(StoreError, match="select got .* or numbers of episodes from 0 to 39"):
+            small_store.select(wrong)
+
+
+def test_names_of_each_agent_are_refused_with_the_way_out(played):
+    with pytest.raises(StoreError, match="one list of words for all agents: an entry for each quantity"):
+        EpisodeStore.from_episodes(
+            *(played[k] for k in ("observations", "actions", "rewards", "costs")),
+            card={"observation_names": [["a"], ["b"]]},
+        )
+
+
+def test_early_ends_that_nobody_explains_are_warned_of(played):
+    from ringfence.datasets.audit import audit
+
+    steps = played["actions"].shape[1]
+    kept = np.arange(10 * steps) >= 5  # the first episode lacks five steps
+    flat = [
+        played[name][:10, :steps].reshape(10 * steps, *played[name].shape[2:])[kept]
+        for name in ("observations", "actions", "rewards", "costs")
+    ]
+
+    def warned(**ends):
+        store = EpisodeStore.from_steps(
+            *flat[:3],
+            costs=flat[3],
+            episode_ends=np.arange(1, 11) * steps - 5,
+            final_observations=played["observations"][:10, -1],
+            **ends,
+        )
+        return any("1 of 10 episodes end before the usual" in warning for warning in audit(store).warnings)
+
+    assert warned()
+    assert not warned(terminated=np.arange(10) == 0)

@@ -10,6 +10,7 @@ import pytest
 import ringfence
 from ringfence.cli import app
 from ringfence.cli.renamed import rewritten
+from ringfence.datasets.audit import odd_actions
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import numbers
 from ringfence.logs.io.observe import observe
@@ -83,7 +84,7 @@ def test_uneven_times_are_put_on_one_clock():
     run, who = np.zeros(sum(sizes), int), np.repeat([0, 1], sizes)
     time, state = np.concatenate(clocks), rng.normal(size=(sum(sizes), 2))
     action, reward, cost = (rng.normal(size=(sum(sizes), k)) for k in (3, 1, 1))
-    got = resample(run, who, time, state, action, reward[:, 0], cost, 0.25, 10.0)
+    got = resample(run, who, time, state, action, reward[:, 0], cost, np.zeros(len(time), bool), 0.25, 10.0)
     seen, late = 0, 0.499 * min(0.25, np.median(np.concatenate([np.diff(c) for c in clocks])))
     for agent in (0, 1):
         mine = np.flatnonzero(who == agent)
@@ -110,7 +111,9 @@ def test_agents_that_come_and_go_make_windows_of_constant_membership():
     order = np.lexsort((t, who, run))
     run, t, who = run[order], t[order], who[order]
     zeros = np.zeros(len(t))
-    tracks = resample(run, who, t * 0.5, np.stack([t, who], 1), zeros[:, None], zeros, zeros[:, None], 0.5, 0.75)
+    tracks = resample(
+        run, who, t * 0.5, np.stack([t, who], 1), zeros[:, None], zeros, zeros[:, None], zeros > 0, 0.5, 0.75
+    )
     rows, many, size = teams(tracks, 3)
     expected = set()
     for e in range(3):
@@ -150,7 +153,7 @@ def test_neighbours_are_those_who_are_nearest_at_that_time():
     order = np.lexsort((t, who, run))
     run, t, who = run[order], t[order], who[order]
     place, zeros = rng.uniform(-2, 2, (len(t), 2)), np.zeros(len(t))
-    tracks = resample(run, who, t * 1.0, place, zeros[:, None], zeros, zeros[:, None], 1.0, 100.0)
+    tracks = resample(run, who, t * 1.0, place, zeros[:, None], zeros, zeros[:, None], zeros > 0, 1.0, 100.0)
     got = nearest(tracks, tracks.state, 3, 2.0)
     for row in range(len(tracks.step)):
         same = (tracks.recording == tracks.recording[row]) & (tracks.step == tracks.step[row])
@@ -448,3 +451,75 @@ def test_files_with_flipped_and_missing_bytes_are_refused_in_a_sentence_or_read(
 def test_one_word_in_a_column_of_a_file_is_named_by_its_own_row():
     with pytest.raises(StoreError, match="row 1: x is 'foo', no number"):
         numbers({"x": np.array(["1.0", "foo", "2.0"], object)}, "x")
+
+
+def valves(runs: int = 12, steps: int = 30) -> dict[str, np.ndarray]:
+    """Two tanks, whose valves open from 0 to 1; the last rows have no command, and the first run spills at once."""
+    rng = np.random.default_rng(0)
+    lengths = np.where(np.arange(runs) == 0, 3, steps)
+    rows = [(run, t, tank) for run in range(runs) for t in range(lengths[run]) for tank in (0, 1)]
+    run, t, tank = np.array(rows).T
+    last = t == lengths[run] - 1
+    return {
+        "run": run,
+        "t": t * 0.5,
+        "tank": tank,
+        "level": rng.uniform(0, 3, len(t)),
+        "valve": np.where(last, np.nan, rng.uniform(0, 1, len(t))),
+        "turn": np.where(last, np.nan, rng.uniform(-2, 1, len(t))),
+        "alarm": (last & (run == 0)).astype(float),
+        "trip": (last & (run == 0)).astype(float),
+    }
+
+
+TANKS = {"time": "t", "agent": "tank", "episode": "run", "state": ["level"], "cost": "alarm"}
+
+
+def test_commands_to_one_side_are_bounded_by_0_and_say_so():
+    store = EpisodeStore.from_table(valves(), **TANKS, action=["valve", "turn"], card={"task": "tanks"})
+    low, high = store.card.bounds
+    assert low[0] == 0 and 0.9 < high[0] <= 1 and -2 <= low[1] < -1.8 and high[1] == -low[1]
+    (said,) = [note for note in store.card.warnings if "never negative" in note]
+    assert said.startswith("valve is never negative and bounded by 0; give --action-low")
+    given = {"action_low": [-1.0, -3.0], "action_high": [1.0, 3.0]}
+    store = EpisodeStore.from_table(valves(), **TANKS, action=["valve", "turn"], card={"task": "tanks", **given})
+    np.testing.assert_array_equal(store.card.bounds, [[-1, -3], [1, 3]])
+    assert not any("never negative" in note for note in store.card.warnings)
+    (odd,) = odd_actions(store)
+    assert odd.startswith("Entry 0 of the actions is never below 0, though bounded by -1 and 1")
+
+
+def test_the_last_row_needs_no_command_and_a_short_time_is_counted():
+    table = valves()
+    store = EpisodeStore.from_table(table, **TANKS, action=["valve"], card={"task": "tanks"})
+    assert store.episodes == 11 and np.isfinite(store.actions).all()
+    (said,) = [note for note in store.card.warnings if "left out, since" in note]
+    assert said.startswith("1 of 12 times are left out, since they have fewer than 5 steps (min_episode_steps), 1 of")
+    all_of_it = EpisodeStore.from_table(
+        table, **TANKS, action=["valve"], terminated="trip", min_episode_steps=1, card={"task": "tanks"}
+    )
+    assert all_of_it.episodes == 12 and all_of_it.lengths[0] == 2
+    assert all_of_it.terminated.sum() == 1 and all_of_it.terminated[1] and all_of_it.costs[1].all()
+    table["valve"][7] = np.nan
+    with pytest.raises(StoreError, match="row 7: valve is nan"):
+        EpisodeStore.from_table(table, **TANKS, action=["valve"])
+    table = valves()
+    table["trip"][7] = 2
+    with pytest.raises(StoreError, match="row 7: trip is 2, no flag; write 0 or 1"):
+        EpisodeStore.from_table(table, **TANKS, action=["valve"], terminated="trip")
+
+
+def test_the_command_line_says_bounds_and_ends(tmp_path):
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    parquet.write_table(pa.table(valves()), file := tmp_path / "tanks.parquet")
+    line = (
+        f"data import-table {file} --time t --agent tank --episode run --state level --action valve turn --cost alarm"
+    )
+    app.main([*line.split(), *f"--terminated trip --action-low 0 -3 --action-high 2 --out {tmp_path}/tanks.h5".split()])
+    store = EpisodeStore.load(tmp_path / "tanks.h5")
+    assert store.card.bounds == ((0, -3), 2)
+    with pytest.raises(SystemExit) as ended:
+        app.main([*line.split(), *f"--action-low 0 1 2 --out {tmp_path}/other.h5".split()])
+    assert ended.value.code == 2

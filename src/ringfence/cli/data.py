@@ -89,8 +89,11 @@ def import_table(
     episode: str | None = None,
     action: list[str] = [],  # noqa: B006
     reward: str | None = None,
+    action_low: list[float] = [],  # noqa: B006
+    action_high: list[float] = [],  # noqa: B006
     cost: list[str] = [],  # noqa: B006
     limits: list[float] = [],  # noqa: B006
+    terminated: str | None = None,
     goal: list[str] = [],  # noqa: B006
     rename: list[str] = [],  # noqa: B006
     wide: str | None = None,
@@ -110,9 +113,13 @@ def import_table(
         state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
         episode: column that tells recordings apart.
         action: columns of what it was commanded to do until its next row; accelerations by default.
+        action_low: least of each of --action, or one of all; by default as far as the largest logged command, and 0
+            where none is negative.
+        action_high: likewise the largest.
         reward: column of what it earned since its row before; progress to the goal by default, or nothing.
         cost: column of danger since its row before, 0 or above; several are constraints of these names.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
+        terminated: column of flags, 1 on the row with which an episode ended by itself, not by a time limit.
         goal: columns of where it is to go, as many as its position has.
         rename: what columns are called in the file and here, e.g. position_x=x position_y=y.
         wide: how a file with columns for every agent calls them, e.g. {agent}_{column} of leader_x and follower_x.
@@ -131,15 +138,17 @@ def import_table(
     options = {
         **episodes.options(),
         "cost": cost,
-        "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)},
+        "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)}
+        | _bounds_of(action, action_low=action_low, action_high=action_high),
     }
     if layout is not None:
-        if state or action or reward or goal or episode or rename or wide:
+        if state or action or reward or goal or episode or rename or wide or terminated:
             raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
         options["layout"] = layout
     else:
         options |= {"time": time, "agent": agent, "episode": episode, "state": state}
         options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
+        options |= {"terminated": terminated}
     if split is not None and rest is not None:
         learned, judged = EpisodeStore.split_table(files, split, **options)
         imported(learned, kept)
@@ -157,6 +166,17 @@ def _pairs(rename: list[str]) -> dict[str, str]:
             raise UserError(f"--rename {pair} must be THEIRS=OURS, each of theirs once, such as position_x=x.")
         pairs[theirs] = ours
     return pairs
+
+
+def _bounds_of(action: list[str], **bounds: list[float]) -> dict[str, Any]:
+    """What a card says of the bounds of these actions: one of all, or one of each."""
+    for name, given in bounds.items():
+        if len(given) > 1 and len(given) != len(action):
+            raise UserError(
+                f"--{name.replace('_', '-')} gives {len(given)} numbers for {len(action)} columns of actions; give "
+                "one, or one for each."
+            )
+    return {name: given[0] if len(given) == 1 else given for name, given in bounds.items() if given}
 
 
 def _limits_of(cost: list[str], limits: list[float]) -> dict[str, Any]:

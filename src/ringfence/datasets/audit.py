@@ -39,7 +39,14 @@ def audit(store: EpisodeStore) -> Audit:
     else:
         danger, warnings = _danger(store, task)
         facts |= danger
-    warnings += [*odd_costs(store), *odd_names(store), *_odd_observations(store), *coarse(store), *_odd_ends(store)]
+    warnings += [
+        *odd_costs(store),
+        *odd_names(store),
+        *odd_actions(store),
+        *_odd_observations(store),
+        *coarse(store),
+        *_odd_ends(store),
+    ]
     return Audit(facts, warnings, list(store.card.warnings))
 
 
@@ -48,7 +55,7 @@ def odd_danger(store: EpisodeStore, task: Task) -> list[str]:
     that cannot be read, no danger at all."""
     told = store.team_costs.any() or not isinstance(task.hazard, constraints.CostColumn)
     untold = [] if told else ["No step has a cost and the card has no formula: no guard can use this World."]
-    return [*odd_names(store), *_unread(store, task), *untold]
+    return [*odd_names(store), *odd_actions(store), *_unread(store, task), *untold]
 
 
 def odd_names(store: EpisodeStore) -> list[str]:
@@ -165,7 +172,30 @@ def _odd_observations(store: EpisodeStore) -> list[str]:
 def _odd_ends(store: EpisodeStore) -> list[str]:
     if store.terminated.any() and not store.truncated.any() and np.ptp(store.lengths) == 0:
         return ["All episodes terminate at the same length: these are probably time limits (truncated)."]
+    longest = store.lengths == store.lengths.max()
+    if not store.terminated.any() and not longest.all() and longest.mean() >= 0.5:
+        return [
+            f"{int((~longest).sum())} of {store.episodes} episodes end before the usual {store.lengths.max()} steps, "
+            "and none is said to have ended by itself (terminated): values go on beyond such an end."
+        ]
     return []
+
+
+def odd_actions(store: EpisodeStore) -> list[str]:
+    """A warning of bounds that the logs use on one side alone: a guard would search where nobody acted."""
+    low, high = (np.broadcast_to(bound, store.actions.shape[1:]) for bound in store.card.bounds)
+    middle = (low + high) / 2
+    least, most = store.actions.min(0), store.actions.max(0)
+    varies = most > least
+    found = []
+    for word, one_side in (("below", varies & (least >= middle)), ("above", varies & (most <= middle))):
+        for entry in np.flatnonzero(one_side.any(0)):
+            found.append(
+                f"Entry {entry} of the actions is never {word} {middle[:, entry].flat[0]:g}, though bounded "
+                f"by {low[:, entry].min():g} and {high[:, entry].max():g}: give the bounds that it has (action_low, "
+                "action_high), since a guard searches within them."
+            )
+    return list(dict.fromkeys(found))
 
 
 def _cost_rate(store: EpisodeStore) -> float:

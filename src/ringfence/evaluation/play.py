@@ -210,8 +210,9 @@ def _check_bounds(env: Any, bounds: Bounds) -> None:
         if narrower.any():
             there = Bounds.of(np.ravel(least), np.ravel(most))
             raise UserError(
-                f"The action space of {agent} in {type(env).__name__} is from {there}, the policy acts from {mine}; "
-                "scale its actions in the simulator, or widen the space."
+                f"The action space of {agent} in {type(env).__name__} is from {there}, the policy acts from {mine}, "
+                "the bounds of its logs; give the logs the simulator's (action_low, action_high) and train anew, or "
+                "scale actions in the simulator."
             )
 
 

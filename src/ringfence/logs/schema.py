@@ -241,7 +241,12 @@ def _lists_of_words(card: dict) -> None:
         words = card.get(name)
         words = words.tolist() if isinstance(words, np.ndarray) else words
         if words is not None and not (isinstance(words, list | tuple) and all(isinstance(w, str) for w in words)):
-            raise StoreError(f"The card has {name}={words!r}; it must be a list of words, or be left out.")
+            of_each = isinstance(words, list | tuple) and all(isinstance(w, list | tuple) for w in words)
+            raise StoreError(
+                f"The card has {name}={str(words)[:200]}; it must be "
+                + ("one list of words for all agents: an entry for each quantity, 0 where an agent has none." * of_each)
+                + ("a list of words, or be left out." * (not of_each))
+            )
         if name in card:
             card[name] = words if words is None else list(words)
         if words and name in LISTS_OF_NAMES:

@@ -178,8 +178,8 @@ class EpisodeStore:
         return digest_of((name, array) for name, array in arrays if array is not None)
 
     def select(self, keep: np.ndarray) -> EpisodeStore:
-        """The episodes where `keep` (E,) is true."""
-        keep = np.asarray(keep, bool)
+        """The episodes where `keep` (E,) is true, or those that it counts, in the store's order."""
+        keep = _chosen(keep, self.episodes)
         if not keep.any():
             raise StoreError("No episode is left after the selection; relax the rule that selects them.")
         steps = np.repeat(keep, self.lengths)
@@ -555,6 +555,19 @@ def _several(
     return several.max(-1), several, {**fields, "constraints": limits}
 
 
+def _chosen(keep: Any, episodes: int) -> np.ndarray:
+    """(E,) flags, of flags or of numbers of episodes."""
+    given = np.asarray(keep)
+    flags = given.dtype == bool and given.shape == (episodes,)
+    numbers = given.dtype.kind in "iu" and given.ndim == 1 and bool(((given >= 0) & (given < episodes)).all())
+    if not flags and not numbers:
+        raise StoreError(
+            f"select got {given.dtype} of shape {given.shape}; give ({episodes},) true or false, or numbers of "
+            f"episodes from 0 to {episodes - 1}."
+        )
+    return given if flags else np.isin(np.arange(episodes), given)
+
+
 def _digest(card: str | bytes) -> str:
     return hashlib.blake2b(card.encode() if isinstance(card, str) else card, digest_size=8).hexdigest()
 
@@ -568,8 +581,9 @@ def _numbers(name: str, value, axes: int | None = None) -> np.ndarray:
     except ValueError as error:  # rows of several lengths
         raise StoreError(f"{name} is no array ({str(error).split('. ')[0]}); give every row the same length.") from None
     if array.dtype.kind not in "biuf":
-        kind = "nothing" if value is None else "entries that are no real numbers"
-        raise StoreError(f"{name} holds {kind} (dtype {array.dtype}); give an array of numbers.")
+        if value is None:
+            raise StoreError(f"{name} is None; it is needed: give an array of numbers.")
+        raise StoreError(f"{name} holds entries that are no real numbers (dtype {array.dtype}); give numbers.")
     if axes is not None and array.ndim != axes:
         raise StoreError(f"{name} has shape {array.shape}, which is not {axes} axes; add or remove one.")
     return array.astype(array.dtype.newbyteorder("="), copy=False)

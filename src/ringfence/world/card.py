@@ -139,6 +139,11 @@ class Verdict(Part, frozen=True):
     reasons: tuple[str, ...] = ()
     remedies: tuple[str, ...] = ()
 
+    def __str__(self) -> str:
+        if not self.reasons:
+            return self.word
+        return f"{self.word}: {'; '.join(self.reasons)}; {' or '.join(self.remedies)}"
+
 
 class BarrierScores(Part, frozen=True):
     """How well a barrier tells danger. With a `warning` the numbers are not known."""
@@ -348,9 +353,7 @@ def _of_verdict(card: Card) -> Iterator[str]:
         if card.barrier is not None and card.format:
             yield "VERDICT none: an earlier version fitted it; fit it again to have one."
         return
-    reasons = "; ".join(card.verdict.reasons)
-    remedies = " or ".join(card.verdict.remedies)
-    yield f"VERDICT {card.verdict.word}" + (f": {reasons}; {remedies}" if reasons else "") + "."
+    yield f"VERDICT {card.verdict}."
 
 
 def _of_causes(card: Card) -> Iterator[str]:

@@ -97,7 +97,7 @@ def words(columns: Columns, name: str) -> np.ndarray:
         raise StoreError(f"row {row}: {name} is missing; fill or drop it.")
     if column.dtype.kind != "O":
         return column
-    missing = [row for row, entry in enumerate(column) if _is_missing(entry)]
+    missing = [row for row, entry in enumerate(column) if is_missing(entry)]
     if missing:
         raise StoreError(f"row {missing[0]}: {name} is missing; fill or drop it.")
     return np.array([_text(name, row, entry) for row, entry in enumerate(column)])
@@ -130,7 +130,7 @@ def _array(name: str, column: Any) -> np.ndarray:
         raise StoreError(f"{name} is no column ({str(error).split('. ')[0]}); give one entry per row.") from None
 
 
-def _is_missing(entry: Any) -> bool:
+def is_missing(entry: Any) -> bool:
     """None, NaN, NaT and pandas' NA, which will not say whether it is itself."""
     try:
         return entry is None or bool(entry != entry)

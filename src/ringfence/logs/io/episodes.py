@@ -109,7 +109,7 @@ class Episodes:
 
 def team_episodes(motion: Motion) -> Episodes:
     """Episodes of a constant team, of which everybody sees all others."""
-    rows, lengths = _team_windows(motion)
+    rows, lengths, short = _team_windows(motion)
     names, parts = motion.own(with_place=True)
     seen = [np.concatenate(parts, 1)[rows]]
     n = rows.shape[1]
@@ -124,14 +124,16 @@ def team_episodes(motion: Motion) -> Episodes:
     cost = motion.tracks.cost[rows]
     if motion.schema.separation is not None:
         cost = _too_close(motion.place[rows], motion.schema.separation.radius)
-    notes = _left_out(motion, rows)
+    notes = (*short, *_left_out(motion, rows))
     return Episodes(rows, lengths, np.concatenate(seen, -1), names, cost, notes)
 
 
-def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (W, N) of windows in which a team is there, and how many rows each has."""
+def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+    """Rows (W, N) of windows in which a team is there, how many rows each has, and what is said of those that are too
+    short."""
     schema = motion.schema
     rows, lengths, n = teams(motion.tracks, schema.team)
+    short = _too_short(motion, rows, lengths)
     index, lengths = cut(lengths, schema.min_episode_steps, schema.max_episode_steps)
     if not len(lengths):
         here = np.unique(motion.tracks.agent).size
@@ -139,7 +141,22 @@ def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray]:
             f"No {n} agents are together for {schema.min_episode_steps} steps of {motion.tracks.dt:g} s (the table has "
             f"{here}); give another team, a smaller min_episode_steps, a longer gap, or neighbours."
         )
-    return rows[index], lengths
+    return rows[index], lengths, short
+
+
+def _too_short(motion: Motion, rows: np.ndarray, lengths: np.ndarray) -> tuple[str, ...]:
+    """What is said of windows (W, N) with too few steps, of so many rows each: a short one may be one that ended in
+    danger."""
+    fewest = motion.schema.min_episode_steps
+    short = lengths - 1 < fewest
+    if not short.any():
+        return ()
+    costly = np.repeat(np.arange(len(lengths)), lengths)[motion.tracks.cost[rows].any((1, 2))]
+    with_cost = int((short & np.isin(np.arange(len(lengths)), costly)).sum())
+    return (
+        f"{int(short.sum())} of {len(lengths)} times are left out, since they have fewer than {fewest} steps "
+        f"(min_episode_steps), {with_cost or 'none'} of them with a cost",
+    )
 
 
 def _of_others(motion: Motion) -> dict[str, np.ndarray]:
@@ -184,11 +201,9 @@ def neighbour_episodes(motion: Motion) -> Episodes:
     schema = motion.schema
     tracks = motion.tracks
     assert schema.neighbours is not None
-    index, lengths = cut(
-        np.bincount(tracks.segment, minlength=tracks.segment.max() + 1),
-        schema.min_episode_steps,
-        schema.max_episode_steps,
-    )
+    lengths = np.bincount(tracks.segment, minlength=tracks.segment.max() + 1)
+    notes = _too_short(motion, np.arange(len(tracks.segment))[:, None], lengths)
+    index, lengths = cut(lengths, schema.min_episode_steps, schema.max_episode_steps)
     if not len(lengths):
         raise StoreError(
             f"No agent is there for {schema.min_episode_steps} steps of {tracks.dt:g} s; give a smaller "
@@ -211,4 +226,4 @@ def neighbour_episodes(motion: Motion) -> Episodes:
         close = np.linalg.norm(offset[:, 0], axis=-1) < schema.separation.radius
         cost = (close & there[:, 0]).astype(float)[:, None]
     rows = index[:, None]
-    return Episodes(rows, lengths, np.concatenate(parts, 1)[rows], names, cost[rows], sensing_radius=float(radius))
+    return Episodes(rows, lengths, np.concatenate(parts, 1)[rows], names, cost[rows], notes, float(radius))

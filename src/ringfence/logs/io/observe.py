@@ -88,5 +88,5 @@ def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots
         return others(n)
     zero = np.zeros(n, int)
     place = np.stack([columns[axis] for axis in AXES if axis in columns], 1)
-    now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, card.get("dt", 1.0))
+    now = Tracks(zero, np.arange(n), np.arange(n), zero, place, place, zero, zero, zero > 0, card.get("dt", 1.0))
     return nearest(now, place, slots, float(card.get("sensing_radius", np.inf)))

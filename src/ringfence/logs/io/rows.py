@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.io.columns import Columns, numbers, seconds, words
+from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
@@ -48,11 +48,12 @@ class Values:
     columns: Columns  # (M,) each of state, action and goal
     reward: np.ndarray  # (M,)
     cost: np.ndarray  # (M, K)
+    ended: np.ndarray  # (M,) whether an episode ended by itself with the row
     single: tuple[str, ...] = ()  # columns that the table holds in single precision
 
     def chosen(self, kept: np.ndarray) -> Values:
         columns = {name: column[kept] for name, column in self.columns.items()}
-        return Values(columns, self.reward[kept], self.cost[kept], self.single)
+        return Values(columns, self.reward[kept], self.cost[kept], self.ended[kept], self.single)
 
     def stacked(self, names: tuple[str, ...]) -> np.ndarray:
         """(M, columns)"""
@@ -105,12 +106,38 @@ def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
 
 def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
     """The numbers that the schema names; without a reward or cost, 0."""
+    columns = columns | {name: _until_the_last(columns[name], rows) for name in schema.action}
     read = {name: numbers(columns, name)[rows.order] for name in (*schema.state, *schema.action, *schema.goal)}
     zero = np.zeros(len(rows.time))
     reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
     costs = [numbers(columns, name)[rows.order] for name in schema.cost]
     single = tuple(name for name in read if columns[name].dtype == np.float32)
-    return Values(read, reward, np.stack(costs or [zero], 1), single)
+    return Values(read, reward, np.stack(costs or [zero], 1), _ends(columns, rows, schema), single)
+
+
+def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
+    """A column of commands, whose last entry of each agent nobody follows: one that is missing is the one before."""
+    last = np.flatnonzero(np.append(~rows.follows, True))
+    last = last[last > 0]
+    here, before = rows.order[last], rows.order[last - 1]
+    missing = np.array([is_missing(entry) for entry in column[here]], bool)
+    if not missing.any():
+        return column
+    filled = column.copy()
+    filled[here[missing]] = column[before[missing]]
+    return filled
+
+
+def _ends(columns: Columns, rows: Rows, schema: TableSchema) -> np.ndarray:
+    """(M,) flags."""
+    if schema.terminated is None:
+        return np.zeros(len(rows.time), bool)
+    flags = numbers(columns, schema.terminated)
+    others = ~np.isin(flags, (0.0, 1.0))
+    if others.any():
+        row = int(np.flatnonzero(others)[0])
+        raise StoreError(f"row {row}: {schema.terminated} is {flags[row]:g}, no flag; write 0 or 1.")
+    return flags[rows.order] > 0
 
 
 def clock_of(rows: Rows, schema: TableSchema) -> Clock:

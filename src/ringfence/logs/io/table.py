@@ -211,6 +211,7 @@ def _on_clock(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> 
         action,
         values.reward,
         values.cost,
+        values.ended,
         clock.dt,
         clock.gap,
     )
@@ -239,14 +240,16 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
             warnings = [*warnings, "all agents have the same costs: they are taken for the team's"]
         costs = costs[:, 0]
     actions = _actions(motion, episodes)[episodes.leaves]
-    bound = _largest(actions) if schema.action else _usual(actions)
-    outliers = int((np.abs(actions) > bound).any(-1).sum())
+    low, high = _of_commands(actions) if schema.action else _usual(actions)
+    if not {"action_low", "action_high"} & set(card):
+        warnings = [*warnings, *_one_sided(schema.action, low, high)]
+    outliers = int((np.abs(actions) > high).any(-1).sum()) if not schema.action else 0
     if outliers:
         largest = float(np.abs(actions).max())
-        actions = np.clip(actions, -bound, bound)
+        actions = np.clip(actions, low, high)
         warnings = [
             *warnings,
-            f"{outliers} accelerations of up to {largest:.4g} m/s² are outliers and cut to {bound.max():.4g}, which "
+            f"{outliers} accelerations of up to {largest:.4g} m/s² are outliers and cut to {high.max():.4g}, which "
             f"{100 * USUAL:g} % are within",
         ]
     facts = {
@@ -255,8 +258,8 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         "hazard": schema.danger or CostColumn(),
         "dt": motion.tracks.dt,
         "warnings": warnings,
-        "action_low": -bound,
-        "action_high": bound,
+        "action_low": low,
+        "action_high": high,
     }
     if schema.homogeneous:
         facts |= {"homogeneous": True, "sensing_radius": episodes.sensing_radius}
@@ -268,25 +271,41 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         "costs": dict(zip(schema.cost, np.moveaxis(costs, -1, 0))) if named else costs[..., 0],
         "episode_ends": np.cumsum(episodes.lengths - 1),
         "final_observations": episodes.observations[episodes.last],
+        "terminated": motion.tracks.ended[episodes.rows[episodes.last]].any(1),
         "card": {**facts, **card},
     }
 
 
-def _largest(actions: np.ndarray) -> np.ndarray:
-    """(A,) the largest size of commands (T, N, A), 1 where there is none. Each entry has its own, since commands are of
-    several kinds: a speed is bounded by speeds and not by how fast something turned."""
-    largest = np.abs(actions).max((0, 1), initial=0.0)
-    return np.where(largest > 0, largest, 1.0)
+def _of_commands(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (A,) of commands (T, N, A): the largest size, both ways but where every command is to one side of 0; 1
+    where there is none. Each entry has its own, since commands are of several kinds: a speed is bounded by speeds and
+    not by how fast something turned, and an opening from 0 to 1 is never negative."""
+    least, most = actions.min((0, 1), initial=0.0), actions.max((0, 1), initial=0.0)
+    largest = np.maximum(-least, most)
+    largest = np.where(largest > 0, largest, 1.0)
+    return np.where((least < 0) | (most == 0), -largest, 0.0), np.where((most > 0) | (least == 0), largest, 0.0)
 
 
-def _usual(actions: np.ndarray) -> np.ndarray:
-    """(1,) a bound of accelerations (T, N, A), the same for all axes: the largest, unless it stands out. Differences of
-    velocities that jitter or jump are far above what anything there can do."""
+def _one_sided(names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Iterator[str]:
+    """Commands that are bounded by 0 because nobody gave any beyond it."""
+    for word, ends, option in (("negative", low, "low"), ("positive", high, "high")):
+        found = [name for name, end in zip(names, ends) if end == 0]
+        if found:
+            yield (
+                f"{', '.join(found)} {'are' if len(found) > 1 else 'is'} never {word} and bounded by 0; give "
+                f"--action-{option} (card={{'action_{option}': ...}}) if it can be"
+            )
+
+
+def _usual(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds (1,) of accelerations (T, N, A), the same for all axes and both ways: the largest, unless it stands out.
+    Differences of velocities that jitter or jump are far above what anything there can do."""
     sizes = np.abs(actions).reshape(-1, actions.shape[-1])
     largest = float(sizes.max(initial=0.0))
     usual = float(np.quantile(sizes, USUAL, axis=0, method="higher").max()) if len(sizes) else 0.0
     bound = usual if 0 < usual < largest / STANDS_OUT else largest
-    return np.array([bound if bound > 0 else 1.0])
+    found = np.array([bound if bound > 0 else 1.0])
+    return -found, found
 
 
 def _of_team(costs: np.ndarray, homogeneous: bool) -> bool:

@@ -31,6 +31,8 @@ class TableSchema:
     it followed until its next row; without any, actions are its accelerations. `reward` and `cost` are what came since
     its row before. Without `reward`, it is the progress to the `goal` (columns of its x, y), in m, or 0. Without
     `cost`, it follows from `danger`, a `Separation`, or is 0. Several columns of costs are constraints of these names.
+    `terminated` is a flag of the row with which an episode ended by itself, not by a time limit or the recording's end.
+    The last row of an agent needs no command.
 
     Rows are put on steps of `dt` s (by default the table's own): states are interpolated, actions held. An agent that
     is silent for more than `gap` s (five steps) was away. Agents come and go: an episode is a time in which the same
@@ -50,6 +52,7 @@ class TableSchema:
     action: tuple[str, ...] = ()
     reward: str | None = None
     cost: tuple[str, ...] = ()
+    terminated: str | None = None
     goal: tuple[str, ...] = ()
     dt: float | None = None
     gap: float | None = None
@@ -109,7 +112,7 @@ class TableSchema:
     @property
     def columns(self) -> list[str]:
         """All that are read."""
-        optional = [name for name in (self.episode, self.reward) if name]
+        optional = [name for name in (self.episode, self.reward, self.terminated) if name]
         return [self.time, self.agent, *self.state, *self.action, *self.goal, *self.cost, *optional]
 
 
@@ -135,7 +138,7 @@ def _require_word(field: str, name: Any) -> None:
 
 # --- rules, in the order in which they are asked ---
 def _words(schema: TableSchema) -> None:
-    for option in ("time", "agent", "episode", "reward", "wide"):
+    for option in ("time", "agent", "episode", "reward", "terminated", "wide"):
         name = getattr(schema, option)
         if name is not None or option in ("time", "agent"):
             _require_word(option, name)

@@ -31,6 +31,7 @@ class Tracks:
     action: np.ndarray  # (R, A): the last one at that time
     earned: np.ndarray  # (R,): the sum of rewards
     cost: np.ndarray  # (R, K): the largest of each kind
+    ended: np.ndarray  # (R,) whether an episode ended by itself
     dt: float  # s
 
 
@@ -42,6 +43,7 @@ def resample(
     action: np.ndarray,
     reward: np.ndarray,
     cost: np.ndarray,
+    ended: np.ndarray,
     dt: float,
     gap: float,
 ) -> Tracks:
@@ -64,6 +66,7 @@ def resample(
         action[row],
         sums[row + 1] - sums[before + 1],
         _largest_between(cost, before, row),
+        _largest_between(ended[:, None].astype(float), before, row)[:, 0] > 0,
         dt,
     )
 
