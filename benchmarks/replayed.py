@@ -2,10 +2,12 @@
 
 python benchmarks/replayed.py telemetry.csv --layout syndrone --radius 2 --name a-den    # results/replay/a-den.json
 python benchmarks/replayed.py fcd.xml --layout sumo --radius 2.5 --name town
+python benchmarks/replayed.py citr.h5 citr-rest.h5 --radius 0.8 --name citr
 
 FILE is a table in one of the layouts of `ringfence data import-table`; docs/replay-results.md says where to get some.
-It is split by time: the first 70 % to learn by, the rest to replay. A step costs 1 where two centres come closer than
-the radius, and the World reads nothing but that column. Settings are the defaults.
+It is split by time: the first 70 % to learn by, the rest to replay. Two files are the parts that `import-table --split`
+wrote. A step costs 1 where two centres come closer than the radius, and the World reads nothing but that column.
+Settings are the defaults.
 """
 
 from __future__ import annotations
@@ -30,16 +32,19 @@ LONGEST = 40  # steps of an episode: a longer track is several, or few episodes 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--layout", required=True)
+    parser.add_argument("files", type=Path, nargs="+", help="a table, or two stores: to learn by, and to replay")
+    parser.add_argument("--layout", help="of a table")
     parser.add_argument("--radius", type=float, required=True, help="m between centres")
     parser.add_argument("--name", required=True, help="of the logs, and of the result")
     parser.add_argument("--seconds", type=float, default=5.0, help="of a window")
     parser.add_argument("--windows", type=int, default=300)
     parser.add_argument("--out", type=Path, help="default: results/replay/NAME.json")
     a = parser.parse_args()
-    how = {"layout": a.layout, "neighbours": NEIGHBOURS, "max_episode_steps": LONGEST}
-    learn, judge = by_cost(a.file, a.radius, a.name, **how)
+    if len(a.files) == 2:
+        learn, judge = without_formula(*map(EpisodeStore.load, a.files))
+    else:
+        how = {"layout": a.layout, "neighbours": NEIGHBOURS, "max_episode_steps": LONGEST}
+        learn, judge = by_cost(a.files[0], a.radius, a.name, **how)
     steps = max(1, round(a.seconds / learn.card.dt))
     found = replayed(learn, judge, radius=a.radius, steps=steps, windows=a.windows)
     write(a.out or OUT / f"{a.name}.json", found)
@@ -48,7 +53,10 @@ def main() -> None:
 def by_cost(file: Path, radius: float, name: str, **how: Any) -> tuple[EpisodeStore, EpisodeStore]:
     """Logs to learn by and to judge by, whose costs are all that is known of danger."""
     danger = constraints.Separation(radius, radius / 4)
-    parts = EpisodeStore.split_table(file, LEARN, danger=danger, card={"task": name}, **how)
+    return without_formula(*EpisodeStore.split_table(file, LEARN, danger=danger, card={"task": name}, **how))
+
+
+def without_formula(*parts: EpisodeStore) -> tuple[EpisodeStore, EpisodeStore]:
     hazard = constraints.to_dict(constraints.CostColumn())
     learn, judge = (dataclasses.replace(part, card=part.card.updated(hazard=hazard)) for part in parts)
     return learn, judge

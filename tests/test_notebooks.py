@@ -48,4 +48,4 @@ def test_kept_outputs_are_of_todays_words(file):
         assert cell["outputs"] or "print" not in "".join(cell["source"])
         if "print(world.card)" in "".join(cell["source"]):
             said = "".join(line for out in cell["outputs"] for line in out.get("text", ()))
-            assert "Danger" in said and "VERDICT" in said
+            assert "Causes of danger" in said and "VERDICT" in said

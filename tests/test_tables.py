@@ -523,3 +523,17 @@ def test_the_command_line_says_bounds_and_ends(tmp_path):
     with pytest.raises(SystemExit) as ended:
         app.main([*line.split(), *f"--action-low 0 1 2 --out {tmp_path}/other.h5".split()])
     assert ended.value.code == 2
+
+
+def test_times_may_be_frames():
+    table = valves()
+    frames = table | {"t": 3 + 12 * np.round(table["t"] / 0.5).astype(int)}  # twelve frames a step
+    how = TANKS | {"action": ["valve"]}
+    one, two = EpisodeStore.from_table(table, **how), EpisodeStore.from_table(frames, **how, time_unit=0.5 / 12)
+    assert one.card.dt == two.card.dt == 0.5
+    np.testing.assert_array_equal(one.observations, two.observations)
+    assert any(
+        "or frames, say how long one is" in note for note in EpisodeStore.from_table(frames, **how).card.warnings
+    )
+    with pytest.raises(UserError, match="time_unit=0 must be a number above 0"):
+        EpisodeStore.from_table(frames, **how, time_unit=0)

@@ -84,6 +84,7 @@ def import_table(
     files: Positional[list[Path]],
     out_file: Out,
     time: str = "time",
+    time_unit: float = 1.0,
     agent: str = "agent",
     state: list[str] = [],  # noqa: B006 (tyro reads it, nobody writes it)
     episode: str | None = None,
@@ -109,6 +110,7 @@ def import_table(
             recordings, each with episodes of its own.
         out_file: the store to write.
         time: column of times, s (or of dates).
+        time_unit: seconds of one, where times are something else, e.g. 0.001 of ms, 0.04 of frames at 25 a second.
         agent: column that tells agents apart.
         state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
         episode: column that tells recordings apart.
@@ -148,7 +150,7 @@ def import_table(
     else:
         options |= {"time": time, "agent": agent, "episode": episode, "state": state}
         options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
-        options |= {"terminated": terminated}
+        options |= {"terminated": terminated, "time_unit": time_unit}
     if split is not None and rest is not None:
         learned, judged = EpisodeStore.split_table(files, split, **options)
         imported(learned, kept)

@@ -70,7 +70,8 @@ class Clock:
 
 def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     """The rows in order; an agent's times must increase."""
-    clock = seconds(columns, schema.time)
+    dates = columns[schema.time].dtype.kind in "mM"
+    clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit)
     agents, owner = np.unique(words(columns, schema.agent), return_inverse=True)
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:
@@ -208,7 +209,7 @@ def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Ite
         yield from _jumps(rows, values, schema)
     yield from blurred(rows, values)
     if clock.dt >= LONG:
-        yield f"a step is {clock.dt:g} s: if times are in ms or µs, scale them to seconds"
+        yield f"a step is {clock.dt:g} s: if times are in ms, µs or frames, say how long one is (time_unit)"
     if schema.dt is None:
         yield from _off_the_clock(rows, clock)
     if schema.action:

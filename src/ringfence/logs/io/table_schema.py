@@ -26,6 +26,8 @@ class TableSchema:
     """Columns of a table with a row per agent and time, in SI units. Checked when made; lists may be given as any
     iterable of names, and `cost` as one name.
 
+    `time` is in units of `time_unit` s, e.g. 0.04 of frames at 25 a second; dates are what they are.
+
     Columns of `state` named x, y, z are where an agent is, and vx, vy, vz how fast it moves in the same axes.
     Velocities that are not there are the differences of positions. `action` is an agent's command at that time, which
     it followed until its next row; without any, actions are its accelerations. `reward` and `cost` are what came since
@@ -49,6 +51,7 @@ class TableSchema:
     agent: str
     state: tuple[str, ...]
     episode: str | None = None
+    time_unit: float = 1.0
     action: tuple[str, ...] = ()
     reward: str | None = None
     cost: tuple[str, ...] = ()
@@ -172,7 +175,7 @@ def _episode_steps(schema: TableSchema) -> None:
 
 
 def _numbers_above_zero(schema: TableSchema) -> None:
-    for name in ("dt", "gap", "sensing_radius", "max_speed"):
+    for name in ("time_unit", "dt", "gap", "sensing_radius", "max_speed"):
         value = getattr(schema, name)
         if value is not None and not (isinstance(value, int | float) and 0 < value <= LARGEST):
             raise UserError(f"{name}={value!r:.60} must be a number above 0, and at most {LARGEST:g}.")
