@@ -160,7 +160,7 @@ FILTERS = {
     "constant-velocity brake": ("rows", "brake"),
 }
 MACHINES = ("a-den", "b-den", "town")
-RECORDINGS = ("zara02", "seq_hotel", "zara01", "seq_eth", "students03")
+RECORDINGS = ("zara02", "seq_hotel", "zara01", "seq_eth", "students03", "citr")
 DRIVERS = {"bc": "clone (`bc`)", "straight": "", "accelerate": "", "hasty": "", "seek": ""}
 
 
