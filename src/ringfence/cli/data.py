@@ -141,7 +141,7 @@ def import_table(
         **episodes.options(),
         "cost": cost,
         "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)}
-        | _bounds_of(action, action_low=action_low, action_high=action_high),
+        | _bounds_of(action_low=action_low, action_high=action_high),
     }
     if layout is not None:
         if state or action or reward or goal or episode or rename or wide or terminated:
@@ -170,14 +170,8 @@ def _pairs(rename: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _bounds_of(action: list[str], **bounds: list[float]) -> dict[str, Any]:
-    """What a card says of the bounds of these actions: one of all, or one of each."""
-    for name, given in bounds.items():
-        if len(given) > 1 and len(given) != len(action):
-            raise UserError(
-                f"--{name.replace('_', '-')} gives {len(given)} numbers for {len(action)} columns of actions; give "
-                "one, or one for each."
-            )
+def _bounds_of(**bounds: list[float]) -> dict[str, Any]:
+    """What a card says of the bounds of actions: one of all entries, or one of each."""
     return {name: given[0] if len(given) == 1 else given for name, given in bounds.items() if given}
 
 
@@ -201,6 +195,8 @@ def import_bag(
     episodes: HowEpisodes = AS_THEY_ARE,
     stamps: bool = True,
     twist: Literal["child", "world"] = "child",
+    action_low: list[float] = [],  # noqa: B006
+    action_high: list[float] = [],  # noqa: B006
     task: str | None = None,
 ) -> None:
     """Import a ROS 1 or ROS 2 bag or an MCAP file; needs the extra `ringfence[ros]`.
@@ -217,6 +213,8 @@ def import_bag(
         episodes: how rows become episodes.
         stamps: take the times in headers; --no-stamps takes those of recording.
         twist: frame of the odometry's velocities, child (ROS's rule) or world.
+        action_low: least of each command, or one of all, if other than what was logged.
+        action_high: likewise the largest.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.rosbag import read_bag
@@ -232,7 +230,8 @@ def import_bag(
         action=bag.action,
         cost="cost" if "cost" in bag.columns else None,
         notes=bag.notes,
-        card={"task": task or kept.stem, "provenance": f"bag {file.name}"},
+        card={"task": task or kept.stem, "provenance": f"bag {file.name}"}
+        | _bounds_of(action_low=action_low, action_high=action_high),
         **episodes.options(),
     )
     imported(store, kept)
@@ -245,6 +244,8 @@ def import_lerobot(
     state: list[str] = ["observation.state"],  # noqa: B006
     min_episode_steps: int = 5,
     max_episode_steps: int | None = None,
+    action_low: list[float] = [],  # noqa: B006
+    action_high: list[float] = [],  # noqa: B006
     task: str | None = None,
 ) -> None:
     """Import a LeRobot data set of version 2 or 3; needs the extra `ringfence[tables]`.
@@ -257,6 +258,8 @@ def import_lerobot(
         state: columns of what an arm knows of itself, e.g. observation.state observation.velocity.
         min_episode_steps: steps of an episode, at least.
         max_episode_steps: steps of an episode, at most; longer ones are cut.
+        action_low: least of each entry of an action, or one of all, if other than what was logged.
+        action_high: likewise the largest.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.lerobot import read_lerobot
@@ -276,7 +279,8 @@ def import_lerobot(
         min_episode_steps=min_episode_steps,
         max_episode_steps=max_episode_steps,
         notes=read.notes,
-        card={"task": task or kept.stem, "provenance": f"LeRobot {folder.resolve().name}"},
+        card={"task": task or kept.stem, "provenance": f"LeRobot {folder.resolve().name}"}
+        | _bounds_of(action_low=action_low, action_high=action_high),
     )
     imported(store, kept)
 
