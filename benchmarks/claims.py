@@ -490,14 +490,15 @@ def own_shield_leaves(most: float) -> Callable[[], tuple[bool, str]]:
 
 
 def as_safe_by_v() -> tuple[bool, str]:
-    """ℓ alone touches along one and three rows, and neither V with them nor ℓ along fifteen does."""
+    """ℓ alone touches along one row, and neither V with it, nor with three, nor ℓ along seven does."""
     name = "default+shield-learned"
     shares = [
         mean("crossing-guards", "crossing-hasty", ("bc", name + more), "violation_rate")
-        for more in (*(f"+horizon{k}+terminal_valueFalse" for k in (1, 3, 15)), "+horizon1", "")
+        for more in (*(f"+horizon{k}+terminal_valueFalse" for k in (1, 3, 7)), "+horizon1", "")
     ]
     text = ", ".join(f"{100 * s:.3g} %" for s in shares)
-    return min(shares[:2]) > 0.03 and max(shares[2:]) == 0, f"ℓ with 1, 3, 15 rows, V with 1, 3: {text} of episodes"
+    held = shares[0] > 0.1 and 0 < shares[1] < 0.03 and max(shares[2:]) == 0
+    return held, f"ℓ with 1, 3, 7 rows, V with 1, 3: {text} of episodes"
 
 
 def told_clones_earn() -> tuple[bool, str]:
@@ -543,11 +544,12 @@ def guards_price() -> tuple[bool, str]:
 
 
 def diffusion_on_crossing() -> tuple[bool, str]:
-    """MADIFF less the actor that is told the same return: alone the interval is above 0, under the shield around it."""
+    """MADIFF less the actor that is told the same return: more alone, and less than 2 % of it under the shield."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
     both = [difference(suite, task, ("madiff", v), ("bc-return", v), "return") for v in ("default", key)]
     text = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
-    return both[0].low > 0 and both[1].low <= 0 <= both[1].high, f"alone and under the shield {text}"
+    share = both[1].mean / mean(suite, task, ("bc-return", key), "return_mean")
+    return both[0].low > 0 and 0 <= share < 0.02, f"alone and under the shield {text}"
 
 
 def no_size_touches() -> tuple[bool, str]:
@@ -668,13 +670,13 @@ CLAIMS = (
     ),
     Claim(
         "docs/crossing-results.md",
-        "V with one predicted step or three is as safe",
+        "predicted step or three is as safe as ℓ along seven",
         "results/crossing-guards/table.csv",
         as_safe_by_v,
     ),
     Claim(
         "docs/crossing-results.md",
-        "a return-conditioned clone earns 4.94 under the same shield",
+        "a return-conditioned clone earns 4.93 under the same shield",
         "results/crossing-guards/table.csv",
         told_clones_earn,
     ),
@@ -731,7 +733,7 @@ CLAIMS = (
     Claim("docs/ope.md", "Danger is ranked well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)),
     Claim(
         "docs/attribution.md",
-        "On Crossing diffusion earns more alone, and nothing more under a shield",
+        "On Crossing diffusion earns more alone, and hardly more under a shield",
         "results/crossing-guards/table.csv",
         diffusion_on_crossing,
     ),

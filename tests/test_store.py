@@ -317,7 +317,7 @@ def test_makers_refuse_incomplete_logs(played):
         ("episode_ends", [[4]], r"episode_ends has shape \(1, 1\), which is not 1 axes"),
         ("episode_ends", [3.5, 4], "episode_ends holds fractions"),
         ("episode_ends", [], "ends at nothing"),
-        ("observations", None, "observations holds nothing"),
+        ("observations", None, "observations is None; it is needed"),
         ("rewards", [[1.0], [1.0, 2.0], [0.0], [0.0]], "rewards is no array .*; give every row the same length"),
         ("rewards", ["1", "2", "3", "4"], "rewards holds entries that are no real numbers"),
     ):
@@ -573,8 +573,8 @@ def test_episodes_are_selected_by_flags_or_numbers(small_store):
     flags = np.arange(small_store.episodes) % 7 == 0
     one, two = small_store.select(flags), small_store.select(np.flatnonzero(flags))
     np.testing.assert_array_equal(one.observations, two.observations)
-    for wrong in (flags[:-1], [small_store.episodes], [0.5], [[0]]):
-        with pytest.raises(StoreError, match="select got .* or numbers of episodes from 0 to 39"):
+    for wrong in (flags[:-1], flags.astype(int), [small_store.episodes], [0.5], [[0]]):
+        with pytest.raises(StoreError, match="select got .* or different numbers of episodes from 0 to 39"):
             small_store.select(wrong)
 
 

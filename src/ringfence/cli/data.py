@@ -144,8 +144,8 @@ def import_table(
         | _bounds_of(action_low=action_low, action_high=action_high),
     }
     if layout is not None:
-        if state or action or reward or goal or episode or rename or wide or terminated:
-            raise UserError(f"--layout {layout} says which columns are what; leave the names of columns out.")
+        if state or action or reward or goal or episode or rename or wide or terminated or time_unit != 1:
+            raise UserError(f"--layout {layout} says which columns are what, in which unit; leave these options out.")
         options["layout"] = layout
     else:
         options |= {"time": time, "agent": agent, "episode": episode, "state": state}

@@ -242,11 +242,10 @@ def _lists_of_words(card: dict) -> None:
         words = words.tolist() if isinstance(words, np.ndarray) else words
         if words is not None and not (isinstance(words, list | tuple) and all(isinstance(w, str) for w in words)):
             of_each = isinstance(words, list | tuple) and all(isinstance(w, list | tuple) for w in words)
-            raise StoreError(
-                f"The card has {name}={str(words)[:200]}; it must be "
-                + ("one list of words for all agents: an entry for each quantity, 0 where an agent has none." * of_each)
-                + ("a list of words, or be left out." * (not of_each))
-            )
+            rule = "a list of words, or be left out"
+            if of_each:
+                rule = "one list of words for all agents: an entry for each quantity, 0 where an agent has none"
+            raise StoreError(f"The card has {name}={str(words)[:200]}; it must be {rule}.")
         if name in card:
             card[name] = words if words is None else list(words)
         if words and name in LISTS_OF_NAMES:

@@ -560,10 +560,10 @@ def _chosen(keep: Any, episodes: int) -> np.ndarray:
     given = np.asarray(keep)
     flags = given.dtype == bool and given.shape == (episodes,)
     numbers = given.dtype.kind in "iu" and given.ndim == 1 and bool(((given >= 0) & (given < episodes)).all())
-    if not flags and not numbers:
+    if not flags and not (numbers and len(set(given.tolist())) == len(given)):  # 0 and 1 are no flags
         raise StoreError(
-            f"select got {given.dtype} of shape {given.shape}; give ({episodes},) true or false, or numbers of "
-            f"episodes from 0 to {episodes - 1}."
+            f"select got {given.dtype} of shape {given.shape}; give ({episodes},) true or false, or different "
+            f"numbers of episodes from 0 to {episodes - 1}."
         )
     return given if flags else np.isin(np.arange(episodes), given)
 
