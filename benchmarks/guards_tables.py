@@ -34,10 +34,10 @@ ROBOTS: dict[str, Column] = {
     "**adapt**": ("guards-mujoco", ("bc", "default+adapt-learned")),
     "full, analytic": ("guards-mujoco", ("bc", "default+full-analytic")),
     "**full**": ("guards-mujoco", ("bc", "default+full-learned")),
-    "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
 }
 ROBOTS_DEFAULTS: dict[str, Column] = {
-    words: ("guards-mujoco-defaults", row) for words, (suite, row) in ROBOTS.items() if suite == "guards-mujoco"
+    **{words: ("guards-mujoco-defaults", row) for words, (_, row) in ROBOTS.items()},
+    "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
 }
 # Crossing's rows: algorithm and variant, and their words.
 SHIELDED = "+shield-learned"
