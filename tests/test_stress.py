@@ -525,7 +525,7 @@ def test_what_is_done_on_an_alarm_is_an_option(run, tmp_path):
     widens, _ = alarmed(on_alarm="widen")
     assert widens.policy.one.guard.options.margin == pytest.approx(1.5 * made.guard["margin"])
     widens.act(seen)
-    hands_over, _ = alarmed(on_alarm="hand_over", fallback=lambda seen, state: np.full((8, 2), 0.25))
+    hands_over, _ = alarmed(on_alarm="hand_over", fallback=lambda seen: np.full((8, 2), 0.25))
     np.testing.assert_array_equal(hands_over.act(seen), 0.25)
     for wrong, words in (
         ({"on_alarm": "panic"}, "is none of its choices"),

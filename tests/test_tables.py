@@ -537,3 +537,23 @@ def test_times_may_be_frames():
     )
     with pytest.raises(UserError, match="time_unit=0 must be a number above 0"):
         EpisodeStore.from_table(frames, **how, time_unit=0)
+
+
+def test_what_is_cut_off_a_long_time_is_counted_too_and_costs_that_are_not_known_yet_are_not():
+    how = TANKS | {"action": ["valve"], "max_episode_steps": 26}  # of 29, three are left
+    store = EpisodeStore.from_table(valves(), **how)
+    assert store.lengths.tolist() == [26] * 11
+    (said,) = [note for note in store.card.warnings if "left out, since" in note]
+    assert said.startswith("12 of 23 times are left out") and said.endswith("1 of them with a cost")
+    places = valves() | {"x": np.arange(len(valves()["t"])) * 0.1}
+    how = {name: given for name, given in TANKS.items() if name != "cost"} | {"state": ["x"], "action": ["valve"]}
+    store = EpisodeStore.from_table(places, **how, danger=Separation(0.3), max_speed=50.0)
+    (said,) = [note for note in store.card.warnings if "left out, since" in note]
+    assert said.endswith("(min_episode_steps)")
+
+
+def test_a_bound_that_is_given_is_not_explained_and_the_other_is():
+    low, high = ({f"action_{side}": end} for side, end in (("low", -1.0), ("high", 2.0)))
+    for card, explained in (({}, True), (high, True), (low, False)):
+        store = EpisodeStore.from_table(valves(), **TANKS, action=["valve"], card=card)
+        assert any("never negative" in note for note in store.card.warnings) == explained

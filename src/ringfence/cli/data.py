@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -57,6 +57,26 @@ AS_THEY_ARE = Episodes()
 HowEpisodes = tyro.conf.OmitArgPrefixes[Episodes]
 
 
+@dataclass(frozen=True)
+class ActionBounds:
+    """How far actions go."""
+
+    action_low: list[float] = field(default_factory=list)
+    """least of each entry of an action, or one of all; by default as far as the largest logged command, and 0 where
+    none is negative."""
+    action_high: list[float] = field(default_factory=list)
+    """likewise the largest."""
+
+    def facts(self) -> dict[str, Any]:
+        """What a card says of them: one number of all entries, or one of each."""
+        given = {name: getattr(self, name) for name in ("action_low", "action_high")}
+        return {name: ends[0] if len(ends) == 1 else ends for name, ends in given.items() if ends}
+
+
+AS_LOGGED = ActionBounds()
+HowBounded = tyro.conf.OmitArgPrefixes[ActionBounds]
+
+
 def make(
     task: Positional[str],
     size: int | None = None,
@@ -90,8 +110,7 @@ def import_table(
     episode: str | None = None,
     action: list[str] = [],  # noqa: B006
     reward: str | None = None,
-    action_low: list[float] = [],  # noqa: B006
-    action_high: list[float] = [],  # noqa: B006
+    bounds: HowBounded = AS_LOGGED,
     cost: list[str] = [],  # noqa: B006
     limits: list[float] = [],  # noqa: B006
     terminated: str | None = None,
@@ -115,9 +134,7 @@ def import_table(
         state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
         episode: column that tells recordings apart.
         action: columns of what it was commanded to do until its next row; accelerations by default.
-        action_low: least of each of --action, or one of all; by default as far as the largest logged command, and 0
-            where none is negative.
-        action_high: likewise the largest.
+        bounds: how far actions go.
         reward: column of what it earned since its row before; progress to the goal by default, or nothing.
         cost: column of danger since its row before, 0 or above; several are constraints of these names.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
@@ -141,7 +158,7 @@ def import_table(
         **episodes.options(),
         "cost": cost,
         "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)}
-        | _bounds_of(action_low=action_low, action_high=action_high),
+        | bounds.facts(),
     }
     if layout is not None:
         if state or action or reward or goal or episode or rename or wide or terminated or time_unit != 1:
@@ -170,11 +187,6 @@ def _pairs(rename: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _bounds_of(**bounds: list[float]) -> dict[str, Any]:
-    """What a card says of the bounds of actions: one of all entries, or one of each."""
-    return {name: given[0] if len(given) == 1 else given for name, given in bounds.items() if given}
-
-
 def _limits_of(cost: list[str], limits: list[float]) -> dict[str, Any]:
     """What a card says of the limits of these costs: of each by its name, where there are several."""
     if limits and len(limits) != len(cost):
@@ -195,8 +207,7 @@ def import_bag(
     episodes: HowEpisodes = AS_THEY_ARE,
     stamps: bool = True,
     twist: Literal["child", "world"] = "child",
-    action_low: list[float] = [],  # noqa: B006
-    action_high: list[float] = [],  # noqa: B006
+    bounds: HowBounded = AS_LOGGED,
     task: str | None = None,
 ) -> None:
     """Import a ROS 1 or ROS 2 bag or an MCAP file; needs the extra `ringfence[ros]`.
@@ -213,8 +224,7 @@ def import_bag(
         episodes: how rows become episodes.
         stamps: take the times in headers; --no-stamps takes those of recording.
         twist: frame of the odometry's velocities, child (ROS's rule) or world.
-        action_low: least of each command, or one of all, if other than what was logged.
-        action_high: likewise the largest.
+        bounds: how far actions go.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.rosbag import read_bag
@@ -230,8 +240,7 @@ def import_bag(
         action=bag.action,
         cost="cost" if "cost" in bag.columns else None,
         notes=bag.notes,
-        card={"task": task or kept.stem, "provenance": f"bag {file.name}"}
-        | _bounds_of(action_low=action_low, action_high=action_high),
+        card={"task": task or kept.stem, "provenance": f"bag {file.name}"} | bounds.facts(),
         **episodes.options(),
     )
     imported(store, kept)
@@ -244,8 +253,7 @@ def import_lerobot(
     state: list[str] = ["observation.state"],  # noqa: B006
     min_episode_steps: int = 5,
     max_episode_steps: int | None = None,
-    action_low: list[float] = [],  # noqa: B006
-    action_high: list[float] = [],  # noqa: B006
+    bounds: HowBounded = AS_LOGGED,
     task: str | None = None,
 ) -> None:
     """Import a LeRobot data set of version 2 or 3; needs the extra `ringfence[tables]`.
@@ -258,8 +266,7 @@ def import_lerobot(
         state: columns of what an arm knows of itself, e.g. observation.state observation.velocity.
         min_episode_steps: steps of an episode, at least.
         max_episode_steps: steps of an episode, at most; longer ones are cut.
-        action_low: least of each entry of an action, or one of all, if other than what was logged.
-        action_high: likewise the largest.
+        bounds: how far actions go.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.io.lerobot import read_lerobot
@@ -279,8 +286,7 @@ def import_lerobot(
         min_episode_steps=min_episode_steps,
         max_episode_steps=max_episode_steps,
         notes=read.notes,
-        card={"task": task or kept.stem, "provenance": f"LeRobot {folder.resolve().name}"}
-        | _bounds_of(action_low=action_low, action_high=action_high),
+        card={"task": task or kept.stem, "provenance": f"LeRobot {folder.resolve().name}"} | bounds.facts(),
     )
     imported(store, kept)
 

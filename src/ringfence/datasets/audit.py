@@ -51,8 +51,8 @@ def audit(store: EpisodeStore) -> Audit:
 
 
 def odd_danger(store: EpisodeStore, task: Task) -> list[str]:
-    """What a World of these logs would not know of danger, before it is fitted: names that nobody reads, a formula
-    that cannot be read, no danger at all."""
+    """What a World of these logs would not know of danger, before it is fitted: names that nobody reads, actions on
+    one side of their bounds alone, a formula that cannot be read, no danger at all."""
     told = store.team_costs.any() or not isinstance(task.hazard, constraints.CostColumn)
     untold = [] if told else ["No step has a cost and the card has no formula: no guard can use this World."]
     return [*odd_names(store), *odd_actions(store), *_unread(store, task), *untold]
@@ -184,18 +184,15 @@ def _odd_ends(store: EpisodeStore) -> list[str]:
 def odd_actions(store: EpisodeStore) -> list[str]:
     """A warning of bounds that the logs use on one side alone: a guard would search where nobody acted."""
     low, high = (np.broadcast_to(bound, store.actions.shape[1:]) for bound in store.card.bounds)
-    middle = (low + high) / 2
     least, most = store.actions.min(0), store.actions.max(0)
-    varies = most > least
-    found = []
-    for word, one_side in (("below", varies & (least >= middle)), ("above", varies & (most <= middle))):
-        for entry in np.flatnonzero(one_side.any(0)):
-            found.append(
-                f"Entry {entry} of the actions is never {word} {middle[:, entry].flat[0]:g}, though bounded "
-                f"by {low[:, entry].min():g} and {high[:, entry].max():g}: give the bounds that it has (action_low, "
-                "action_high), since a guard searches within them."
-            )
-    return list(dict.fromkeys(found))
+    both = (low < 0) & (high > 0) & (most > least)
+    return [
+        f"Entry {entry} of the actions is never {word} 0, though bounded by {low[:, entry].min():g} and "
+        f"{high[:, entry].max():g}: give the bounds that it has (action_low, action_high), since a guard searches "
+        "within them."
+        for word, one_side in (("below", both & (least >= 0)), ("above", both & (most <= 0)))
+        for entry in np.flatnonzero(one_side.any(0))
+    ]
 
 
 def _cost_rate(store: EpisodeStore) -> float:

@@ -62,7 +62,7 @@ class Controller:
 
     `finished(violated)` after an episode watches whether the certificate's bound is kept. `on_alarm` says what is done
     when it is not: report (`info["alarm"]`), stop (refuse to act), widen (half as much margin again), or hand_over (to
-    `fallback`, a callable (observations, state) -> actions that nothing guards).
+    `fallback`, a callable like `run` may be, that nothing guards).
 
     driven: who acts by this controller, where a team's guard is that of one agent among others (or some): it decides
     for them alone, and expects of the others what is proposed for them. `info["agent_infeasible"]` is of them, too.

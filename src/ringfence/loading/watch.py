@@ -12,6 +12,7 @@ from ringfence.errors import UserError, known
 from ringfence.faults.certificate import Certificate
 from ringfence.faults.monitor import Monitor
 from ringfence.guards.wrap import guarded_of, with_guarded
+from ringfence.utils.functions import of_both
 from ringfence.utils.given import given_as
 
 ON_ALARM = ("report", "stop", "widen", "hand_over")
@@ -30,7 +31,7 @@ class Watch:
         if (on_alarm == "hand_over") != (fallback is not None):
             raise UserError("on_alarm='hand_over' and fallback=, who then acts, go together; give both or none.")
         self.on_alarm = on_alarm
-        self.fallback = fallback
+        self.fallback = None if fallback is None else of_both(fallback)
         self._monitor = None
         if certificate is not None and certificate.bound < 1:
             self._monitor = Monitor(certificate.bound)

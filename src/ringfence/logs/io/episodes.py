@@ -132,31 +132,38 @@ def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ..
     """Rows (W, N) of windows in which a team is there, how many rows each has, and what is said of those that are too
     short."""
     schema = motion.schema
-    rows, lengths, n = teams(motion.tracks, schema.team)
-    short = _too_short(motion, rows, lengths)
-    index, lengths = cut(lengths, schema.min_episode_steps, schema.max_episode_steps)
+    rows, there, n = teams(motion.tracks, schema.team)
+    index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
     if not len(lengths):
         here = np.unique(motion.tracks.agent).size
         raise StoreError(
             f"No {n} agents are together for {schema.min_episode_steps} steps of {motion.tracks.dt:g} s (the table has "
             f"{here}); give another team, a smaller min_episode_steps, a longer gap, or neighbours."
         )
-    return rows[index], lengths, short
+    return rows[index], lengths, _too_short(motion, rows, there, index, len(lengths))
 
 
-def _too_short(motion: Motion, rows: np.ndarray, lengths: np.ndarray) -> tuple[str, ...]:
-    """What is said of windows (W, N) with too few steps, of so many rows each: a short one may be one that ended in
-    danger."""
-    fewest = motion.schema.min_episode_steps
-    short = lengths - 1 < fewest
-    if not short.any():
+def _too_short(
+    motion: Motion, rows: np.ndarray, there: np.ndarray, index: np.ndarray, episodes: int
+) -> tuple[str, ...]:
+    """What is said of times with too few steps, which `cut` left out: a short one may be one that ended in danger. Of
+    windows (W, N) of `there` rows each, `index` are in one of the `episodes`."""
+    left = np.ones(len(rows), bool)
+    left[index] = False
+    window = np.repeat(np.arange(len(there)), there)
+    goes_on = np.append(False, left[:-1] & (window[1:] == window[:-1]))
+    begins = left & ~goes_on
+    times = int(begins.sum())
+    if not times:
         return ()
-    costly = np.repeat(np.arange(len(lengths)), lengths)[motion.tracks.cost[rows].any((1, 2))]
-    with_cost = int((short & np.isin(np.arange(len(lengths)), costly)).sum())
-    return (
-        f"{int(short.sum())} of {len(lengths)} times are left out, since they have fewer than {fewest} steps "
-        f"(min_episode_steps), {with_cost or 'none'} of them with a cost",
-    )
+    fewest = motion.schema.min_episode_steps
+    said = f"{times} of {times + episodes} times are left out, since they have fewer than {fewest} steps"
+    said += " (min_episode_steps)"
+    if motion.schema.cost:  # what follows from distances is not known yet
+        costly = motion.tracks.cost[rows[left]].any((1, 2))
+        with_cost = len(np.unique(np.cumsum(begins)[left][costly]))
+        said += f", {with_cost or 'none'} of them with a cost"
+    return (said,)
 
 
 def _of_others(motion: Motion) -> dict[str, np.ndarray]:
@@ -201,29 +208,29 @@ def neighbour_episodes(motion: Motion) -> Episodes:
     schema = motion.schema
     tracks = motion.tracks
     assert schema.neighbours is not None
-    lengths = np.bincount(tracks.segment, minlength=tracks.segment.max() + 1)
-    notes = _too_short(motion, np.arange(len(tracks.segment))[:, None], lengths)
-    index, lengths = cut(lengths, schema.min_episode_steps, schema.max_episode_steps)
+    there = np.bincount(tracks.segment, minlength=tracks.segment.max() + 1)
+    index, lengths = cut(there, schema.min_episode_steps, schema.max_episode_steps)
+    notes = _too_short(motion, np.arange(len(tracks.segment))[:, None], there, index, len(lengths))
     if not len(lengths):
         raise StoreError(
             f"No agent is there for {schema.min_episode_steps} steps of {tracks.dt:g} s; give a smaller "
             "min_episode_steps."
         )
     near = nearest(tracks, motion.place, schema.neighbours, schema.sensing_radius or np.inf)
-    there = near >= 0
-    offset = np.where(there[..., None], motion.place[near] - motion.place[:, None], 0.0)
-    drift = np.where(there[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
+    seen = near >= 0
+    offset = np.where(seen[..., None], motion.place[near] - motion.place[:, None], 0.0)
+    drift = np.where(seen[..., None], motion.velocity[near] - motion.velocity[:, None], 0.0)
     radius = schema.sensing_radius or float(np.linalg.norm(offset, axis=-1).max(initial=1.0))
-    offset[~there] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
+    offset[~seen] = np.eye(offset.shape[-1])[0] * radius  # nobody is as far as one sees
     names, parts = motion.own(with_place=False)
     for j in range(schema.neighbours):
-        parts += [offset[:, j], drift[:, j], there[:, j, None].astype(float)]
+        parts += [offset[:, j], drift[:, j], seen[:, j, None].astype(float)]
         names += [f"other{j}.d{axis}" for axis in schema.position]
         names += [f"other{j}.dv{axis}" for axis in schema.axes]
         names.append(f"other{j}.seen")
     cost = tracks.cost
     if schema.separation is not None:
         close = np.linalg.norm(offset[:, 0], axis=-1) < schema.separation.radius
-        cost = (close & there[:, 0]).astype(float)[:, None]
+        cost = (close & seen[:, 0]).astype(float)[:, None]
     rows = index[:, None]
     return Episodes(rows, lengths, np.concatenate(parts, 1)[rows], names, cost[rows], notes, float(radius))

@@ -241,8 +241,7 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         costs = costs[:, 0]
     actions = _actions(motion, episodes)[episodes.leaves]
     low, high = _of_commands(actions) if schema.action else _usual(actions)
-    if not {"action_low", "action_high"} & set(card):
-        warnings = [*warnings, *_one_sided(schema.action, low, high)]
+    warnings = [*warnings, *_one_sided(schema.action, low, high, card)]
     outliers = int((np.abs(actions) > high).any(-1).sum()) if not schema.action else 0
     if outliers:
         largest = float(np.abs(actions).max())
@@ -286,11 +285,11 @@ def _of_commands(actions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where((least < 0) | (most == 0), -largest, 0.0), np.where((most > 0) | (least == 0), largest, 0.0)
 
 
-def _one_sided(names: Sequence[str], low: np.ndarray, high: np.ndarray) -> Iterator[str]:
-    """Commands that are bounded by 0 because nobody gave any beyond it."""
+def _one_sided(names: Sequence[str], low: np.ndarray, high: np.ndarray, card: Mapping[str, Any]) -> Iterator[str]:
+    """Commands that are bounded by 0 because nobody gave any beyond it, and the card does not say how far they go."""
     for word, ends, option in (("negative", low, "low"), ("positive", high, "high")):
         found = [name for name, end in zip(names, ends) if end == 0]
-        if found:
+        if found and f"action_{option}" not in card:
             yield (
                 f"{', '.join(found)} {'are' if len(found) > 1 else 'is'} never {word} and bounded by 0; give "
                 f"--action-{option} (card={{'action_{option}': ...}}) if it can be"
