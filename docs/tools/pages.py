@@ -33,7 +33,7 @@ NOTEBOOKS = [
 
 # --- the Python reference: pages of modules that belong together ---
 REFERENCE = {
-    "Logs": ("ringfence.logs.store", "ringfence.datasets.make", "ringfence.datasets.audit"),
+    "Logs": ("ringfence.logs.store", "ringfence.problem.layout", "ringfence.datasets.make", "ringfence.datasets.audit"),
     "Importers": (
         "ringfence.logs.io.table_schema",
         "ringfence.logs.io.table",
@@ -58,6 +58,7 @@ REFERENCE = {
         "ringfence.faults.monitor",
         "ringfence.evaluation.simulators",
         "ringfence.logs.collect",
+        "ringfence.envs.padded",
         "ringfence.evaluation.reference",
         "ringfence.deploy.zoo",
     ),

@@ -26,6 +26,8 @@ _WHERE = {
     "Faults": "ringfence.faults",
     "certify": "ringfence.evaluation.certify",
     "collect": "ringfence.logs.collect",
+    "padded": "ringfence.envs.padded",
+    "Layout": "ringfence.problem.layout",
     "ope": "ringfence.evaluation.ope",
     "replay": "ringfence.evaluation.replay",
     "World": "ringfence.world",

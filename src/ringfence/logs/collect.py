@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
+from ringfence.envs.padded import PaddedEnv
 from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
 from ringfence.logs.schema import given_card
 from ringfence.logs.store import EpisodeStore
@@ -197,15 +198,20 @@ class _Space:
 
     bounds: Bounds
     entries: int
+    has_entry: np.ndarray | None = None  # (N, A) bool, where agents have different numbers of entries
 
     def clipped(self, actions: np.ndarray) -> np.ndarray:
-        """Actions (N, A) within the bounds; more than a rounding outside is refused."""
+        """Actions (N, A) within the bounds; more than a rounding outside is refused. What an agent has not stays at the
+        middle."""
+        if self.has_entry is not None:
+            actions = np.where(self.has_entry, actions, self.bounds.middle)
         if self.bounds.outside(actions).any():
             raise UserError(
                 f"The policy gave actions from {actions.min():.4g} to {actions.max():.4g}, the action space is from "
                 f"{self.bounds}; clip or scale them."
             )
-        return np.clip(actions, self.bounds.low, self.bounds.high)
+        clipped = np.clip(actions, self.bounds.low, self.bounds.high)
+        return clipped.astype(np.float32)  # a space of single precision holds no number of double precision
 
 
 @dataclass(frozen=True)
@@ -364,6 +370,7 @@ def _store(
             "agents": [str(agent) for agent in env.possible_agents],
             "action_low": bounds.low,
             "action_high": bounds.high,
+            **(env.layout.card if isinstance(env, PaddedEnv) else {}),
             **card,
         },
     )
@@ -409,10 +416,12 @@ def _space(env: Any) -> _Space:
     widths = {space.shape[0] for space in spaces}
     low = min(float(space.low.min()) for space in spaces)
     high = max(float(space.high.max()) for space in spaces)
-    if len(widths) > 1 or not np.isfinite([low, high]).all():
+    if not np.isfinite([low, high]).all():
+        raise UserError(f"{name} has action spaces from {low:g} to {high:g}; they must be bounded.")
+    if len(widths) > 1:
         raise UserError(
-            f"{name} has action spaces of {sorted(widths)} entries from {low:g} to {high:g}; they must "
-            "be as wide for all agents, and bounded."
+            f"{name} has action spaces of {sorted(widths)} entries, and all agents must have as many; pass "
+            "ringfence.padded(make_env), in which they have."
         )
     bounds = Bounds.of(np.stack([space.low for space in spaces]), np.stack([space.high for space in spaces]))
-    return _Space(bounds, widths.pop())
+    return _Space(bounds, widths.pop(), env.layout.has_entry if isinstance(env, PaddedEnv) else None)

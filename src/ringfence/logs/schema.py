@@ -244,7 +244,10 @@ def _lists_of_words(card: dict) -> None:
             of_each = isinstance(words, list | tuple) and all(isinstance(w, list | tuple) for w in words)
             rule = "a list of words, or be left out"
             if of_each:
-                rule = "one list of words for all agents: an entry for each quantity, 0 where an agent has none"
+                rule = (
+                    "one list of words for all agents: an entry for each quantity, 0 where an agent has none "
+                    "(ringfence.Layout makes such arrays)"
+                )
             raise StoreError(f"The card has {name}={str(words)[:200]}; it must be {rule}.")
         if name in card:
             card[name] = words if words is None else list(words)
