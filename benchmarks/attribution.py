@@ -150,7 +150,6 @@ OF_ROBOTS = (
             ("bc", f"default{FULL}"),
             ("mpc", f"default{FULL}{reach}"),
             ROBOT_KEYS,
-            shown=reach != "",
         )
         for where, reach in (("near rest", ""), ("climbed anywhere", "+trust_radius2.0"))
     ),
@@ -203,8 +202,8 @@ def _usual(counts: list[int]) -> int:
 ROBOTS: dict[str, Row] = {
     "BC": ("bc", f"default{ADAPT}"),
     "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
-    "our MADIFF": ("madiff", f"default{STEADY}"),
     "ICBF": ("icbf", f"default{STEADY}"),
+    "MPC, `full`": ("mpc", f"default{FULL}"),
     "MPC, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }
 

@@ -34,9 +34,6 @@ ROBOTS: dict[str, Column] = {
     "**adapt**": ("guards-mujoco", ("bc", "default+adapt-learned")),
     "full, analytic": ("guards-mujoco", ("bc", "default+full-analytic")),
     "**full**": ("guards-mujoco", ("bc", "default+full-learned")),
-}
-ROBOTS_DEFAULTS: dict[str, Column] = {
-    **{words: ("guards-mujoco-defaults", row) for words, (_, row) in ROBOTS.items()},
     "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
 }
 # Crossing's rows: algorithm and variant, and their words.
@@ -72,7 +69,6 @@ SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
 def main() -> None:
     put("docs/guard-results.md", "spread", table(SPREAD, short))
     put("docs/guard-results.md", "robots", table(ROBOTS, long))
-    put("docs/guard-results.md", "robots-defaults", table(ROBOTS_DEFAULTS, long))
     put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
     put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", filtered=False))
     put("docs/proving-ground.md", "drawn", proving(RESULTS / "proving" / "drawn", "*.json", filtered=False))

@@ -215,17 +215,17 @@ SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
     ),
     "BC + guard, *analytic*": (
         ("guards", "bc", "default+shield-analytic"),
-        ("guards-mujoco-defaults", "bc", "+adapt-analytic"),
+        ("guards-mujoco", "bc", "+adapt-analytic"),
         None,
     ),
     "**BC + guard**": (
         ("guards", "bc", "default+shield-learned"),
-        ("guards-mujoco-defaults", "bc", "+adapt-learned"),
+        ("guards-mujoco", "bc", "+adapt-learned"),
         ("crossing", "bc", "default+shield-learned"),
     ),
     "**BC + guard that also climbs values** (`full`)": (
         ("guards", "bc", "default+full-learned"),
-        ("guards-mujoco-defaults", "bc", "+full-learned"),
+        ("guards-mujoco", "bc", "+full-learned"),
         ("crossing-guards", "bc", "default+full-learned"),
     ),
 }
@@ -234,7 +234,7 @@ SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
 def summary() -> str:
     """One line per method: all tiers, all robots and Crossing in a cell each."""
     data = {s: grouped(s) for s in ("simple_spread", "guards", "guards-before", "crossing", "crossing-guards")}
-    robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco-defaults")}
+    robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
     logs = [data["simple_spread"][f"simple_spread-{t}", "behaviour data", "reference"][0] for t in TIERS]
     logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
     lines = ["| method | Simple Spread | robots | Crossing |", "|---|---|---|---|"]

@@ -140,6 +140,28 @@ def test_a_blurred_cause_of_all_does_not_hide_those_of_some(monkeypatch):
     assert cause_search.find(*about)[0].false_alarms > 0.01, "without both"
 
 
+def test_a_cause_is_not_about_agents_who_have_nothing_of_it():
+    """Two batteries and an engine, whose charge is 0 in the logs: it would stand in the midst of their danger."""
+    chance = np.random.default_rng(0)
+    x = np.zeros((300, 60, 3, 3))
+    steps = chance.normal(0, 0.05, x.shape)
+    charge = 0.5 + np.cumsum(steps[..., :2, 0], 1)
+    charge = np.abs(charge - 2 * np.floor(charge / 2) - 1)  # mirrored at 0 and 1
+    x[..., :2, 0] = charge
+    x[..., 2, 1] = 20 + 10 * np.cumsum(steps[..., 2, 1], 1)
+    load = np.cumsum(steps[..., 0, 2], 1)
+    x[..., 2] = load[..., None]
+    unsafe = (charge < 0.1).any(-1) | (np.abs(load) > 0.8)
+    names = ["own.charge", "own.heat", "bus.load"]
+    episode = np.repeat(np.arange(300), 60)
+    found, _ = cause_search.find(x.reshape(-1, 3, 3), unsafe.ravel(), episode, names)
+    told = {cause.name: edge.bounds for cause, edge in zip(found.causes, found.edges)}
+    assert set(told) == {"own.charge of agent 0, agent 1", "bus.load"} and found.explained > 0.98
+    assert [round(bound, 1) for bound in told["own.charge of agent 0, agent 1"]] == [0.1, 1.0]  # danger, end of logs
+    wide = next(causes.wider(found.causes[list(told).index("own.charge of agent 0, agent 1")], names))
+    assert wide.name == "own.charge, own.heat of agent 0, agent 1" and wide.who == ((0, 0), (1, 0))
+
+
 def row_of(agents: int, steps: int, seed: int = 0):
     """A row of agents who keep their order, each of whom sees how far all others are; the next may not come nearer than
     0.3. Returns what `find` takes."""

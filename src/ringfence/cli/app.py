@@ -115,7 +115,8 @@ def fit(
     """Fit the World of a task's data or of a store, and print its card: what can be predicted, how well, where not. The
     last line is the verdict; exit status 3 says that it is unfit to guard by.
 
-    Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on.
+    Cached by content: the same data, settings and seed are fitted once, and an interrupted fit goes on with the part
+    that it was at.
 
     Args:
         data: a task (its data set is regenerated if need be) or a store's file.

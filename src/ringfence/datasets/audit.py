@@ -182,7 +182,17 @@ def _odd_ends(store: EpisodeStore) -> list[str]:
 
 
 def odd_actions(store: EpisodeStore) -> list[str]:
-    """A warning of bounds that the logs use on one side alone: a guard would search where nobody acted."""
+    """Warnings of agents who never act in another way, of whom nobody learns what actions do, and of bounds that the
+    logs use on one side alone: a guard would search where nobody acted."""
+    still = np.flatnonzero((np.ptp(store.actions, 0) == 0).all(-1))
+    who = ", ".join(map(str, still))
+    return [
+        *([f"Actions of agent {who} never vary: no World can learn what they do."] if len(still) else []),
+        *_one_sided(store),
+    ]
+
+
+def _one_sided(store: EpisodeStore) -> list[str]:
     low, high = (np.broadcast_to(bound, store.actions.shape[1:]) for bound in store.card.bounds)
     least, most = store.actions.min(0), store.actions.max(0)
     both = (low < 0) & (high > 0) & (most > least)

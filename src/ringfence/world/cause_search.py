@@ -13,7 +13,7 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 from msgspec.structs import replace
@@ -24,7 +24,7 @@ from ringfence.world.cause_siblings import siblings
 from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, wider
 from ringfence.world.cells import Cells
 
-VERSION = 14  # of the search: what was found by another is looked for again
+VERSION = 15  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -87,17 +87,34 @@ def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Co
 
 def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     """Causes of some of the entries of one, of all agents for whom these vary, and of each."""
-    varies = np.ptp(steps.x, axis=0) > 0  # (N, D)
     whole = {frozenset(thing) for thing in cause.things}
     for fewer in candidates(names):
         if fewer.length or not all(any(set(thing) < every for every in whole) for thing in fewer.things):
             continue
-        vary = varies[:, np.array(fewer.things)].all(-1)  # (N, J)
+        vary = _vary(steps, fewer)
         if vary.all():
             yield fewer
         elif vary.any():
             yield narrowed(fewer, tuple((int(i), int(j)) for i, j in np.argwhere(vary)))
         yield from (one for one in only_of(fewer, len(vary)) if vary[one.who[0]])
+
+
+def _vary(steps: Steps, cause: Cause) -> np.ndarray:
+    """(N, J) bool: of which agents and things all that the cause reads varies."""
+    return (np.ptp(steps.x, axis=0) > 0)[:, np.array(cause.things)].all(-1)
+
+
+def _about_whom(steps: Steps, causes: Iterable[Cause]) -> Iterator[Cause]:
+    """The causes, each of the agents who have what it reads: without those for whom none of its things varies."""
+    for cause in causes:
+        vary = _vary(steps, cause)
+        have = vary.any(1)
+        if have.all():
+            yield cause
+        elif have.any():
+            held = cause.holds(len(vary)) & have[:, None]
+            if held.any():
+                yield narrowed(cause, tuple((int(i), int(j)) for i, j in np.argwhere(held)))
 
 
 def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:
@@ -108,7 +125,7 @@ def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:
 def _grown_of_pure(steps: Steps, names: Sequence[str]) -> list[Counted]:
     """Causes of all agents and of some alone, of which nearly all steps that they call unsafe are: those of one entry
     first, then lengths, then all others."""
-    pool = list(candidates(names))
+    pool = list(_about_whom(steps, candidates(names)))
     alone = [one for cause in pool for one in only_of(cause, steps.x.shape[1])]
     chosen: list[Counted] = []
     for fits in (lambda cause: cause.width == 1 and not cause.length, lambda cause: cause.width == 1, lambda _: True):
@@ -138,7 +155,7 @@ def _purity(steps: Steps, one: Counted) -> float:
 def _grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     """Causes, one after the other, each the simplest of those that tell most of what is left: first those that hold for
     all agents, then those that hold for some alone."""
-    pool = list(candidates(names))
+    pool = list(_about_whom(steps, candidates(names)))
     chosen = _added(steps, [], pool)
     n_agents = steps.x.shape[1]
     if n_agents > 1 and len(chosen) < MOST:
@@ -234,7 +251,7 @@ def _gain_if(steps: Steps, one: Counted, pure: float) -> float:
 
 def _best_wider(steps: Steps, best: Counted, explained: Explained, names: Sequence[str]) -> Counted | None:
     """The cause with one more entry, where that tells clearly more."""
-    tried = [counted(steps, cause, explained) for cause in wider(best.cause, names)]
+    tried = [counted(steps, cause, explained) for cause in _about_whom(steps, wider(best.cause, names))]
     found = max(tried, key=lambda t: t.gain, default=None)
     if found is None or found.gain < (1 + 2 * SIMPLER) * best.gain:
         return None

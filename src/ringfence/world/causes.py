@@ -85,10 +85,9 @@ def candidates(names: Sequence[str]) -> Iterator[Cause]:
 
 
 def only_of(cause: Cause, n_agents: int) -> Iterator[Cause]:
-    """The cause as one that holds for a single agent, and a single thing of it."""
-    for agent in range(n_agents):
-        for thing in range(len(cause.things)):
-            yield narrowed(cause, ((agent, thing),))
+    """The cause as one that holds for a single agent of those that it holds for, and a single thing of it."""
+    for agent, thing in np.argwhere(cause.holds(n_agents)).tolist():
+        yield narrowed(cause, ((agent, thing),))
 
 
 def narrowed(cause: Cause, who: tuple[tuple[int, int], ...]) -> Cause:
@@ -182,11 +181,14 @@ def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
 
 
 def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
-    """The cause with one more entry of oneself, or of the same thing."""
-    if cause.length:
-        cause = replace(cause, length=False, name=cause.name.removeprefix("length of "))
-    if len(cause.things[0]) >= WIDEST:
-        return
+    """The cause with one more entry of oneself, or of the same thing; of whom it is."""
+    if len(cause.things[0]) < WIDEST:
+        base = narrowed(cause, ())
+        base = replace(base, length=False, name=base.name.removeprefix("length of "))
+        yield from (narrowed(more, cause.who) for more in _with_one_more(base, names))
+
+
+def _with_one_more(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     things = things_of(names)
     inside = {d for kind in things.values() for fields in kind for d in fields.values()}
     for d, name in enumerate(names):

@@ -108,6 +108,8 @@ def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
 def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
     """The numbers that the schema names; without a reward or cost, 0."""
     columns = columns | {name: _until_the_last(columns[name], rows) for name in schema.action}
+    arrive = [name for name in (schema.reward, *schema.cost) if name is not None]
+    columns = columns | {name: _since_the_first(columns[name], rows) for name in arrive}
     read = {name: numbers(columns, name)[rows.order] for name in (*schema.state, *schema.action, *schema.goal)}
     zero = np.zeros(len(rows.time))
     reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
@@ -126,6 +128,17 @@ def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
         return column
     filled = column.copy()
     filled[here[missing]] = column[before[missing]]
+    return filled
+
+
+def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
+    """A column of what came since the row before, which an agent's first row has not: one that is missing is 0."""
+    first = rows.order[np.append(True, ~rows.follows)]
+    missing = np.array([is_missing(entry) for entry in column[first]], bool)
+    if not missing.any():
+        return column
+    filled = column.copy()
+    filled[first[missing]] = 0
     return filled
 
 
