@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
@@ -168,6 +170,14 @@ def test_what_does_not_fit_is_refused(make):
         ringfence.padded(Grid(), NAMES)
     with pytest.raises(StoreError, match="one list of words for all agents.*ringfence.Layout makes such arrays"):
         ringfence.collect(make, episodes=1, card={"observation_names": [["a"], ["b"]]})
+
+
+def test_a_card_that_contradicts_its_arrays_is_refused(logs):
+    for agents in (["battery"], ["battery", "battery"], ["battery", "diesel", "solar"]):
+        with pytest.raises(StoreError, match=r"The card names the agents \[.*\], the data has 2; give each its own"):
+            dataclasses.replace(logs, card=logs.card.updated(agents=agents))
+    with pytest.raises(StoreError, match="Entry 1 of agent 1's action is used, and by action_sizes it has 1; keep"):
+        dataclasses.replace(logs, card=logs.card.updated(action_sizes=[1, 1]))
 
 
 @pytest.mark.parametrize(

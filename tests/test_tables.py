@@ -509,6 +509,23 @@ def test_the_last_row_needs_no_command_and_a_short_time_is_counted():
         EpisodeStore.from_table(table, **TANKS, action=["valve"], terminated="trip")
 
 
+def test_the_first_row_needs_no_reward_and_no_cost():
+    table = valves()
+    first = table["t"] == 0
+    table = table | {"gain": np.where(first, np.nan, 1.0), "alarm": np.where(first, np.nan, table["alarm"])}
+    store = EpisodeStore.from_table(table, **TANKS, action=["valve"], reward="gain", card={"task": "tanks"})
+    assert np.isfinite(store.costs).all() and (store.rewards == 1).all()
+    table["gain"][2] = np.nan
+    with pytest.raises(StoreError, match="row 2: gain is nan"):
+        EpisodeStore.from_table(table, **TANKS, action=["valve"], reward="gain", card={"task": "tanks"})
+
+
+def test_who_never_acts_is_warned_of():
+    table = valves()
+    store = EpisodeStore.from_table(table | {"valve": np.full(len(table["t"]), 0.5)}, **TANKS, action=["valve"])
+    assert "Actions of agent 0, 1 never vary: no World can learn what they do." in odd_actions(store)
+
+
 def test_the_command_line_says_bounds_and_ends(tmp_path):
     import pyarrow as pa
     from pyarrow import parquet
