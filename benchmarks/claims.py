@@ -731,7 +731,9 @@ CLAIMS = (
         "results/crossing-guards/table.csv",
         diffusion_on_crossing,
     ),
-    Claim("docs/tables.md", "climbing from nothing earns less on six of nine data sets and more on one", ROBOT_ROWS, PRIOR),
+    Claim(
+        "docs/tables.md", "climbing from nothing earns less on six of nine data sets and more on one", ROBOT_ROWS, PRIOR
+    ),
     Claim("docs/attribution.md", "On Simple Spread a shield takes the cost from every proposal", SPREAD, shielded_all),
     Claim(
         "docs/attribution.md",
