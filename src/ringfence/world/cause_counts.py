@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -48,6 +49,15 @@ class Steps:
         cell = self.cells(narrowed(cause, ()))[-1]
         agents, things = np.nonzero(cause.holds(cell.shape[1]))
         return cell[:, agents, things], agents
+
+    @cached_property
+    def varies(self) -> np.ndarray:
+        """(N, D) bool: which entries of whom vary at all."""
+        return np.asarray(self.x.min(0) < self.x.max(0))
+
+    def vary(self, cause: Cause) -> np.ndarray:
+        """(N, J) bool: of which agents and things all that a cause reads varies."""
+        return self.varies[:, np.array(cause.things)].all(-1)
 
     def part(self, some: np.ndarray) -> Steps:
         """Those of the steps, `some` (T,) bool."""

@@ -91,7 +91,7 @@ def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Itera
     for fewer in candidates(names):
         if fewer.length or not all(any(set(thing) < every for every in whole) for thing in fewer.things):
             continue
-        vary = _vary(steps, fewer)
+        vary = steps.vary(fewer)
         if vary.all():
             yield fewer
         elif vary.any():
@@ -99,20 +99,14 @@ def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Itera
         yield from (one for one in only_of(fewer, len(vary)) if vary[one.who[0]])
 
 
-def _vary(steps: Steps, cause: Cause) -> np.ndarray:
-    """(N, J) bool: of which agents and things all that the cause reads varies."""
-    return (np.ptp(steps.x, axis=0) > 0)[:, np.array(cause.things)].all(-1)
-
-
 def _about_whom(steps: Steps, causes: Iterable[Cause]) -> Iterator[Cause]:
     """The causes, each of the agents who have what it reads: without those for whom none of its things varies."""
     for cause in causes:
-        vary = _vary(steps, cause)
-        have = vary.any(1)
+        have = np.asarray(steps.vary(cause).any(1))  # (N,)
         if have.all():
             yield cause
-        elif have.any():
-            held = cause.holds(len(vary)) & have[:, None]
+        else:
+            held = cause.holds(len(have)) & have[:, None]
             if held.any():
                 yield narrowed(cause, tuple((int(i), int(j)) for i, j in np.argwhere(held)))
 
