@@ -57,7 +57,7 @@ class Steps:
 
     def vary(self, cause: Cause) -> np.ndarray:
         """(N, J) bool: of which agents and things all that a cause reads varies."""
-        return self.varies[:, np.array(cause.things)].all(-1)
+        return np.all(self.varies[:, np.array(cause.things)], -1)
 
     def part(self, some: np.ndarray) -> Steps:
         """Those of the steps, `some` (T,) bool."""
