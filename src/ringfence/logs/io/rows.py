@@ -133,6 +133,8 @@ def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
 
 def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
     """A column of what came since the row before, which an agent's first row has not: one that is missing is 0."""
+    if column.dtype.kind not in "fO":  # no other has a missing number
+        return column
     first = rows.order[np.append(True, ~rows.follows)]
     missing = np.array([is_missing(entry) for entry in column[first]], bool)
     if not missing.any():
