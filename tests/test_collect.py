@@ -173,7 +173,7 @@ def test_simulators_and_policies_that_cannot_be_collected(tmp_path):
 
     for make_env, policy, said in (
         (Few, lean, "agents need a Box of one axis"),
-        (Unbounded, lean, "must be bounded"),
+        (Unbounded, lean, "and bounded"),
         (Silent, lean, "tells no observations where an episode ends"),
         (Drift, lambda o, s: np.zeros((3, 1)), r"actions has shape \(3, 1\)"),
         (Drift, lambda o, s: np.full((2, 1), np.nan), "takes finite numbers"),

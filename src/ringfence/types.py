@@ -6,7 +6,7 @@ D feature, A action, K diffusion steps.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -82,11 +82,16 @@ class Spec:
         """Actions (..., N, A) in [−1, 1] with 0 where an agent has no such entry."""
         if self.action_sizes is None:
             return action
-        return action * (np.arange(self.action_dim) < np.array(self.action_sizes)[:, None])
+        return action * has_entry(self.action_sizes, self.action_dim)
 
     @property
     def feature_dim(self) -> int:
         return len(self.feature_names)
+
+
+def has_entry(sizes: Sequence[int], widest: int) -> np.ndarray:
+    """(N, A) bool: which entries of a joint action agents have, whose own actions have these sizes."""
+    return np.arange(widest) < np.array(sizes)[:, None]
 
 
 def as_tuples(value: Any) -> Any:

@@ -15,6 +15,7 @@ from ringfence.problem import constraints
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import local_features
 from ringfence.problem.slips import slips
+from ringfence.types import has_entry
 
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
 
@@ -51,8 +52,8 @@ def audit(store: EpisodeStore) -> Audit:
 
 
 def odd_danger(store: EpisodeStore, task: Task) -> list[str]:
-    """What a World of these logs would not know of danger, before it is fitted: names that nobody reads, actions on
-    one side of their bounds alone, a formula that cannot be read, no danger at all."""
+    """What a World of these logs would not know of danger, before it is fitted: names that nobody reads, odd
+    actions, a formula that cannot be read, no danger at all."""
     told = store.team_costs.any() or not isinstance(task.hazard, constraints.CostColumn)
     untold = [] if told else ["No step has a cost and the card has no formula: no guard can use this World."]
     return [*odd_names(store), *odd_actions(store), *_unread(store, task), *untold]
@@ -182,13 +183,26 @@ def _odd_ends(store: EpisodeStore) -> list[str]:
 
 
 def odd_actions(store: EpisodeStore) -> list[str]:
-    """Warnings of agents who never act in another way, of whom nobody learns what actions do, and of bounds that the
-    logs use on one side alone: a guard would search where nobody acted."""
+    """Warnings of agents who never act in another way, of whom nobody learns what actions do, of entries that agents
+    use and do not have, and of bounds that the logs use on one side alone: a guard would search where nobody acted."""
     still = np.flatnonzero((np.ptp(store.actions, 0) == 0).all(-1))
     who = ", ".join(map(str, still))
     return [
         *([f"Actions of agent {who} never vary: no World can learn what they do."] if len(still) else []),
+        *_spare(store),
         *_one_sided(store),
+    ]
+
+
+def _spare(store: EpisodeStore) -> list[str]:
+    sizes, bounds = store.card.action_sizes, store.card.bounds
+    if sizes is None:
+        return []
+    used = ~has_entry(sizes, store.actions.shape[2]) & (np.abs(store.actions - bounds.middle) > bounds.slack).any(0)
+    return [
+        f"Entry {entry} of agent {agent}'s action is used, and by action_sizes it has {sizes[agent]}: keep what it "
+        "lacks at the middle of the bounds, as ringfence.Layout does."
+        for agent, entry in np.argwhere(used).tolist()
     ]
 
 

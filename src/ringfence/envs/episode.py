@@ -271,10 +271,10 @@ class Episode:
         """(N, O) in the order of the agents, or a refusal of what so many of them cannot have seen."""
         rows = [observations[a] for a in self.agents]
         shape = (agents, self.shape.observation)
-        sizes = {np.size(row) for row in rows}
         try:
             return self._given("observations", rows, shape, self.shape.origins.observations)
         except UserError as error:
+            sizes = {np.size(row) for row in rows}
             if len(sizes) > 1:
                 raise UserError(
                     f"Agents of {self.name} observe {min(sizes)} to {max(sizes)} entries, and all must have the same; "

@@ -417,7 +417,7 @@ def _space(env: Any) -> _Space:
     low = min(float(space.low.min()) for space in spaces)
     high = max(float(space.high.max()) for space in spaces)
     if not np.isfinite([low, high]).all():
-        raise UserError(f"{name} has action spaces from {low:g} to {high:g}; they must be bounded.")
+        raise UserError(f"{name} has action spaces from {low:g} to {high:g}; they must be finite, and bounded.")
     if len(widths) > 1:
         raise UserError(
             f"{name} has action spaces of {sorted(widths)} entries, and all agents must have as many; pass "

@@ -14,7 +14,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.problem import constraints
-from ringfence.problem.bounds import Bounds
+from ringfence.problem.bounds import SHOWN, Bounds
 from ringfence.problem.bounds import stored as stored_bound
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
@@ -27,7 +27,6 @@ LARGEST = 1e15  # entry of an array: its square, and sums of that, are still num
 OPTIONAL = ("state", "speed", "constraints")
 ROWS = ("observations", "state")  # arrays with one row more than steps in every episode
 LIKELY = 0.85  # similarity of two names, from which one is taken for the other mistyped
-SHOWN = 120  # letters of a list in a message
 LISTS_OF_NAMES = ("observation_names", "state_names")
 ALWAYS = (
     "task",
@@ -547,21 +546,12 @@ def _action_sizes(store: Arrays) -> None:
         f"The card has action_sizes={sizes!r}; it must say for each of the {n_agents} agents how many entries its "
         f"action has, 1 to {widest}.",
     )
-    spare = np.arange(widest) >= np.array(sizes)[:, None]  # (N, A)
-    bounds = store.card.bounds
-    used = spare & (np.abs(store.actions - bounds.middle) > bounds.slack).any(0)
-    if used.any():
-        agent, entry = (int(k) for k in np.argwhere(used)[0])
-        raise StoreError(
-            f"Entry {entry} of agent {agent}'s action is used, and by action_sizes it has {sizes[agent]}; keep what it "
-            "lacks at the middle of the bounds, as ringfence.Layout does."
-        )
 
 
 def _names_of_agents(store: Arrays) -> None:
     agents = store.card.agents
     n_agents = store.actions.shape[1]
-    if agents is not None and n_agents > 1:
+    if agents is not None and n_agents > 1:  # logs of one at a time may be of many
         _demand(
             len(set(agents)) == n_agents,
             f"The card names the agents {str(agents)[:SHOWN]}, the data has {n_agents}; give each its own name.",

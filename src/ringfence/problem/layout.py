@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.problem.bounds import Bounds
+from ringfence.types import has_entry
 
-Agent = Hashable
-ByAgent = Mapping[Any, Any]
 SPARE = (-1.0, 1.0)  # bounds of an action's entry that an agent has not; it stays at their middle
 
 
@@ -30,9 +30,9 @@ class Layout:
     store = EpisodeStore.from_steps(layout.rows(seen), layout.joint(done), ..., card={**layout.card, "task": "grid"})
     """
 
-    observations: Mapping[Agent, Sequence[str] | int]
-    action_low: Mapping[Agent, Sequence[float]]
-    action_high: Mapping[Agent, Sequence[float]]
+    observations: Mapping[Any, Sequence[str] | int]
+    action_low: Mapping[Any, Sequence[float]]
+    action_high: Mapping[Any, Sequence[float]]
 
     def __post_init__(self):
         for what, by_agent in (("action_low", self.action_low), ("action_high", self.action_high)):
@@ -53,7 +53,7 @@ class Layout:
     def agents(self) -> tuple[Any, ...]:
         return tuple(self.observations)
 
-    @property
+    @cached_property
     def entries(self) -> tuple[Any, ...]:
         """Of a row of observations: names, or (how many, which of them)."""
         return tuple(dict.fromkeys(entry for agent in self.agents for entry in self._of(agent)))
@@ -78,10 +78,10 @@ class Layout:
             )
         )
 
-    @property
+    @cached_property
     def has_entry(self) -> np.ndarray:
         """(N, A) bool: which entries of an action agents have."""
-        return np.arange(max(self.action_sizes)) < np.array(self.action_sizes)[:, None]
+        return has_entry(self.action_sizes, max(self.action_sizes))
 
     @property
     def card(self) -> dict[str, Any]:
@@ -98,20 +98,20 @@ class Layout:
             fields["action_sizes"] = list(self.action_sizes)
         return fields
 
-    def rows(self, observations: ByAgent) -> np.ndarray:
+    def rows(self, observations: Mapping[Any, Any]) -> np.ndarray:
         """(..., N, O) of every agent's own (..., O_i)."""
         own = [self._given("observations", observations, agent, len(self._of(agent))) for agent in self.agents]
         rows = np.zeros((*own[0].shape[:-1], len(own), len(self.entries)), np.result_type(*own))
-        for k, (places, one) in enumerate(zip(self._places(), own)):
+        for k, (places, one) in enumerate(zip(self._places, own)):
             rows[..., k, places] = one
         return rows
 
     def own(self, rows: np.ndarray) -> dict[Any, np.ndarray]:
         """Every agent's own (..., O_i) of (..., N, O): the inverse of `rows`."""
         rows = np.asarray(rows)
-        return {agent: rows[..., k, places] for k, (agent, places) in enumerate(zip(self.agents, self._places()))}
+        return {agent: rows[..., k, places] for k, (agent, places) in enumerate(zip(self.agents, self._places))}
 
-    def joint(self, actions: ByAgent) -> np.ndarray:
+    def joint(self, actions: Mapping[Any, Any]) -> np.ndarray:
         """(..., N, A) of every agent's own (..., A_i)."""
         own = [self._given("actions", actions, agent, len(self.action_low[agent])) for agent in self.agents]
         joint = np.zeros((*own[0].shape[:-1], *self.has_entry.shape), np.result_type(*own, np.float32))
@@ -128,11 +128,13 @@ class Layout:
         entries = self.observations[agent]
         return [(entries, k) for k in range(entries)] if isinstance(entries, int) else list(entries)
 
+    @cached_property
     def _places(self) -> list[list[int]]:
+        """Where each agent's entries stand in a row."""
         place = {entry: k for k, entry in enumerate(self.entries)}
         return [[place[entry] for entry in self._of(agent)] for agent in self.agents]
 
-    def _given(self, what: str, by_agent: ByAgent, agent: Any, size: int) -> np.ndarray:
+    def _given(self, what: str, by_agent: Mapping[Any, Any], agent: Any, size: int) -> np.ndarray:
         """One agent's, checked."""
         if not isinstance(by_agent, Mapping) or agent not in by_agent:
             raise UserError(f"{what} has nothing of {agent}; give a dictionary with an array of every agent.")
