@@ -48,6 +48,20 @@ def check(env: Any, *names: str) -> None:
         raise UserError(f"make_env() made a {type(env).__name__} without {lacking[0]}; give a PettingZoo ParallelEnv.")
 
 
+def made(make_env: Callable[[], Any], *names: str) -> Any:
+    """A simulator that has these besides; what makes none is refused."""
+    if not callable(make_env):
+        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
+    env = make_env()
+    check(env, *names)
+    return env
+
+
+def is_vector(space: Any) -> bool:
+    """Whether it is a Box of one axis."""
+    return getattr(space, "low", None) is not None and len(space.shape) == 1
+
+
 class Episode:
     """An episode under way: what its agents see, and what they have earned and cost.
 

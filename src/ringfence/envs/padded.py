@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from ringfence.envs.episode import check
+from ringfence.envs.episode import is_vector, made
 from ringfence.errors import UserError
 from ringfence.problem.layout import Layout
 
@@ -72,16 +72,13 @@ def padded(make_env: Callable[[], Any], observation_names: Mapping[Any, Sequence
     store = collect(make, policy)               # of (N, O); make.layout.own gives each agent's own vector
     result = play(run, make)
     """
-    if not callable(make_env):
-        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
-    env = make_env()
-    check(env, "action_space", "observation_space")
+    env = made(make_env, "action_space", "observation_space")
     name = type(env).__name__
     agents = list(env.possible_agents)
     for what, space_of in (("action", env.action_space), ("observation", env.observation_space)):
         for agent in agents:
             space = space_of(agent)
-            if getattr(space, "low", None) is None or len(space.shape) != 1:
+            if not is_vector(space):
                 raise UserError(f"{agent} of {name} has the {what} space {space}; agents need a Box of one axis.")
     sizes = {agent: env.observation_space(agent).shape[0] for agent in agents}
     named = sizes if observation_names is None else _named(name, sizes, observation_names)

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, check
+from ringfence.envs.episode import EARLY_ENDS, Cost, Episode, Shape, is_vector, made
 from ringfence.envs.padded import PaddedEnv
 from ringfence.errors import Interrupted, StoreError, UserError, known, whole_number
 from ringfence.logs.schema import given_card
@@ -60,12 +60,9 @@ def collect(
     whole_number("episodes", episodes, 1)
     whole_number("seed", seed, 0, 2**31)
     whole_number("max_episode_steps", max_episode_steps, 1)
-    if not callable(make_env):
-        raise UserError(f"make_env is a {type(make_env).__name__}; give a function, or the class, that makes one.")
     given_card(card or {})
     file = None if out is None else writable(out)
-    env = make_env()
-    check(env, "action_space")
+    env = made(make_env, "action_space")
     player = _Player.of(policy)
     source = {"simulator": type(env).__name__, "policy": player.name, "first_seed": seed}
     kept = _kept_before(file, source, episodes)
@@ -409,7 +406,7 @@ def _has_state(env: Any, seed: int) -> bool:
 def _space(env: Any) -> _Space:
     name = type(env).__name__
     spaces = [env.action_space(agent) for agent in env.possible_agents]
-    if any(getattr(space, "low", None) is None or len(space.shape) != 1 for space in spaces):
+    if not all(map(is_vector, spaces)):
         raise UserError(
             f"{name} has an action space {spaces[0]}; agents need a Box of one axis, since actions are numbers here."
         )

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
 from ringfence.world.cause_edges import refined, within
 from ringfence.world.cause_siblings import siblings
-from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, wider
+from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, only_where, wider
 from ringfence.world.cells import Cells
 
 VERSION = 15  # of the search: what was found by another is looked for again
@@ -95,20 +95,20 @@ def _of_fewer_entries(steps: Steps, cause: Cause, names: Sequence[str]) -> Itera
         if vary.all():
             yield fewer
         elif vary.any():
-            yield narrowed(fewer, tuple((int(i), int(j)) for i, j in np.argwhere(vary)))
+            yield only_where(fewer, vary)
         yield from (one for one in only_of(fewer, len(vary)) if vary[one.who[0]])
 
 
 def _about_whom(steps: Steps, causes: Iterable[Cause]) -> Iterator[Cause]:
-    """The causes, each of the agents who have what it reads: without those for whom none of its things varies."""
+    """The causes, each of the agents who have what it reads: without those for whom none of its things varies.
+    A place of a list that nobody ever takes is not missing, where another is taken."""
     for cause in causes:
         have = np.asarray(steps.vary(cause).any(1))  # (N,)
+        held = cause.holds(len(have)) & have[:, None]
         if have.all():
             yield cause
-        else:
-            held = cause.holds(len(have)) & have[:, None]
-            if held.any():
-                yield narrowed(cause, tuple((int(i), int(j)) for i, j in np.argwhere(held)))
+        elif held.any():
+            yield only_where(cause, held)
 
 
 def _is_left(steps: Steps, one: Counted, chosen: list[Counted]) -> bool:

@@ -101,6 +101,11 @@ def narrowed(cause: Cause, who: tuple[tuple[int, int], ...]) -> Cause:
     return replace(cause, name=f"{base} of {', '.join(each)}", who=tuple(sorted(who)))
 
 
+def only_where(cause: Cause, held: np.ndarray) -> Cause:
+    """The cause as one of the agents and things (N, J) that hold."""
+    return narrowed(cause, tuple((int(agent), int(thing)) for agent, thing in np.argwhere(held)))
+
+
 def offsets(names: Sequence[str]) -> list[Cause]:
     """How far away things are, by kind, as names tell (dx, dy, dz)."""
     found = []
