@@ -118,7 +118,7 @@ def of_systems() -> tuple[bool, str]:
     refused = [one["task"].removeprefix("proving-") for one in found if one["verdict"] == "unfit"]
     most = max(rate for name, rate in clone.items() if name in fine)
     more = [name for name in fine if naive[name] > 0.01]
-    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 14 and len(more) == 3 and refused == ["arms"]
+    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 15 and len(more) == 4 and refused == ["arms"]
     return holds, f"{most:.3f} at most on {len(fine)}, at nine tenths of the return; naive more on {', '.join(more)}"
 
 
@@ -893,8 +893,8 @@ CLAIMS = (
     ),
     Claim(
         "README.md",
-        "On fourteen of sixteen systems a guarded clone violates in at most 1 % of its "
-        "episodes; on three of these a naive driver does so more often",
+        "On fifteen of sixteen systems a guarded clone violates in at most 1 % of its "
+        "episodes; on four of these a naive driver does so more often",
         PROVING,
         of_systems,
     ),
@@ -906,7 +906,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/proving-ground.md",
-        "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes",
+        "Fifteen of sixteen guarded clones violate in at most 1 % of their episodes",
         PROVING,
         of_systems,
     ),
