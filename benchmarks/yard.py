@@ -11,10 +11,9 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
-import sys
 from pathlib import Path
 
-import numpy as np
+from _yard import naive, yard
 from readme import put
 
 import ringfence
@@ -25,9 +24,6 @@ from ringfence.utils import stored
 from ringfence.utils.files import whole
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT / "examples"))
-import yard  # noqa: E402
-
 OUT = ROOT / "results" / "yard.csv"
 # Who acts, under which guard, of how many episodes one (`full` takes ten times as long).
 ROWS = (
@@ -46,14 +42,6 @@ ROWS = (
     ("naive controller", "shield", "analytic", {}, 1),
 )
 HEAD = ("method", "guard", "barrier", "options", "episodes", "return", "return_low", "return_high", "contact", "bound")
-AT = {name: k for k, name in enumerate(yard.NAMES)}
-
-
-def naive(observations: np.ndarray, state: None) -> np.ndarray:
-    """Full speed to the goal, past nobody."""
-    gap, speed = (observations[:, [AT[f"{n}x"], AT[f"{n}y"]]] for n in ("goal.d", "own.v"))
-    far = np.maximum(np.linalg.norm(gap, axis=-1, keepdims=True), 0.3)
-    return np.clip(2 * (gap / far - speed), -1, 1)
 
 
 def main() -> None:

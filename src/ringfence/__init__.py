@@ -26,6 +26,7 @@ _WHERE = {
     "Faults": "ringfence.faults",
     "certify": "ringfence.evaluation.certify",
     "collect": "ringfence.logs.collect",
+    "undelay": "ringfence.logs.late",
     "padded": "ringfence.envs.padded",
     "Layout": "ringfence.problem.layout",
     "ope": "ringfence.evaluation.ope",

@@ -410,6 +410,26 @@ def imported(store, file: Path) -> None:
         out.print(f"[yellow]note[/] {escape(plain(note))}", soft_wrap=True)
 
 
+def undelay(file: Positional[Path], out_file: Out, delay: int) -> None:
+    """Make logs of a machine whose commands take effect late as they would be if they did at once.
+
+    Each step gets the command that was sent `delay` steps before; the first steps of each episode are left out. A
+    guard by a World of such logs decides for so much later by itself. `data info` says what delay the logs tell.
+
+    Args:
+        file: a store.
+        out_file: the store to write.
+        delay: steps after which a command takes effect.
+    """
+    from ringfence.logs.late import undelay
+    from ringfence.logs.store import EpisodeStore
+
+    target = writable(out_file)
+    if target.exists() and file.exists() and target.samefile(file):
+        raise UserError(f"'{file}' would be overwritten; give another file with --out.")
+    imported(undelay(EpisodeStore.load(file), delay), target)
+
+
 def info(file: Positional[Path]) -> None:
     """The card of a store: sizes, returns, cost, share of episodes that start unsafe, warnings."""
     from ringfence.datasets.audit import audit
@@ -445,6 +465,7 @@ COMMANDS = {
     "import-ogmarl": import_ogmarl,
     "import-madiff": import_madiff,
     "import-hdf5": import_hdf5,
+    "undelay": undelay,
     "info": info,
     "train-behaviour": train_behaviour,
 }

@@ -9,6 +9,7 @@ import numpy as np
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError
+from ringfence.logs.late import late_actions
 from ringfence.logs.resolution import coarse
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
@@ -44,6 +45,7 @@ def audit(store: EpisodeStore) -> Audit:
         *odd_costs(store),
         *odd_names(store),
         *odd_actions(store),
+        *late_actions(store),
         *_odd_observations(store),
         *coarse(store),
         *_odd_ends(store),
@@ -56,7 +58,7 @@ def odd_danger(store: EpisodeStore, task: Task) -> list[str]:
     actions, a formula that cannot be read, no danger at all."""
     told = store.team_costs.any() or not isinstance(task.hazard, constraints.CostColumn)
     untold = [] if told else ["No step has a cost and the card has no formula: no guard can use this World."]
-    return [*odd_names(store), *odd_actions(store), *_unread(store, task), *untold]
+    return [*odd_names(store), *odd_actions(store), *late_actions(store), *_unread(store, task), *untold]
 
 
 def odd_names(store: EpisodeStore) -> list[str]:

@@ -136,8 +136,11 @@ def _missing_options(spec: PolicySpec, faults: Faults, guard_of: GuardOf) -> dic
     if not late and not seldom:
         return found
     guard = guard_of(spec)
+    own = guard.world.card.data.action_delay  # of the machine itself
+    if "delay" in found:
+        found["delay"] += own
     if "max_age" in found:
-        found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", 0), 0))
+        found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", own), 0))
     if late and "others_acceleration" not in given:
         found["others_acceleration"] = own_acceleration(guard.world)
     rows = min(math.ceil(ASKED * _steps_between(faults) - 1e-9), rows_foreseen(guard.world))

@@ -371,6 +371,8 @@ def build(
     if usual is None:
         usual = {name: by_card(world, name, changes)} if barrier == "learned" else {}
     _refuse_two_horizons(changes)
+    if world.card.data.action_delay:
+        changes = {"delay": world.card.data.action_delay, **changes}
     options = build_config(GuardOptions, options_of(name, barrier, usual, **changes), "the guard")
     options = in_steps(options, world.card.data.dt)
     if not options.judges:

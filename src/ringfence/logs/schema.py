@@ -66,6 +66,7 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     team: int | None = None  # agents of the team whose logs were split into those of single ones
     content: str | None = None  # digest of the arrays that these were made of
     sensing_radius: float | None = None  # m
+    action_delay: int = 0  # steps that commands took to take effect, of logs without that now (logs/late.py)
     warnings: list[str] = []
     extra: dict[str, Any] = {}
     written: tuple[str, ...] = ()  # names in the JSON, in order
@@ -285,6 +286,12 @@ def _team(card: dict) -> None:
         raise StoreError(f"The card has team={team!r}; it must be the number of agents of a team, 1 or more.")
 
 
+def _action_delay(card: dict) -> None:
+    delay = card.get("action_delay", 0)
+    if not (_is_number(delay) and delay >= 0 and float(delay).is_integer()):
+        raise StoreError(f"The card has action_delay={delay!r}; it must be a whole number of steps, 0 or more.")
+
+
 def _homogeneous(card: dict) -> None:
     if not isinstance(card.get("homogeneous", False), bool):
         raise StoreError(f"The card has homogeneous={card['homogeneous']!r}; it must be true or false.")
@@ -319,6 +326,7 @@ CARD_RULES: tuple[Callable[[dict], None], ...] = (
     _origins,
     _seconds_of_a_step,
     _team,
+    _action_delay,
     _homogeneous,
     _hazard,
 )

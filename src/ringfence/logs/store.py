@@ -206,6 +206,8 @@ class EpisodeStore:
             raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
         if self._shape_of_agents() != other._shape_of_agents():
             raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
+        if self.card.action_delay != other.card.action_delay:
+            raise StoreError("The stores were undelayed by other steps; join them before.")
         if self.card.origins != other.card.origins:
             raise StoreError("The stores were moved by other origins; make them of one table.")
         each = self.costs.ndim != other.costs.ndim  # the team's are everybody's, then

@@ -45,6 +45,10 @@ class Data(Part, frozen=True):
     ranges: dict[str, tuple[float, float]] | None = None  # least and most of safe steps, of own entries and lengths
     inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
     impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
+    action_delay: int = 0  # steps that commands took to take effect: a guard decides for so much later (logs/late.py)
+    late: tuple[
+        int | None, ...
+    ] = ()  # steps after which each agent's commands take effect, where some do (logs/late.py)
     partners: bool = False  # predictions read what those do who are in lists of the nearest (problem/partners.py)
 
 

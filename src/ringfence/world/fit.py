@@ -23,6 +23,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from ringfence.errors import UserError
+from ringfence.logs.late import lateness
 from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features, partners
 from ringfence.problem.normalise import varying
@@ -106,6 +107,7 @@ def fit_view(
     content += [settings.miscoverage, settings.barrier]
     # What the card tells beside; `content` of agents who see for themselves is of the whole team's logs.
     content += [store.card.task, store.card.hazard, store.card.dt, store.card.content]
+    content += ["undelayed by", store.card.action_delay] if store.card.action_delay else []
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
     heading = Heading.of(map.names)
@@ -185,6 +187,7 @@ def _fitted(
 def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> Data:
     """What the card says of the logs."""
     several = logged.several
+    late = lateness(store)
     return Data(
         task=store.card.task,
         content=store.card.content or store.content,
@@ -200,6 +203,8 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> 
         ranges=_ranges(logged),
         inferred_names=_inferred_names(store, logged.map) or None,
         impacts=thrown,
+        action_delay=store.card.action_delay,
+        late=late.steps if late.any else (),
         partners=looked_up,
     )
 

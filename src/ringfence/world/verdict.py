@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Literal
 
 from ringfence.errors import UserError
+from ringfence.logs.late import Lateness
 from ringfence.world.card import BarrierScores, Card, Verdict
 
 Word = Literal["fit", "weak", "unfit"]
@@ -28,6 +29,7 @@ def judge(card: Card) -> Verdict:
     for name, scores in (card.constraints or {}).items():
         found += _barrier(scores, f" of '{name}'")
     found += _prediction(card)
+    found += _late(Lateness(card.data.late))
     worst: Word = "fit"
     for word in ("weak", "unfit"):
         if any(given == word for given, _, _ in found):
@@ -94,6 +96,11 @@ def _prediction(card: Card) -> Iterator[tuple[Word, str, str]]:
             f"its predictions err by {ours:.0%} of what changes where constant velocity errs by {theirs:.0%}",
             remedy,
         )
+
+
+def _late(late: Lateness) -> Iterator[tuple[Word, str, str]]:
+    if late.any:
+        yield "unfit", f"it takes commands to act at once, and these act {late}", late.remedy
 
 
 def _times(ratio: float) -> str:

@@ -176,7 +176,8 @@ class Logs:
         motion = motion_of(self.store, self.names)
         radius, source = radius_of(self.store, motion, how.radius, {} if world is None else world.card.causes)
         stage, left_out = _stage(self.store, self.names, motion, world, how, radius, windows, seed)
-        return dataclasses.replace(stage, faults=faults), source, left_out
+        late = dataclasses.replace(faults, delay=faults.delay + self.store.card.action_delay)  # as whoever was logged
+        return dataclasses.replace(stage, faults=late), source, left_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +272,11 @@ def check_view(world: World, store: EpisodeStore) -> None:
         )
     if world.origins != store.card.origins:
         raise UserError("The logs were moved by other origins than those of the World; fit a World to these logs.")
+    if world.card.data.action_delay != store.card.action_delay:
+        raise UserError(
+            f"The World is of logs that were undelayed by {world.card.data.action_delay} steps, these by "
+            f"{store.card.action_delay}; undelay these likewise, or fit a World to them."
+        )
     names = store.card.observation_names
     if names and not world.map.reads_state:
         called = {name: entry for entry, name in (world.card.data.inferred_names or {}).items()}

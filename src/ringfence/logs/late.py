@@ -1,0 +1,167 @@
+"""Logs of machines whose commands take effect some steps late: how many, by the logs alone, and the logs as they would
+be if every step held the command that moved it.
+
+Of each agent, what an entry changes by in a step is explained linearly by where it is, by its last change, and by the
+command of so many steps before, alone and times where it is. The last change tells of motion that goes on, so that a
+slow body is not taken for a late one. What that gains on held-out episodes has its summit at the delay.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ringfence.errors import StoreError, whole_number
+from ringfence.logs.store import EpisodeStore
+
+LONGEST = 10  # steps of a delay that is looked for
+CLEARLY = 2.0  # times what the command of the step itself explains, by which a late one is told
+LITTLE = 0.05  # of one entry's change: what explains less is nobody's command
+STEPS = 4_000  # of each agent that are looked at, at most
+AGENTS = 4  # that are looked at, at most
+PRODUCTS = 400  # of entries and commands, at most; where there are more, commands are looked at alone
+FLAT = 1e-6  # of its size: an entry that varies by less does not
+FEWEST = 200  # steps, below which nothing is said
+HELD_OUT = 3  # every so many-th episode, or stretch of steps where there are few
+RIDGE = 1e-4  # of the number of steps
+
+
+@dataclass(frozen=True)
+class Lateness:
+    """Steps after which each agent's commands take effect by its logs, (N,); None of one that tells nothing."""
+
+    steps: tuple[int | None, ...]
+
+    @property
+    def any(self) -> bool:
+        """Whether somebody's take effect late."""
+        return any(self.steps)
+
+    @property
+    def of_all(self) -> int:
+        """That of the team; 0 where agents differ."""
+        told = {late for late in self.steps if late is not None}
+        return told.pop() if len(told) == 1 else 0
+
+    def __str__(self) -> str:
+        if self.of_all:
+            return f"{self.of_all} step{'s' if self.of_all > 1 else ''} late"
+        return ", ".join(f"{late} steps late of agent {i}" for i, late in enumerate(self.steps) if late is not None)
+
+    @property
+    def remedy(self) -> str:
+        """What helps a World of such logs."""
+        if self.of_all:
+            return f"undelay the logs (`ringfence data undelay --delay {self.of_all}`)"
+        return "log what each agent did at the step that it moved"
+
+
+def lateness(store: EpisodeStore) -> Lateness:
+    """How late commands take effect, as the logs tell it."""
+    some = set(np.unique(np.linspace(0, store.n_agents - 1, AGENTS).astype(int)).tolist())
+    return Lateness(tuple(_of_agent(store, i) if i in some else None for i in range(store.n_agents)))
+
+
+def late_actions(store: EpisodeStore) -> list[str]:
+    """A warning where commands take effect late: a World that takes them to act at once predicts poorly."""
+    late = lateness(store)
+    return [f"Commands take effect {late}, as what agents do tells: {late.remedy}."] if late.any else []
+
+
+def undelay(store: EpisodeStore, steps: int) -> EpisodeStore:
+    """The logs as they would be if commands took effect at once: each step has the command that was sent `steps` steps
+    before. The first `steps` steps of each episode, whose commands nobody knows, are left out, and so are episodes that
+    are no longer. The card's `action_delay` says so, and a guard by a World of these logs decides for so much later."""
+    whole_number("steps", steps, 1, LONGEST)
+    if store.card.action_delay:
+        raise StoreError(
+            f"The logs of '{store.card.task}' were undelayed by {store.card.action_delay} steps before; undelay what "
+            "they were made of."
+        )
+    long = store.lengths > steps
+    if not long.any():
+        raise StoreError(f"No episode of '{store.card.task}' is longer than {steps} steps; undelay by less.")
+    lost = int((~long).sum())
+    logs = store.select(long) if lost else store
+    within = _within_episode(logs)
+    kept = np.flatnonzero(within >= steps)
+    rows = np.delete(np.arange(len(logs.observations)), (logs.first_rows[:, None] + np.arange(steps)).ravel())
+    notes = list(logs.card.warnings)
+    if lost:
+        notes.append(f"{lost} episodes of {steps} steps or fewer were left out by undelaying")
+    return EpisodeStore(
+        logs.observations[rows],
+        logs.actions[kept - steps],
+        logs.rewards[kept],
+        logs.costs[kept],
+        logs.terminated[kept],
+        logs.truncated[kept],
+        np.cumsum(logs.lengths - steps),
+        None if logs.state is None else logs.state[rows],
+        logs.card.updated(action_delay=steps, warnings=notes),
+        None if logs.speed is None else logs.speed[kept],
+        None if logs.constraints is None else logs.constraints[kept],
+    )
+
+
+def _within_episode(store: EpisodeStore) -> np.ndarray:
+    """(T,) steps of its episode before each step."""
+    return np.arange(store.steps) - np.repeat(store.episode_ends - store.lengths, store.lengths)
+
+
+def _of_agent(store: EpisodeStore, agent: int) -> int | None:
+    """Steps after which one agent's commands take effect; None where its logs do not tell."""
+    steps = np.flatnonzero(_within_episode(store) >= LONGEST)
+    if len(steps) > STEPS:
+        steps = steps[np.linspace(0, len(steps) - 1, STEPS).astype(int)]
+    if len(steps) < FEWEST:
+        return None
+    gains = np.array(_gains(store, agent, steps))
+    if not gains.size or gains.max() < LITTLE:
+        return None
+    explained = np.where(gains < LITTLE, 0.0, gains).sum(1)
+    best = int(explained.argmax())
+    return best if explained[best] > CLEARLY * explained[0] else 0
+
+
+def _gains(store: EpisodeStore, agent: int, steps: np.ndarray) -> list[np.ndarray]:
+    """Of each delay from 0 on, what the command explains (D,) of what is left of entries' changes, on held-out
+    steps."""
+    episode = store.episode_of_step[steps]
+    rows = steps + episode
+    before, now, after = (store.observations[rows + k, agent].astype(np.float64) for k in (-1, 0, 1))
+    change = after - now
+    x, last = _standardised(now), _standardised(now - before)
+    known = np.concatenate([np.ones((len(steps), 1)), x, last], 1)
+    blocks = episode if len(np.unique(episode)) >= 2 * HELD_OUT else np.arange(len(steps)) * 30 // len(steps)
+    _, blocks = np.unique(blocks, return_inverse=True)
+    out = blocks % HELD_OUT == HELD_OUT - 1
+    y = _standardised(change)
+    left = _squared_error(known, y, out)
+    gains = []
+    for late in range(LONGEST + 1):
+        action = _standardised(store.actions[steps - late, agent].astype(np.float64))
+        told = np.concatenate([known, action, *_products(action, x)], 1)
+        gains.append(1 - _squared_error(told, y, out) / np.maximum(left, 1e-12))
+    return gains
+
+
+def _products(action: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
+    """What commands do where a body heads elsewhere; nothing where that is too much to look at."""
+    if action.shape[1] * x.shape[1] > PRODUCTS:
+        return []
+    return [(action[:, :, None] * x[:, None, :]).reshape(len(x), -1)]
+
+
+def _standardised(x: np.ndarray) -> np.ndarray:
+    """Entries that vary, with mean 0 and deviation 1."""
+    x = x[:, x.std(0) > FLAT * np.abs(x).max(0)]
+    return (x - x.mean(0)) / x.std(0)
+
+
+def _squared_error(x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
+    """(D,) of the least squares fit to the other steps, on those held out."""
+    fitted = x[~out]
+    weights = np.linalg.solve(fitted.T @ fitted + RIDGE * len(x) * np.eye(x.shape[1]), fitted.T @ y[~out])
+    return ((y[out] - x[out] @ weights) ** 2).sum(0)
