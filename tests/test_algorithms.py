@@ -765,3 +765,8 @@ def test_cloning_that_reads_returns_does_what_it_is_asked_for(tmp_path):
         earned[name] = float(acted[..., 0].mean())
     assert earned["high"] > 0.2 and earned["low"] < -0.2
     assert earned["best"] > 0.2  # the mean of all is 0
+
+
+def test_a_setting_that_is_given_as_an_argument_is_shown_its_place(small_store):
+    with pytest.raises(UserError, match=r"num_updates is a setting of bc, not an argument; give changes="):
+        loop.train("bc", small_store, num_updates=3)

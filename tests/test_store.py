@@ -205,7 +205,7 @@ RULES = {
     "inf": (changed("state", (3, 2), np.inf), r"state\[3, 2\] is inf"),
     "nan reward": (changed("rewards", (0, 1), np.nan), r"rewards\[0, 1\] is nan \(episode 0, step 0\)"),
     "action": (changed("actions", (5, 0, 1), 1.5), r"actions\[5, 0, 1\] is 1.5, outside \[-1, 1\]"),
-    "negative cost": (changed("costs", 1, -1.0), "costs holds negative entries"),
+    "negative cost": (changed("costs", 5, -1.0), r"costs\[5\] is -1 \(episode 2, step 1\); a cost is 0 or positive"),
     "flat actions": (lambda s: {"actions": s.actions[:, 0]}, r"actions has shape \(8, 2\), expected \(T, N, A\)"),
     "no last state": (lambda s: {"observations": s.observations[:-3]}, r"observations has shape \(8, 2, 5\)"),
     "agents": (lambda s: {"observations": s.observations[:, :1]}, "observations has shape"),
@@ -608,3 +608,14 @@ def test_early_ends_that_nobody_explains_are_warned_of(played):
 
     assert warned()
     assert not warned(terminated=np.arange(10) == 0)
+
+
+def test_what_is_no_store_by_its_name_is_imported_or_given_as_arrays(tmp_path):
+    np.savez(tmp_path / "logs.npz", actions=np.zeros(3))
+    with pytest.raises(StoreError, match=r"logs\.npz' is no episode store, by its name; import it"):
+        EpisodeStore.load(tmp_path / "logs.npz")
+
+
+def test_flat_logs_need_the_state_that_each_episode_ended_in():
+    with pytest.raises(StoreError, match="no final_observations .* give the last observation of each episode"):
+        EpisodeStore.from_steps(np.zeros((4, 2, 3)), np.zeros((4, 2, 1)), np.zeros(4), episode_ends=[4])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import datetime
 
 import numpy as np
 import pytest
@@ -259,12 +260,13 @@ def broken(**columns):
         (fleet(), {"state": ["x", "x", "y"]}, "names the column 'x' twice"),
         (fleet(), {"danger": Separation(1.0)}, "cost and danger both say"),
         (broken(run=(4, 3)) | {"id": np.array([None, *fleet()["id"][1:]], object)}, {}, "row 0: id is missing"),
+        (fleet(), {"action_low": 0.0}, "action_low is said by the card, not by the table; give card={'action_low'"),
         (fleet(), {"dt": 0.0}, "dt=0.0 must be a number above 0"),
         (fleet(), {"goal": ["gx"]}, "goal names 1 columns, the position has 2"),
         (fleet(), {"danger": CostColumn(), "cost": None}, "danger=CostColumn is not read from a table"),
         (fleet(), {"state": ["vx", "vy"], "danger": Separation(1.0), "cost": None}, "state holds no x, y or z"),
         (fleet(), {"state": ["hit"], "action": ()}, "action names no column"),
-        (broken(hit=(8, -1.0)), {}, "costs holds negative entries"),
+        (broken(hit=(8, -1.0)), {}, r"costs holds negative entries: costs\[.*\] is -1 \(episode 0, step"),
         (fleet() | {"x": np.zeros(3)}, {}, "not of one length"),
         ({k: v[:0] for k, v in fleet().items()}, {}, "not of one length above 0"),
         ([1, 2, 3], {}, "The table is a "),
@@ -574,3 +576,15 @@ def test_a_bound_that_is_given_is_not_explained_and_the_other_is():
     for card, explained in (({}, True), (high, True), (low, False)):
         store = EpisodeStore.from_table(valves(), **TANKS, action=["valve"], card=card)
         assert any("never negative" in note for note in store.card.warnings) == explained
+
+
+def test_dates_that_are_written_as_text_are_dates():
+    table = fleet()
+    first = datetime.datetime(2026, 1, 1, 12)
+    text = [(first + datetime.timedelta(seconds=float(s))).isoformat() for s in table["t"]]
+    plain = EpisodeStore.from_table(table, **NAMES)
+    for written in (text, np.array(text), [s + "Z" for s in text], [s + "+02:00" for s in text]):
+        store = EpisodeStore.from_table(table | {"t": written}, **NAMES)
+        np.testing.assert_allclose(store.observations, plain.observations, atol=1e-5)
+    with pytest.raises(UserError, match="row 0: t is '2026-01-01T12:00:00Z', no number"):  # of which zone is the rest?
+        EpisodeStore.from_table(table | {"t": [text[0] + "Z", *text[1:]]}, **NAMES)

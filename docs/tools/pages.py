@@ -33,7 +33,13 @@ NOTEBOOKS = [
 
 # --- the Python reference: pages of modules that belong together ---
 REFERENCE = {
-    "Logs": ("ringfence.logs.store", "ringfence.problem.layout", "ringfence.datasets.make", "ringfence.datasets.audit"),
+    "Logs": (
+        "ringfence.logs.store",
+        "ringfence.logs.late",
+        "ringfence.problem.layout",
+        "ringfence.datasets.make",
+        "ringfence.datasets.audit",
+    ),
     "Importers": (
         "ringfence.logs.io.table_schema",
         "ringfence.logs.io.table",

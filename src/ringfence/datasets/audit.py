@@ -168,7 +168,9 @@ def _odd_observations(store: EpisodeStore) -> list[str]:
     some = store.observations[:: max(1, len(store.observations) // 100_000)]
     constant = np.flatnonzero(np.ptp(some, axis=0).max(0) < 1e-9)  # for no agent
     if len(constant):
-        warnings.append(f"Observation entries {', '.join(map(str, constant))} never vary; views leave them out.")
+        names = store.card.observation_names
+        which = ", ".join(f"{d} ({names[d]})" if names else str(d) for d in constant)
+        warnings.append(f"Observation entries {which} never vary; views leave them out.")
     return warnings
 
 

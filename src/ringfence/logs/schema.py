@@ -472,17 +472,28 @@ def _finite(store: Arrays) -> None:
                 f"{name} reaches {most:.3g}, beyond {LARGEST:g}, what 32 bits can be learned from; scale it.",
             )
             continue
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        ends = store.episode_ends + (np.arange(1, len(store.episode_ends) + 1) if name in ROWS else 0)
-        episode = int(np.searchsorted(ends, where[0], side="right"))
-        step = where[0] - (int(ends[episode - 1]) if episode else 0)
+        raise StoreError(f"{_first(store, name, ~np.isfinite(array))}; remove or repair that episode.")
+
+
+def _first(store: Arrays, name: str, wrong: np.ndarray) -> str:
+    """The first entry of an array that is wrong, and where it stands."""
+    where = tuple(int(i) for i in np.argwhere(wrong)[0])
+    ends = store.episode_ends + (np.arange(1, len(store.episode_ends) + 1) if name in ROWS else 0)
+    episode = int(np.searchsorted(ends, where[0], side="right"))
+    step = where[0] - (int(ends[episode - 1]) if episode else 0)
+    return f"{name}{list(where)} is {getattr(store, name)[where]:.4g} (episode {episode}, step {step})"
+
+
+def _demand_no_negative(name: str, store: Arrays) -> None:
+    negative = getattr(store, name) < 0
+    if negative.any():
         raise StoreError(
-            f"{name}{list(where)} is {array[where]} (episode {episode}, step {step}); remove or repair that episode."
+            f"{name} holds negative entries: {_first(store, name, negative)}; a cost is 0 or positive, check its sign."
         )
 
 
 def _costs(store: Arrays) -> None:
-    _demand(bool((store.costs >= 0).all()), "costs holds negative entries; a cost is 0 or positive, check its sign.")
+    _demand_no_negative("costs", store)
 
 
 def _constraints(store: Arrays) -> None:
@@ -496,10 +507,7 @@ def _constraints(store: Arrays) -> None:
             f"constraints has shape {shape}, its card names {len(limits)} ({', '.join(limits) or 'none'}) for "
             f"costs of {store.costs.shape}; give costs={{name: array, ...}}, and a limit for each in the card."
         )
-    _demand(
-        bool((store.constraints >= 0).all()),
-        "constraints holds negative entries; a cost is 0 or positive, check its sign.",
-    )
+    _demand_no_negative("constraints", store)
     _demand(
         bool(np.array_equal(store.constraints.max(-1), store.costs)),
         "costs is not the largest of the constraints at every step; give costs={name: array, ...} alone.",

@@ -332,7 +332,7 @@ class EpisodeStore:
         rewards,
         *,
         episode_ends,
-        final_observations,
+        final_observations=None,
         costs=None,
         state=None,
         final_state=None,
@@ -345,6 +345,11 @@ class EpisodeStore:
         default), state (T, S); `episode_ends` (E,) cumulative steps; `final_observations` (E, N, O) and `final_state`
         (E, S): the state each episode ended in; `terminated` (E,) bool, default all false (ended by a time limit);
         speed (T,)."""
+        if final_observations is None:
+            raise StoreError(
+                "from_steps was given no final_observations (E, N, O), the state that each episode ended in; where "
+                "nobody logged it, give the last observation of each episode, and leave that step out of all arrays."
+            )
         ends = _whole_ends(episode_ends)
         observations = _numbers("observations", observations, 3)
         actions = _floats("actions", actions, 3)
@@ -487,6 +492,11 @@ class EpisodeStore:
         except StoreError:
             raise
         except OSError as error:
+            if path.suffix in (".npz", ".npy", ".csv", ".parquet", ".pq", ".json", ".jsonl", ".pkl", ".bag", ".mcap"):
+                raise StoreError(
+                    f"'{path}' is no episode store, by its name; import it with `ringfence data`, or give its arrays "
+                    "to EpisodeStore.from_steps."
+                ) from error
             reason = str(error).splitlines()[0]
             raise StoreError(
                 f"'{path}' is truncated or not HDF5 ({reason}); make or import the store again."

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.errors import CheckpointError, RunConflict, UserError, unknown
 from ringfence.logs.provenance import other_data, regenerated
@@ -33,6 +34,7 @@ from ringfence.training.runs import LOGS, Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
 from ringfence.utils import stored
 from ringfence.utils.compilation import keep_programs
+from ringfence.utils.config import fields_of
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
 from ringfence.utils.precision import in_float32
@@ -77,6 +79,10 @@ def train(
     keep_programs()
     older = renamed(older, OLD_ARGUMENTS, "train")
     vmap_seeds = older.pop("vmap_seeds", vmap_seeds)
+    settings = fields_of(algos.get(algorithm).Config) if older else ()
+    for name in older:
+        if name in settings:
+            raise UserError(f"{name} is a setting of {algorithm}, not an argument; give changes={{'{name}': ...}}.")
     if older:
         raise unknown("argument of train()", next(iter(older)), inspect.signature(train).parameters)
     _check_store(data)

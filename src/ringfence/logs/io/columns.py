@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from datetime import UTC, datetime
 from numbers import Number
 from pathlib import Path
 from types import ModuleType
@@ -62,6 +63,21 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
     if missing.any():
         raise StoreError(f"row {int(np.flatnonzero(missing)[0])}: {name} is missing; fill or drop it.")
     return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
+
+
+def dates(column: np.ndarray) -> np.ndarray:
+    """A column of dates that are written as text (ISO 8601) as dates; any other as it is. Those with an offset are
+    counted in UTC, and a column in which some have one is left to be refused."""
+    if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
+        return column
+    try:
+        found = [datetime.fromisoformat(entry) for entry in column.tolist()]
+    except (TypeError, ValueError):
+        return column
+    if len({one.tzinfo is None for one in found}) > 1:
+        return column
+    plain = [one if one.tzinfo is None else one.astimezone(UTC).replace(tzinfo=None) for one in found]
+    return np.array(plain, "datetime64[us]")
 
 
 def numbers(columns: Columns, name: str) -> np.ndarray:

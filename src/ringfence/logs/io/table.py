@@ -15,7 +15,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.angles import without_angles
-from ringfence.logs.io.columns import Columns, Table, Tables, numbers, read_columns, seconds, words
+from ringfence.logs.io.columns import Columns, Table, Tables, dates, numbers, read_columns, seconds, words
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.lists import expanded
@@ -196,6 +196,7 @@ def _columns_of(table: Table, schema: TableSchema) -> tuple[Columns, TableSchema
     else:
         read = read_columns(table, [theirs.get(name, name) for name in schema.columns])
         columns = {name: read[theirs.get(name, name)] for name in schema.columns}
+    columns[schema.time] = dates(columns[schema.time])
     names = entry_names(table)
     return expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from ringfence.errors import UserError, unknown, whole_number
+from ringfence.logs.schema import FIELDS as CARD_FIELDS
 from ringfence.problem.constraints import Hazard, Separation
 
 AXES = "xyz"
@@ -82,6 +83,8 @@ class TableSchema:
         """The schema of options by name."""
         names = [each.name for each in fields(cls)]
         for name in options:
+            if name in CARD_FIELDS and name not in names:
+                raise UserError(f"{name} is said by the card, not by the table; give card={{'{name}': ...}}.")
             if name not in names:
                 raise unknown("option of a table", name, names)
         for name in ("time", "agent", "state"):
