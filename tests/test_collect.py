@@ -212,3 +212,10 @@ def test_a_simulator_that_tells_no_cost_is_said_so_at_once():
         ringfence.collect(Misspelt, lean, episodes=2, cost=lambda infos: max(i["costs"] for i in infos.values()))
         formula = ringfence.SpeedLimit(limit=1.0, features=("own.vx",))
         ringfence.collect(Misspelt, lean, episodes=2, card={"hazard": formula})
+
+
+def test_a_wrapper_of_pettingzoos_is_called_what_is_within_it():
+    wrapper = type("aec_to_parallel_wrapper", (Drift,), {"__module__": "pettingzoo.utils.conversions"})
+    wrapper.metadata = {"name": "drift_v2"}
+    assert ringfence.collect(wrapper, episodes=1).card.simulator == "drift_v2"
+    assert ringfence.collect(Drift, episodes=1).card.simulator == "Drift"

@@ -363,6 +363,22 @@ def test_a_replayed_guard_that_knows_of_faults_has_the_options_for_them(close, c
         ringfence.replay(None, store, radius=0.1, guard="none", faults={"delay": 1}, compensate=True)
 
 
+def test_a_driven_agent_of_undelayed_logs_acts_as_late_as_they_did_and_its_guard_knows(close, monkeypatch):
+    store, world = close
+    late = dataclasses.replace(store, card=store.card.updated(action_delay=1))
+    knows = dataclasses.replace(world, card=replace(world.card, data=replace(world.card.data, action_delay=1)))
+    seen = []
+    monkeypatch.setattr(judge, "_played", lambda stage, _, filters, *__: seen.append((stage, filters["shield"])) or [])
+    monkeypatch.setattr(judge, "rows_of", lambda *_: [])
+    given = {"world": knows, "radius": 0.1, "baselines": False, "anyway": True, "every_episode": True}
+    result = ringfence.replay(None, late, **given)
+    assert "take effect 1 steps late, as whoever was logged" in result.notes[0]
+    ringfence.replay(None, late, faults={"delay": 1}, compensate=True, **given)
+    assert [(stage.faults.delay, guard.guard.options.delay) for stage, guard in seen] == [(1, 1), (2, 2)]
+    with pytest.raises(UserError, match="undelayed by 1 steps, these by 0"):
+        ringfence.replay(None, store, **given)
+
+
 def test_the_driven_agent_has_faults_and_the_others_none():
     """Three late steps: it goes on as it began for three, and then does what it did at first without them."""
     stage = stage_of(walkers())

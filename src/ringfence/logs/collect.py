@@ -64,7 +64,7 @@ def collect(
     file = None if out is None else writable(out)
     env = made(make_env, "action_space")
     player = _Player.of(policy)
-    source = {"simulator": type(env).__name__, "policy": player.name, "first_seed": seed}
+    source = {"simulator": _called(env), "policy": player.name, "first_seed": seed}
     kept = _kept_before(file, source, episodes)
     if kept is not None and _begun(kept) >= episodes:
         return kept
@@ -298,6 +298,13 @@ def _played(env: Any, player: _Player, rules: _Rules, first_seed: int, k: int) -
         charged=charged,
         told=frozenset(episode.told),
     )
+
+
+def _called(env: Any) -> str:
+    """The name of a simulator: its class's, or what is within a wrapper of PettingZoo's calls itself."""
+    own = getattr(env, "metadata", None) or {}
+    wrapped = type(env).__module__.startswith("pettingzoo.utils.")
+    return str(own["name"]) if wrapped and own.get("name") else type(env).__name__
 
 
 def _warn_unless_charged(simulator: str, first: list[_Played]) -> None:

@@ -107,6 +107,11 @@ def replay(
     if faults.given:
         known_to = ", which the guard knows" if compensate else ""
         notes.append(f"Behind faults: {faults.name}{known_to}; a brake is not behind them.")
+    if store.card.action_delay:
+        notes.append(
+            f"The driven agent's commands take effect {store.card.action_delay} steps late, as whoever was logged; a "
+            "brake's do not."
+        )
     if guarded is not None and store.n_agents > 1 and not guarded.guard.world.alone:
         notes.append(
             "This guard is of a team and decides for the driven agent alone. Of others it expects what they do now, or "
