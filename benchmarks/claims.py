@@ -539,12 +539,11 @@ def guards_price() -> tuple[bool, str]:
 
 
 def diffusion_on_crossing() -> tuple[bool, str]:
-    """MADIFF less the actor that is told the same return: more alone, and less than 2 % of it under the shield."""
+    """MADIFF less the actor that is told the same return: more alone, and by chance under the shield."""
     suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
     both = [difference(suite, task, ("madiff", v), ("bc-return", v), "return") for v in ("default", key)]
     text = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
-    share = both[1].mean / mean(suite, task, ("bc-return", key), "return_mean")
-    return both[0].low > 0 and 0 <= share < 0.02, f"alone and under the shield {text}"
+    return both[0].low > 0 > both[1].low, f"alone and under the shield {text}"
 
 
 def no_size_touches() -> tuple[bool, str]:
@@ -676,7 +675,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/crossing-results.md",
-        "a return-conditioned clone earns 4.93 under the same shield",
+        "a return-conditioned clone earns 4.96 under the same shield",
         "results/crossing-guards/table.csv",
         told_clones_earn,
     ),
@@ -727,7 +726,7 @@ CLAIMS = (
     Claim("docs/ope.md", "Danger is ranked well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)),
     Claim(
         "docs/attribution.md",
-        "On Crossing diffusion earns more alone, and hardly more under a shield",
+        "On Crossing diffusion earns more alone, and under a shield no more beyond chance",
         "results/crossing-guards/table.csv",
         diffusion_on_crossing,
     ),
