@@ -107,7 +107,7 @@ def table() -> str:
     for r in stored.table(OUT):
         alone = r["world"] == ALONE
         error = "" if alone else f"{100 * float(r['error']):.2g}"
-        when = {"": "", "0": "now"}.get(r["delay"], f"{r['delay']} steps later")
+        when = {"": "", "0": "now"}.get(r["delay"], f"{r['delay']} step{'s' * (r['delay'] != '1')} later")
         touched = f"{100 * float(r['contact']):.3g} (≤ {100 * float(r['bound']):.3g})"
         world = "no guard" if alone else f"{r['world']}, *{r['verdict']}*"
         lines.append(f"| {r['late']} | {world} | {error} | {when} | {float(r['return']):.2f} | {touched} |")

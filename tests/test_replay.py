@@ -372,7 +372,7 @@ def test_a_driven_agent_of_undelayed_logs_acts_as_late_as_they_did_and_its_guard
     monkeypatch.setattr(judge, "rows_of", lambda *_: [])
     given = {"world": knows, "radius": 0.1, "baselines": False, "anyway": True, "every_episode": True}
     result = ringfence.replay(None, late, **given)
-    assert "take effect 1 steps late, as whoever was logged" in result.notes[0]
+    assert "take effect 1 step late, as whoever was logged" in result.notes[0]
     ringfence.replay(None, late, faults={"delay": 1}, compensate=True, **given)
     assert [(stage.faults.delay, guard.guard.options.delay) for stage, guard in seen] == [(1, 1), (2, 2)]
     with pytest.raises(UserError, match="undelayed by 1 steps, these by 0"):

@@ -26,6 +26,7 @@ from ringfence.guards.policy import Guarded, build
 from ringfence.guards.wrap import Nothing
 from ringfence.loading.resolve import resolve
 from ringfence.loading.spec import PolicySpec
+from ringfence.logs.late import Lateness
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
 from ringfence.problem.names import Names
@@ -109,7 +110,7 @@ def replay(
         notes.append(f"Behind faults: {faults.name}{known_to}; a brake is not behind them.")
     if store.card.action_delay:
         notes.append(
-            f"The driven agent's commands take effect {store.card.action_delay} steps late, as whoever was logged; a "
+            f"The driven agent's commands take effect {Lateness((store.card.action_delay,))}, as whoever was logged; a "
             "brake's do not."
         )
     if guarded is not None and store.n_agents > 1 and not guarded.guard.world.alone:
