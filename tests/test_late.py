@@ -7,11 +7,13 @@ import ringfence
 from ringfence.cli import app
 from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
+from ringfence.evaluation.ope import estimate
 from ringfence.evaluation.replay.judge import check_view
 from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
+from ringfence.loading.resolve import resolve
 from ringfence.logs.late import lateness
 from ringfence.logs.store import EpisodeStore
 from tests.quick import QUICK_WORLD
@@ -144,6 +146,18 @@ def test_a_world_and_logs_that_were_not_undelayed_alike_are_kept_apart(world):
     check_view(world, ringfence.undelay(carts(), 2))
     with pytest.raises(UserError, match="undelayed by 2 steps, these by 0"):
         check_view(world, carts())
+
+
+def test_evaluation_by_undelayed_logs_alone_acts_at_once(world, tmp_path, monkeypatch):
+    store = ringfence.undelay(carts(), 2)
+    run = ringfence.train("bc", store, out=tmp_path, changes={"num_updates": 2, "width": 8}, quiet=True)[0]
+    asked = []
+    monkeypatch.setattr(estimate, "resolve", lambda spec: asked.append(spec) or resolve(spec))
+    monkeypatch.setattr(estimate, "_refuse_without_state", lambda *_: 1 / 0)
+    for options in ({}, {"delay": 2}):
+        with pytest.raises(ZeroDivisionError):
+            ringfence.ope(run, store, guard="shield", world=world, anyway=True, **options)
+    assert [dict(spec.guard_options)["delay"] for spec in asked] == [0, 2]
 
 
 def test_the_command_line_undelays(tmp_path, capsys):

@@ -72,6 +72,8 @@ def ope(
     run = Run.of(run)
     check(run, store)
     spec = PolicySpec.of(run, planner=planner, **options)
+    if store.card.action_delay and spec.guarded and "delay" not in dict(spec.guard_options):
+        spec = spec.with_guard_options(delay=0)  # undelayed logs, and their World, act at once
     resolved = resolve(spec)
     _refuse_without_state(resolved, store)
     world = evaluation_world or worlds.fit(store, seed=seed + 1, execution=spec.execution, quiet=quiet)
