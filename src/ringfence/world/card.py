@@ -46,9 +46,7 @@ class Data(Part, frozen=True):
     inferred_names: dict[str, str] | None = None  # of entries that nobody named, by number (problem/inferred_names.py)
     impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
     action_delay: int = 0  # steps that commands took to take effect: a guard decides for so much later (logs/late.py)
-    late: tuple[
-        int | None, ...
-    ] = ()  # steps after which each agent's commands take effect, where some do (logs/late.py)
+    late: tuple[int | None, ...] = ()  # steps after which commands of each agent take effect, where not at once
     partners: bool = False  # predictions read what those do who are in lists of the nearest (problem/partners.py)
 
 
