@@ -116,7 +116,7 @@ def test_episodes_that_are_no_longer_than_the_delay_are_left_out_and_counted():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: ringfence.undelay(carts(), 0), "steps=0 must be a whole number from 1"),
+        (lambda: ringfence.undelay(carts(), 0), "delay=0 must be a whole number from 1"),
         (lambda: ringfence.undelay(ringfence.undelay(carts(), 2), 1), "were undelayed by 2 steps before"),
         (lambda: ringfence.undelay(carts().select([0]), STEPS), "must be a whole number"),
         (lambda: carts(action_delay=1.5), "action_delay=1.5; it must be a whole number of steps"),

@@ -69,37 +69,37 @@ def late_actions(store: EpisodeStore) -> list[str]:
     return [f"Commands take effect {late}, as what agents do tells: {late.remedy}."] if late.any else []
 
 
-def undelay(store: EpisodeStore, steps: int) -> EpisodeStore:
-    """The logs as they would be if commands took effect at once: each step has the command that was sent `steps` steps
-    before. The first `steps` steps of each episode, whose commands nobody knows, are left out, and so are episodes that
+def undelay(store: EpisodeStore, delay: int) -> EpisodeStore:
+    """The logs as they would be if commands took effect at once: each step has the command that was sent `delay` steps
+    before. The first `delay` steps of each episode, whose commands nobody knows, are left out, and so are episodes that
     are no longer. The card's `action_delay` says so, and a guard by a World of these logs decides for so much later."""
-    whole_number("steps", steps, 1, LONGEST)
+    whole_number("delay", delay, 1, LONGEST)
     if store.card.action_delay:
         raise StoreError(
             f"The logs of '{store.card.task}' were undelayed by {store.card.action_delay} steps before; undelay what "
             "they were made of."
         )
-    long = store.lengths > steps
+    long = store.lengths > delay
     if not long.any():
-        raise StoreError(f"No episode of '{store.card.task}' is longer than {steps} steps; undelay by less.")
+        raise StoreError(f"No episode of '{store.card.task}' is longer than {delay} steps; undelay by less.")
     lost = int((~long).sum())
     logs = store.select(long) if lost else store
     within = _within_episode(logs)
-    kept = np.flatnonzero(within >= steps)
-    rows = np.delete(np.arange(len(logs.observations)), (logs.first_rows[:, None] + np.arange(steps)).ravel())
+    kept = np.flatnonzero(within >= delay)
+    rows = np.delete(np.arange(len(logs.observations)), (logs.first_rows[:, None] + np.arange(delay)).ravel())
     notes = list(logs.card.warnings)
     if lost:
-        notes.append(f"{lost} episodes of {steps} steps or fewer were left out by undelaying")
+        notes.append(f"{lost} episodes of {delay} steps or fewer were left out by undelaying")
     return EpisodeStore(
         logs.observations[rows],
-        logs.actions[kept - steps],
+        logs.actions[kept - delay],
         logs.rewards[kept],
         logs.costs[kept],
         logs.terminated[kept],
         logs.truncated[kept],
-        np.cumsum(logs.lengths - steps),
+        np.cumsum(logs.lengths - delay),
         None if logs.state is None else logs.state[rows],
-        logs.card.updated(action_delay=steps, warnings=notes),
+        logs.card.updated(action_delay=delay, warnings=notes),
         None if logs.speed is None else logs.speed[kept],
         None if logs.constraints is None else logs.constraints[kept],
     )
