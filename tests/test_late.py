@@ -22,15 +22,16 @@ EPISODES, STEPS = 40, 30
 NAMES = ["own.x", "own.y", "own.vx", "own.vy"]
 
 
-def carts(delays=(2, 2), lag=0.0, pushed=True, steps=STEPS, **card) -> EpisodeStore:
-    """Carts that steer for the middle; what each is told takes effect so many steps later, and with a `lag` little by
-    little."""
+def carts(delays=(2, 2), lag=0.0, pushed=True, steps=STEPS, noise=0.5, smooth=0.0, **card) -> EpisodeStore:
+    """Carts that steer for the middle, as far as `noise` that is more or less `smooth` lets them. What each is told
+    takes effect so many steps later, and with a `lag` little by little."""
     rng = np.random.default_rng(0)
-    place, speed, push = (np.zeros((EPISODES, len(delays), 2)) for _ in range(3))
-    place = rng.normal(0, 2, place.shape)
+    speed, push, drift = (np.zeros((EPISODES, len(delays), 2)) for _ in range(3))
+    place = rng.normal(0, 2, speed.shape)
     seen, told = [np.concatenate([place, speed], -1)], []
     for t in range(steps):
-        told.append(np.clip(-place - speed + rng.normal(0, 0.5, place.shape), -1, 1))
+        drift = smooth * drift + rng.normal(0, noise, place.shape)
+        told.append(np.clip(-place - speed + drift, -1, 1))
         due = np.stack([told[t - late][:, i] if t >= late else 0 * push[:, i] for i, late in enumerate(delays)], 1)
         push = lag * push + (1 - lag) * due * pushed
         place, speed = place + 0.1 * speed, 0.95 * speed + 0.2 * push
@@ -57,7 +58,9 @@ def world():
         ({"delays": (0, 3)}, (0, 3)),
         ({"delays": (0, 0), "lag": 0.6}, (0, 0)),  # slow is not late
         ({"delays": (1,), "lag": 0.6}, (1,)),
-        ({"delays": (2, 2), "pushed": False}, (None, None)),  # commands do nothing
+        ({"delays": (1, 2), "noise": 0.0}, (1, 2)),  # commands follow from what is seen
+        ({"delays": (0, 1), "noise": 0.05, "smooth": 0.98}, (0, 1)),  # and hardly change from step to step
+        ({"delays": (2, 2), "pushed": False}, (None, None)),  # they do nothing
     ],
 )
 def test_how_late_commands_take_effect_is_told_by_what_agents_do(how, told):

@@ -3,7 +3,9 @@ be if every step held the command that moved it.
 
 Of each agent, what an entry changes by in a step is explained linearly by where it is, by its last change, and by the
 command of so many steps before, alone and times where it is. The last change tells of motion that goes on, so that a
-slow body is not taken for a late one. What that gains on held-out episodes has its summit at the delay.
+slow body is not taken for a late one. What that gains on held-out episodes has its summit at the delay. Commands that
+vary slowly tell of each other, so a late one also has to tell clearly more beyond that of the step than the other way
+round.
 """
 
 from __future__ import annotations
@@ -16,11 +18,13 @@ from ringfence.errors import StoreError, whole_number
 from ringfence.logs.store import EpisodeStore
 
 LONGEST = 10  # steps of a delay that is looked for
-CLEARLY = 2.0  # times what the command of the step itself explains, by which a late one is told
+CLEARLY = 2.0  # times what the command of the step itself adds to a late one, which that has to add to it
 LITTLE = 0.05  # of one entry's change: what explains less is nobody's command
+MUCH = 0.3  # of one entry's change, which a late command has to explain: chance does less, in short logs, too
 STEPS = 4_000  # of each agent that are looked at, at most
 AGENTS = 4  # that are looked at, at most
 PRODUCTS = 400  # of entries and commands, at most; where there are more, commands are looked at alone
+NOTHING = 1e-6  # of an entry's variance: where less is left without commands, none explains it
 FLAT = 1e-6  # of its size: an entry that varies by less does not
 FEWEST = 200  # steps, below which nothing is said
 HELD_OUT = 3  # every so many-th episode, or stretch of steps where there are few
@@ -117,34 +121,61 @@ def _of_agent(store: EpisodeStore, agent: int) -> int | None:
         steps = steps[np.linspace(0, len(steps) - 1, STEPS).astype(int)]
     if len(steps) < FEWEST:
         return None
-    gains = np.array(_gains(store, agent, steps))
+    explained = _Explained.of(store, agent, steps)
+    gains = np.stack([explained.by(late) for late in range(LONGEST + 1)])
     if not gains.size or gains.max() < LITTLE:
         return None
-    explained = np.where(gains < LITTLE, 0.0, gains).sum(1)
-    best = int(explained.argmax())
-    return best if explained[best] > CLEARLY * explained[0] else 0
+    late = int(np.where(gains < LITTLE, 0.0, gains).sum(1).argmax())
+    if late == 0 or gains[late].max() < MUCH:
+        return 0
+    # Commands that vary slowly tell of each other: what counts is what one tells beyond the other.
+    beyond, behind = (explained.beyond(one, other).clip(0).sum() for one, other in ((late, 0), (0, late)))
+    return late if beyond > max(CLEARLY * behind, LITTLE) else 0
 
 
-def _gains(store: EpisodeStore, agent: int, steps: np.ndarray) -> list[np.ndarray]:
-    """Of each delay from 0 on, what the command explains (D,) of what is left of entries' changes, on held-out
-    steps."""
-    episode = store.episode_of_step[steps]
-    rows = steps + episode
-    before, now, after = (store.observations[rows + k, agent].astype(np.float64) for k in (-1, 0, 1))
-    change = after - now
-    x, last = _standardised(now), _standardised(now - before)
-    known = np.concatenate([np.ones((len(steps), 1)), x, last], 1)
-    blocks = episode if len(np.unique(episode)) >= 2 * HELD_OUT else np.arange(len(steps)) * 30 // len(steps)
-    _, blocks = np.unique(blocks, return_inverse=True)
-    out = blocks % HELD_OUT == HELD_OUT - 1
-    y = _standardised(change)
-    left = _squared_error(known, y, out)
-    gains = []
-    for late in range(LONGEST + 1):
-        action = _standardised(store.actions[steps - late, agent].astype(np.float64))
-        told = np.concatenate([known, action, *_products(action, x)], 1)
-        gains.append(1 - _squared_error(told, y, out) / np.maximum(left, 1e-12))
-    return gains
+@dataclass(frozen=True, eq=False)
+class _Explained:
+    """What commands of so many steps before explain (D,) of entries' changes, on held-out steps."""
+
+    known: np.ndarray  # (M, ...) where the agent is, and its last change
+    x: np.ndarray  # (M, X) where it is
+    change: np.ndarray  # (M, D)
+    actions: np.ndarray  # (M, 1 + LONGEST, A), those of so many steps before
+    out: np.ndarray  # (M,) bool, held out
+
+    @classmethod
+    def of(cls, store: EpisodeStore, agent: int, steps: np.ndarray) -> _Explained:
+        episode = store.episode_of_step[steps]
+        rows = steps + episode
+        before, now, after = (store.observations[rows + k, agent].astype(np.float64) for k in (-1, 0, 1))
+        x, last = _standardised(now), _standardised(now - before)
+        known = np.concatenate([np.ones((len(steps), 1)), x, last], 1)
+        blocks = episode if len(np.unique(episode)) >= 2 * HELD_OUT else np.arange(len(steps)) * 30 // len(steps)
+        _, blocks = np.unique(blocks, return_inverse=True)
+        actions = store.actions[steps[:, None] - np.arange(LONGEST + 1), agent].astype(np.float64)
+        out = blocks % HELD_OUT == HELD_OUT - 1
+        return cls(known, x, _standardised(after - now), actions, out)
+
+    def by(self, late: int) -> np.ndarray:
+        """Share (D,) of what is left without commands; 0 where nothing is."""
+        left = self._left()
+        nothing = left < NOTHING * self.out.sum()
+        return np.where(nothing, 0.0, 1 - self._left(late) / np.where(nothing, 1.0, left))
+
+    def beyond(self, late: int, other: int) -> np.ndarray:
+        """What the command of so many steps before adds (D,) to that of other ones, as a share of what is left without
+        commands."""
+        left = self._left()
+        nothing = left < NOTHING * self.out.sum()
+        return np.where(nothing, 0.0, (self._left(other) - self._left(late, other)) / np.where(nothing, 1.0, left))
+
+    def _left(self, *late: int) -> np.ndarray:
+        told = [part for k in late for part in self._told(k)]
+        return _squared_error(np.concatenate([self.known, *told], 1), self.change, self.out)
+
+    def _told(self, late: int) -> list[np.ndarray]:
+        action = _standardised(self.actions[:, late])
+        return [action, *_products(action, self.x)]
 
 
 def _products(action: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
