@@ -8,11 +8,12 @@ Rows that are there already are not made again.
 
 from __future__ import annotations
 
-import csv
 import warnings
 from pathlib import Path
 
+import msgspec
 import numpy as np
+from _rows import append, read
 from _yard import naive, yard
 from readme import put
 
@@ -20,14 +21,27 @@ import ringfence
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.logs.late import lateness
 from ringfence.logs.store import EpisodeStore
-from ringfence.utils import stored
-from ringfence.utils.files import whole
+from ringfence.world.card import Card, Verdict
+from ringfence.world.verdict import judge
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "results" / "late_logs.csv"
 LATE = (1, 2, 3)
 LOGGED, EPISODES = 1500, 300
-HEAD = ("late", "told", "world", "verdict", "error", "delay", "episodes", "return", "contact", "bound", "infeasible")
+HEAD = (
+    "late",
+    "told",
+    "world",
+    "verdict",
+    "otherwise",
+    "error",
+    "delay",
+    "episodes",
+    "return",
+    "contact",
+    "bound",
+    "infeasible",
+)
 ALONE, AS_THEY_ARE, UNDELAYED = "none", "of the logs as they are", "of undelayed logs"
 
 
@@ -65,9 +79,7 @@ class LateYard(yard.Yard):
 
 
 def main() -> None:
-    there = stored.table(OUT) if OUT.exists() else []
-    rows = [list(r.values()) for r in there]
-    done = {(int(r["late"]), r["world"], r["delay"]) for r in there}
+    done = {(int(r["late"]), r["world"], r["delay"]) for r in read(OUT)}
     for late in LATE:
         env = type("LateYard", (LateYard,), {"late": late})
         store = record(late)
@@ -84,19 +96,18 @@ def main() -> None:
             r = ringfence.play(ringfence.guard(naive, world, **how), env, episodes=EPISODES, num_envs=100)
             bound = upper_bound(round(r["violation_rate"] * EPISODES), EPISODES)
             error = world.card.prediction_error.error_of_change[0]
-            about = [late, told.of_all, world_of, world.card.verdict.word, error, "" if delay is None else delay]
+            verdicts = [world.card.verdict.word, otherwise(world.card).word]
+            about = [late, told.of_all, world_of, *verdicts, error, "" if delay is None else delay]
             measured = [r["return_mean"], r["violation_rate"], bound, r["infeasible_rate"]]
-            rows.append([*about, EPISODES, *measured])
-            print(rows[-1], flush=True)
-            write(rows)
+            row = [f"{v:.5g}" if isinstance(v, float) else v for v in (*about, EPISODES, *measured)]
+            append(OUT, dict(zip(HEAD, row)), HEAD)
+            print(row, flush=True)
     put("docs/stress-results.md", "late-logs", table())
 
 
-def write(rows: list[list]) -> None:
-    with whole(OUT) as temporary, temporary.open("w") as f:
-        writer = csv.writer(f, lineterminator="\n")
-        writer.writerow(HEAD)
-        writer.writerows([f"{v:.5g}" if isinstance(v, float) else v for v in row] for row in rows)
+def otherwise(card: Card) -> Verdict:
+    """The verdict of a card that does not say how late commands are."""
+    return judge(msgspec.structs.replace(card, data=msgspec.structs.replace(card.data, late=())))
 
 
 def table() -> str:
@@ -104,12 +115,13 @@ def table() -> str:
         "| steps late | World | error, % of what changes | the guard decides for | return | episodes with contact, % |",
         "|---|---|---|---|---|---|",
     ]
-    for r in stored.table(OUT):
+    for r in read(OUT):
         alone = r["world"] == ALONE
         error = "" if alone else f"{100 * float(r['error']):.2g}"
         when = {"": "", "0": "now"}.get(r["delay"], f"{r['delay']} step{'s' * (r['delay'] != '1')} later")
         touched = f"{100 * float(r['contact']):.3g} (≤ {100 * float(r['bound']):.3g})"
-        world = "no guard" if alone else f"{r['world']}, *{r['verdict']}*"
+        other = "" if r["otherwise"] == r["verdict"] else f", *{r['otherwise']}* but for that"
+        world = "no guard" if alone else f"{r['world']}, *{r['verdict']}*{other}"
         lines.append(f"| {r['late']} | {world} | {error} | {when} | {float(r['return']):.2f} | {touched} |")
     return "\n".join(lines)
 

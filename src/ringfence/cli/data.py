@@ -385,11 +385,17 @@ def import_hdf5(
     """
     from ringfence.datasets.importers.hdf5 import import_hdf5
 
-    target = writable(out_file)
-    if target.exists() and Path(file).exists() and target.samefile(file):
-        raise UserError(f"'{file}' would be overwritten by its own import; give another file with --out.")
+    target = _another(out_file, file, "its own import")
     bounds = {"action_low": action_low, "action_high": action_high}
     imported(import_hdf5(file, task=task, agents=agents, cost_limit=cost_limit, **bounds), target)
+
+
+def _another(out_file: Path, file: str | Path, what: str) -> Path:
+    """Where to write what is made of a file: another one."""
+    target = writable(out_file)
+    if target.exists() and Path(file).exists() and target.samefile(file):
+        raise UserError(f"'{file}' would be overwritten by {what}; give another file with --out.")
+    return target
 
 
 def _limit(speed_limit: float | None, quantile: bool):
@@ -424,9 +430,7 @@ def undelay(file: Positional[Path], out_file: Out, delay: int) -> None:
     from ringfence.logs.late import undelay
     from ringfence.logs.store import EpisodeStore
 
-    target = writable(out_file)
-    if target.exists() and file.exists() and target.samefile(file):
-        raise UserError(f"'{file}' would be overwritten; give another file with --out.")
+    target = _another(out_file, file, "its undelayed logs")
     imported(undelay(EpisodeStore.load(file), delay), target)
 
 

@@ -10,13 +10,15 @@ round.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from ringfence.errors import StoreError, whole_number
 from ringfence.logs.store import EpisodeStore
 
+VERSION = 1  # of how delays are found: Worlds that were judged by another are judged again
 LONGEST = 10  # steps of a delay that is looked for
 CLEARLY = 2.0  # times what the command of the step itself adds to a late one, which that has to add to it
 LITTLE = 0.05  # of one entry's change: what explains less is nobody's command
@@ -94,19 +96,9 @@ def undelay(store: EpisodeStore, delay: int) -> EpisodeStore:
     notes = list(logs.card.warnings)
     if lost:
         notes.append(f"{lost} episodes of {delay} steps or fewer were left out by undelaying")
-    return EpisodeStore(
-        logs.observations[rows],
-        logs.actions[kept - delay],
-        logs.rewards[kept],
-        logs.costs[kept],
-        logs.terminated[kept],
-        logs.truncated[kept],
-        np.cumsum(logs.lengths - delay),
-        None if logs.state is None else logs.state[rows],
-        logs.card.updated(action_delay=delay, warnings=notes),
-        None if logs.speed is None else logs.speed[kept],
-        None if logs.constraints is None else logs.constraints[kept],
-    )
+    card = logs.card.updated(action_delay=delay, warnings=notes)
+    late = logs.taken(rows, kept, np.cumsum(logs.lengths - delay))
+    return replace(late, actions=logs.actions[kept - delay], card=card)
 
 
 def _within_episode(store: EpisodeStore) -> np.ndarray:
@@ -129,7 +121,7 @@ def _of_agent(store: EpisodeStore, agent: int) -> int | None:
     if late == 0 or gains[late].max() < MUCH:
         return 0
     # Commands that vary slowly tell of each other: what counts is what one tells beyond the other.
-    beyond, behind = (explained.beyond(one, other).clip(0).sum() for one, other in ((late, 0), (0, late)))
+    beyond, behind = (explained.by(one, other).clip(0).sum() for one, other in ((late, 0), (0, late)))
     return late if beyond > max(CLEARLY * behind, LITTLE) else 0
 
 
@@ -156,20 +148,19 @@ class _Explained:
         out = blocks % HELD_OUT == HELD_OUT - 1
         return cls(known, x, _standardised(after - now), actions, out)
 
-    def by(self, late: int) -> np.ndarray:
-        """Share (D,) of what is left without commands; 0 where nothing is."""
-        left = self._left()
-        nothing = left < NOTHING * self.out.sum()
-        return np.where(nothing, 0.0, 1 - self._left(late) / np.where(nothing, 1.0, left))
+    def by(self, late: int, *beyond: int) -> np.ndarray:
+        """What the command of so many steps before adds (D,) beyond those of others, as a share of what is left without
+        any; 0 where nothing is."""
+        before = self._left(*beyond) if beyond else self._alone
+        nothing = self._alone < NOTHING * self.out.sum()
+        return np.where(nothing, 0.0, (before - self._left(late, *beyond)) / np.where(nothing, 1.0, self._alone))
 
-    def beyond(self, late: int, other: int) -> np.ndarray:
-        """What the command of so many steps before adds (D,) to that of other ones, as a share of what is left without
-        commands."""
-        left = self._left()
-        nothing = left < NOTHING * self.out.sum()
-        return np.where(nothing, 0.0, (self._left(other) - self._left(late, other)) / np.where(nothing, 1.0, left))
+    @cached_property
+    def _alone(self) -> np.ndarray:
+        return self._left()
 
     def _left(self, *late: int) -> np.ndarray:
+        """Squared error (D,) by the commands of so many steps before."""
         told = [part for k in late for part in self._told(k)]
         return _squared_error(np.concatenate([self.known, *told], 1), self.change, self.out)
 

@@ -290,6 +290,8 @@ def _action_delay(card: dict) -> None:
     delay = card.get("action_delay", 0)
     if not (_is_number(delay) and delay >= 0 and float(delay).is_integer()):
         raise StoreError(f"The card has action_delay={delay!r}; it must be a whole number of steps, 0 or more.")
+    if "action_delay" in card:
+        card["action_delay"] = int(delay)
 
 
 def _homogeneous(card: dict) -> None:

@@ -184,6 +184,10 @@ class EpisodeStore:
             raise StoreError("No episode is left after the selection; relax the rule that selects them.")
         steps = np.repeat(keep, self.lengths)
         rows = np.repeat(keep, self.lengths + 1)
+        return self.taken(rows, steps, np.cumsum(self.lengths[keep]))
+
+    def taken(self, rows: np.ndarray, steps: np.ndarray, episode_ends: np.ndarray) -> EpisodeStore:
+        """Some rows and steps, as flags or numbers, of episodes that end after so many steps (E,)."""
         return EpisodeStore(
             self.observations[rows],
             self.actions[steps],
@@ -191,7 +195,7 @@ class EpisodeStore:
             self.costs[steps],
             self.terminated[steps],
             self.truncated[steps],
-            np.cumsum(self.lengths[keep]),
+            episode_ends,
             None if self.state is None else self.state[rows],
             self.card,
             None if self.speed is None else self.speed[steps],

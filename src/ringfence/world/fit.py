@@ -23,7 +23,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import save_file
 
 from ringfence.errors import UserError
-from ringfence.logs.late import lateness
+from ringfence.logs import late
 from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features, partners
 from ringfence.problem.normalise import varying
@@ -100,6 +100,7 @@ def fit_view(
         cause_search.VERSION,
         impacts.VERSION,
         margins.VERSION,
+        late.VERSION,
         store.content,
         features.to_dict(map),
         *_bounds(store),
@@ -187,7 +188,7 @@ def _fitted(
 def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> Data:
     """What the card says of the logs."""
     several = logged.several
-    late = lateness(store)
+    delays = late.lateness(store)
     return Data(
         task=store.card.task,
         content=store.card.content or store.content,
@@ -204,7 +205,7 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> 
         inferred_names=_inferred_names(store, logged.map) or None,
         impacts=thrown,
         action_delay=store.card.action_delay,
-        late=late.steps if late.any else (),
+        late=delays.steps if delays.any else (),
         partners=looked_up,
     )
 
