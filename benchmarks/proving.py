@@ -1,12 +1,14 @@
-"""The proving ground in one seed: is danger learned from a cost column alone, and kept?
+"""The proving ground: is danger learned from a cost column alone, and kept?
 
     python benchmarks/proving.py results/proving [--tasks proving-hall ...] [--episodes 60] [--rows "bc none" ...]
+                                                 [--seed 1]
 
 For every system: the World's verdict, what it found danger to be caused by, and the share of episodes with a violation
 of a clone and of the naive driver: alone, under guards by what was learned, and by the oracle, which knows dynamics
 and distances. `--rows` names some of them (`ROWS`, `BESIDE`, `HORIZONS` and `FILTERED` below, of `bc` or `naive`); by
 default all of `ROWS` are played. Rows of the same World that a file holds already, of as many episodes or more, are not
-played again. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench
+played again. Clone and World are of the same logs and of seed 0; those of another seed have files of their own, in
+`seed-1` and so on. Other tasks have the rows that they can have, e.g. `--tasks crossing-hasty`. `ringfence bench
 proving-ground` plays everything with 500 episodes.
 """
 
@@ -91,13 +93,13 @@ def described(card) -> dict:
     }
 
 
-def system(task: str, runs: Path, episodes: int, names: list[str], file: Path) -> dict:
+def system(task: str, runs: Path, episodes: int, names: list[str], file: Path, seed: int = 0) -> dict:
     begun = time.perf_counter()
     store, _ = make(TASKS[task])
     drivers = ["bc", "naive"] if isinstance(TASKS[task].env, System) else ["bc"]
-    trained = {name: ringfence.train(name, store, out=str(runs), quiet=True)[0] for name in drivers}
+    trained = {name: ringfence.train(name, store, out=str(runs), seeds=(seed,), quiet=True)[0] for name in drivers}
     fitted = time.perf_counter()
-    card = worlds.fit(store, seed=0).card
+    card = worlds.fit(store, seed=seed).card
     seconds = {"made and trained": fitted - begun, "fitted": time.perf_counter() - fitted}
     found = {
         "task": task,
@@ -113,7 +115,7 @@ def system(task: str, runs: Path, episodes: int, names: list[str], file: Path) -
     }
     every = None
     if any(name.endswith(ALL) for name in names):
-        every = worlds.fit(store, seed=0, causes=False)
+        every = worlds.fit(store, seed=seed, causes=False)
         found["networks on all entries"] = described(every.card)
     for name in names:
         driver, _, row = name.partition(" ")
@@ -155,10 +157,12 @@ def main() -> None:
     reader.add_argument("--episodes", type=int, default=60)
     reader.add_argument("--rows", nargs="*", default=USUAL, choices=NAMES)
     reader.add_argument("--runs", type=Path, default=Path("runs"))
+    reader.add_argument("--seed", type=int, default=0)
     given = reader.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
+    out = given.out / f"seed-{given.seed}" if given.seed else given.out
+    out.mkdir(parents=True, exist_ok=True)
     for task in given.tasks:
-        tell(system(task, given.runs, given.episodes, given.rows, given.out / f"{task}.json"))
+        tell(system(task, given.runs, given.episodes, given.rows, out / f"{task}.json", given.seed))
 
 
 if __name__ == "__main__":

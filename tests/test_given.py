@@ -125,6 +125,20 @@ def test_a_function_of_observations_alone_acts_as_one_that_reads_no_state(world,
             ringfence.guard(nothing, world)
 
 
+@pytest.mark.parametrize(
+    "function, told",
+    [
+        (lambda seen, care=1.0: care, 1.0),
+        (lambda seen, *, care=1.0: care, 1.0),
+        (lambda seen, state=None: state, "the state"),
+        (lambda seen, truth: truth, "the state"),
+        (lambda *given: given[1], "the state"),
+    ],
+)
+def test_a_setting_with_a_default_is_not_the_state(function, told):
+    assert of_both(function)("what is seen", "the state") == told
+
+
 def test_a_memory_of_a_function_of_observations_is_copied_and_reset():
     class Counts:
         n = 0

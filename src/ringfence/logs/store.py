@@ -41,6 +41,7 @@ from ringfence.utils.pytrees import digest_of
 from ringfence.utils.renamed import deprecated, renamed
 
 FORMAT = 1
+HDF5_BEGINS = b"\x89HDF\r\n\x1a\n"
 PACKED = 4  # times its size that a store may unpack to; it is written uncompressed
 
 
@@ -496,10 +497,12 @@ class EpisodeStore:
         except StoreError:
             raise
         except OSError as error:
-            if path.suffix in (".npz", ".npy", ".csv", ".parquet", ".pq", ".json", ".jsonl", ".pkl", ".bag", ".mcap"):
+            with path.open("rb") as file:
+                begins = file.read(len(HDF5_BEGINS))
+            if begins and not HDF5_BEGINS.startswith(begins):
                 raise StoreError(
-                    f"'{path}' is no episode store, by its name; import it with `ringfence data`, or give its arrays "
-                    "to EpisodeStore.from_steps."
+                    f"'{path}' is no episode store, by its first bytes; import it with `ringfence data`, or give its "
+                    "arrays to EpisodeStore.from_steps."
                 ) from error
             reason = str(error).splitlines()[0]
             raise StoreError(

@@ -24,12 +24,13 @@ class OfObservations:
 
 
 def of_both(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function as one of (observations, state). What has no signature is taken as it is."""
+    """The function as one of (observations, state). What has no signature is taken as it is; a second parameter with a
+    default is the function's own setting, unless it is called `state`."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
         return function
-    if _takes(signature, 2):
+    if _takes(signature, 2) and not _of_its_own(signature):
         return function
     if _takes(signature, 1):
         return OfObservations(function)
@@ -42,3 +43,9 @@ def _takes(signature: inspect.Signature, count: int) -> bool:
     except TypeError:
         return False
     return True
+
+
+def _of_its_own(signature: inspect.Signature) -> bool:
+    """Whether the second parameter is a setting that has a value."""
+    second = list(signature.parameters.values())[1:2]
+    return any(one.default is not one.empty and one.name.strip("_") != "state" for one in second)
