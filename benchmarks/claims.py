@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pooled
+from _proven import proven
 from ablations import adjusted
 from attribution import ADAPT, FULL, OF_ROBOTS, QUESTIONS, SHIELD, STEADY, Question, answers
 from evidence import LEVEL, difference, evaluations, mean, of, tasks_of, variant
@@ -108,14 +109,14 @@ def of_a_pool(row: str, verdict: Callable[[dict, dict], bool]) -> Callable[[], t
 
 
 def of_systems() -> tuple[bool, str]:
-    """The clone's and the naive driver's episodes on the proving ground."""
-    found = [json.loads(file.read_text()) for file in sorted((ROOT / PROVING).glob("proving-*.json"))]
+    """The clone's and the naive driver's episodes on the proving ground, by the seed that violates most."""
+    found = proven()
     rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found}
-    clone = {name: r["bc shield learned"]["violation_rate"] for name, r in rows.items()}
+    clone = {name: r["bc shield learned"]["most"] for name, r in rows.items()}
     naive = {name: r["naive shield learned"]["violation_rate"] for name, r in rows.items()}
     kept = {n: r["bc shield learned"]["return_mean"] / r["bc shield oracle"]["return_mean"] for n, r in rows.items()}
     fine = [name for name in rows if clone[name] <= 0.01 and kept[name] >= 0.9]
-    refused = [one["task"].removeprefix("proving-") for one in found if one["verdict"] == "unfit"]
+    refused = [one["task"].removeprefix("proving-") for one in found if "unfit" in one["verdicts"]]
     most = max(rate for name, rate in clone.items() if name in fine)
     more = [name for name in fine if naive[name] > 0.01]
     holds = len(rows) == 16 and most <= 0.01 and len(fine) == 15 and len(more) == 4 and refused == ["arms"]
@@ -124,8 +125,7 @@ def of_systems() -> tuple[bool, str]:
 
 def of_bad_driving() -> tuple[bool, str]:
     """Systems on which the guard leaves the naive driver at most 2 %, as it is and by three rows."""
-    files = sorted((ROOT / PROVING).glob("proving-*.json"))
-    rows = [json.loads(file.read_text())["rows"] for file in files]
+    rows = [one["rows"] for one in proven()]
     kept = [r["naive shield learned"]["return_mean"] / r["naive shield oracle"]["return_mean"] for r in rows]
     far = [r["naive shield learned"]["violation_rate"] <= 0.02 and share >= 0.9 for r, share in zip(rows, kept)]
     near = [r["naive shield learned, 3 rows"]["violation_rate"] <= 0.02 for r in rows]
@@ -325,8 +325,7 @@ def of_a_crowd() -> tuple[bool, str]:
 
 def of_filters() -> tuple[bool, str]:
     """Naive drivers under the shield that learned, and under the classical filter, where there is one."""
-    found = [json.loads(file.read_text()) for file in sorted((ROOT / PROVING).glob("proving-*.json"))]
-    rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found if "naive cbf-qp" in one["rows"]}
+    rows = {one["task"].removeprefix("proving-"): one["rows"] for one in proven() if "naive cbf-qp" in one["rows"]}
     both = {n: [r[f"naive {how}"]["violation_rate"] for how in ("shield learned", "cbf-qp")] for n, r in rows.items()}
     fewer = [name for name, (mine, theirs) in both.items() if mine < theirs]
     more = [name for name, (mine, theirs) in both.items() if mine > theirs]

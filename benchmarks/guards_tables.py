@@ -5,11 +5,11 @@ python benchmarks/guards_tables.py
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 
 import numpy as np
+from _proven import proven
 from evidence import Row, of, tasks_of, variant
 from readme import put
 
@@ -213,14 +213,19 @@ def proving(folder: Path, files: str, filtered: bool = True) -> str:
     heads = ["system", "verdict", "causes found"]
     heads += [head or driver for driver in drivers.values() for head in kinds.values()]
     lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
-    for file in sorted(folder.glob(files)):
-        found = json.loads(file.read_text())
+    for found in proven(folder, files):
         causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
         name = found["task"].removeprefix("proving-").removeprefix("other-").removeprefix("drawn-")
-        cells = [f"`{name}`{_in_words(found.get('system'))}", found["verdict"], "; ".join(causes) or "none"]
+        cells = [f"`{name}`{_in_words(found.get('system'))}", _verdicts(found), "; ".join(causes) or "none"]
         cells += [_share_and_return(found["rows"].get(row)) for row in rows]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _verdicts(found: dict) -> str:
+    """What the Worlds of all seeds say of themselves."""
+    words = found["verdicts"]
+    return words[0] if len(set(words)) == 1 else ", ".join(words)
 
 
 def _in_words(system: dict | None) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from _proven import proven
 
 from ringfence import algos
 from ringfence.bench import paper, unpack
@@ -125,8 +126,8 @@ def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
 
 def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     """The mean over the systems whose Worlds are not refused; returns as shares of what the clone alone earns."""
-    found = [json.loads(file.read_text()) for file in sorted((RESULTS / "proving").glob("proving-*.json"))]
-    systems = [one["rows"] for one in found if one["verdict"] != "unfit"]
+    found = proven()
+    systems = [one["rows"] for one in found if "unfit" not in one["verdicts"]]
     for words, danger, way in (
         (f"{len(systems)} of {len(found)} other systems, one being refused: a clone of the logs", NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import jax
 import numpy as np
@@ -16,6 +16,7 @@ import numpy as np
 from ringfence.errors import UserError
 
 Array = jax.Array
+X = TypeVar("X", np.ndarray, Array)  # NumPy in gives NumPy out
 Key = jax.Array
 PyTree = Any
 Metrics = dict[str, Array]

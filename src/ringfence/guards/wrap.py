@@ -35,9 +35,9 @@ _LOOKS_ON = {"correction_steps": 0, "select": True}  # options of a guard that c
 
 
 @jax.jit
-def _decided(guarded: Guarded, carry: PyTree, present: Array, actions: Array, key: Key) -> tuple[PyTree, PolicyStep]:
+def _decided(guarded: Guarded, carry: PyTree, present: Array, action: Array, key: Key) -> tuple[PyTree, PolicyStep]:
     """One program for every guard of the same World and options."""
-    return guarded.decided(carry, present, actions, key)
+    return guarded.decided(carry, present, held(action, guarded.guard.options.horizon), key)
 
 
 class Callback:
@@ -117,12 +117,12 @@ class Callback:
         world = self.guarded.guard.world
         spec, batch = world.spec, len(observations)
         wanted = self._wanted(wanted, batch)
-        action = jnp.clip(normalise.to_unit(jnp.asarray(wanted), spec.action_low, spec.action_high), -1.0, 1.0)
-        given = jnp.asarray(observations), None if state is None else jnp.asarray(state)
+        action = normalise.to_unit(wanted, spec.action_low, spec.action_high).clip(-1.0, 1.0)
+        given = (None if x is None else np.asarray(x, np.float32) for x in (observations, state))
         present = local_features(world.map, spec.homogeneous, *given)
-        plan = held(split_agents(action) if spec.homogeneous else action, self.guarded.guard.options.horizon)
-        carry, step = _decided(self.guarded, carry, present, plan, key)
-        return carry, merge_agents(step, (batch, self.agents)) if spec.homogeneous else step
+        action = split_agents(action) if spec.homogeneous else action
+        carry, step = _decided(self.guarded, carry, present, action, key)
+        return carry, merge_agents(jax.device_get(step), (batch, self.agents)) if spec.homogeneous else step
 
 
 class Nothing(eqx.Module):

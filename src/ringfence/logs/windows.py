@@ -16,6 +16,7 @@ import numpy as np
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import normalise
 from ringfence.types import Array, Batch, Key
+from ringfence.utils.device import on_device
 
 NOT_ARRIVED = -1.0  # cost of an episode's first row: nothing was charged on arriving there, so nobody knows
 
@@ -34,20 +35,20 @@ class WindowData:
         row = np.arange(store.steps) + episode
         last = store.episode_ends[episode] + episode
         seen = np.asarray(features(store.observations, store.state), np.float32)
-        actions = normalise.to_unit(jnp.asarray(store.actions), *store.card.bounds)
+        actions = normalise.to_unit(store.actions, *store.card.bounds)
         scores = np.zeros(store.steps) if scores is None else scores
         self.steps = store.steps
         self.arrays = {
-            "features": jnp.asarray(seen),  # (M, N, D)
-            "actions": actions,  # (T, N, A)
-            "rewards": jnp.asarray(store.rewards),  # (T, N)
-            "terminated": jnp.asarray(store.terminated),  # (T,)
-            "scores": jnp.asarray(scores, jnp.float32),  # (T,)
+            "features": on_device(seen),  # (M, N, D)
+            "actions": on_device(actions),  # (T, N, A)
+            "rewards": on_device(store.rewards),  # (T, N)
+            "terminated": on_device(store.terminated),  # (T,)
+            "scores": on_device(scores, np.float32),  # (T,)
             # (M,) the team's, charged on arriving
-            "costs": jnp.asarray(np.insert(store.team_costs, starts, NOT_ARRIVED), jnp.float32),
-            "row": jnp.asarray(row, jnp.int32),  # (T,) row of the state before the step
-            "first_row": jnp.asarray(starts[episode] + episode, jnp.int32),  # (T,)
-            "last_row": jnp.asarray(last, jnp.int32),  # (T,)
+            "costs": on_device(np.insert(store.team_costs, starts, NOT_ARRIVED), np.float32),
+            "row": on_device(row, np.int32),  # (T,) row of the state before the step
+            "first_row": on_device(starts[episode] + episode, np.int32),  # (T,)
+            "last_row": on_device(last, np.int32),  # (T,)
         }
 
 

@@ -7,9 +7,11 @@ from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from ringfence.types import Array, Key, Metrics, PyTree
+from ringfence.utils.device import on_device
 from ringfence.utils.progress import Progress
 
 CHUNKS = 40  # a regression is in, one after the other, so that its progress is seen
@@ -97,7 +99,8 @@ def regress(
 
         return jax.lax.fori_loop(start, stop, step, carry)
 
-    carry = (net, jax.jit(adam.init)(net))  # one program, and not one for each shape
+    nothing = jax.eval_shape(adam.init, net)  # all that Adam remembers begins at 0: no program for it
+    carry = (net, jax.tree.map(lambda leaf: on_device(np.zeros(leaf.shape, leaf.dtype)), nothing))
     chunk = max(1, updates // CHUNKS)
     with Progress(label, updates, quiet=not label) as bar:
         for start in range(0, updates, chunk):

@@ -15,8 +15,9 @@ import math
 import re
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,11 +27,10 @@ from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.partners import Mirrored
 from ringfence.problem.turns import Turn
-from ringfence.types import Array
+from ringfence.types import Array, X
 
 View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
-X = TypeVar("X", np.ndarray, Array)
 VIEWS = ("pruned", "centralized", "decentralized")
 
 
@@ -473,8 +473,8 @@ def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, in
     how = derived(map.names, map.plus.shape[0])
     if not how or steps is None:
         return {}
-    pair = jnp.asarray(np.stack([steps.before, steps.after], 1), jnp.float32)
-    predicted = np.asarray(_relative(how, map.names, map.plus.shape[0])(pair))[:, 1]
+    pair = np.stack([steps.before, steps.after], 1).astype(np.float32)
+    predicted = np.asarray(jax.jit(_relative(how, map.names, map.plus.shape[0]))(pair))[:, 1]
     error = predicted - steps.after
     change = steps.after - steps.before
     return {d: rule for d, rule in how.items() if _follows(error[..., d], change[..., d])}

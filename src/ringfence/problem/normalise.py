@@ -18,7 +18,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.types import Array, Bound, Spec
+from ringfence.types import Array, Bound, Spec, X
+from ringfence.utils.device import on_device
 
 Coordinates = Literal["displacement", "state"]
 ROUNDING = 1e-5  # of an entry's size: less variation is rounding, and the entry is centred and left alone
@@ -84,7 +85,7 @@ def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> N
     mean = rows.mean(0)
     scale = rows.std(0)
 
-    as_array = lambda x: jnp.asarray(np.asarray(x), jnp.float32)  # noqa: E731
+    as_array = lambda x: on_device(x, np.float32)  # noqa: E731
     return Normaliser(
         as_array(mean),
         as_array(varying(scale, mean)),
@@ -95,7 +96,7 @@ def fit(windows: np.ndarray, valid: np.ndarray, now: int, coordinates: str) -> N
     )
 
 
-def to_unit(action: Array, low: Bound, high: Bound) -> Array:
+def to_unit(action: X, low: Bound, high: Bound) -> X:
     """Actions (..., N, A) within [low, high], in units of [−1, 1], where weights, noise and searches mean the same in
     any bounds. Those bounded so anyway are left as they are, to the last bit."""
     middle, half = _middle_and_half(low, high)

@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
-from ringfence.types import Array
-
-X = TypeVar("X", np.ndarray, Array)
+from ringfence.types import Array, X
 
 # (lowest, whole turn): from minus a half or from none, in rad or degrees
 KINDS = tuple((low * whole, whole) for whole in (2 * math.pi, 360.0) for low in (-0.5, 0.0))

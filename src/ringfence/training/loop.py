@@ -301,7 +301,7 @@ class _Training:
     @classmethod
     def begin(cls, job: Job, lessons: _Lessons, runs: list[Run], seeds: Sequence[int], options: _Options) -> _Training:
         """Fresh states, or those of the last checkpoints."""
-        roots = jax.vmap(jax.random.key)(jnp.asarray(seeds))
+        roots = jax.vmap(jax.random.key)(np.array(seeds))
         states: list[PyTree] = []
         scores: list[Array] = []
         arrays: Arrays = {}
@@ -327,8 +327,8 @@ class _Training:
             label=f"{job.algorithm.name}/{job.preset} {job.task.name} {whose}",
             roots=roots,
             arrays=arrays,
-            scores=jnp.stack(scores),
-            state=jax.tree.map(lambda *x: jnp.stack(x), *states),
+            scores=_stacked(*scores),
+            state=_stacked(*states),
             step=steps[0],
             saved=steps[0] or -1,
             writers=tensorboard,
@@ -405,6 +405,12 @@ def _begun(job: Job, run: Run, root: Key, world: World | None, windows: WindowDa
     if run.checkpoints():
         state = state | run.load_checkpoint(learned(state))[1]
     return state
+
+
+@jax.jit  # one program, and not one for each shape
+def _stacked(*states: PyTree) -> PyTree:
+    """States of several seeds as one, with a leading axis."""
+    return jax.tree.map(lambda *x: jnp.stack(x), *states)
 
 
 def learned(state: PyTree) -> PyTree:

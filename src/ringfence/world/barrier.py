@@ -33,6 +33,7 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.problem.features import FeatureMap, numbered
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 from ringfence.world.cause_nets import Score, blank, scores, worst
 from ringfence.world.causes import Found
 
@@ -384,7 +385,7 @@ def fit_label(
     rows = 2**31 - 1
     net = networks(key_nets, shape, width)
     words = "" if quiet else "barrier, what is dangerous now"
-    given = (*data, jnp.asarray(unsafe), jnp.asarray(safe))
+    given = (*data, on_device(unsafe), on_device(safe))
     found = regress(objective, net, given, rows, key_fit, updates, batch, 2e-3, words, decay=1e-4)
     return eqx.tree_at(lambda b: b.label, barrier, found)
 
@@ -442,10 +443,10 @@ def fit_future(
         net, slow = pair
         return net, jax.tree.map(lambda s, n: s + rate * (n - s), slow, net)
 
-    near = jnp.asarray(close if len(close) else picked)
-    data = arrays["features"], arrays["row"], arrays["terminated"], near, jnp.asarray(picked)
+    near = on_device(close if len(close) else picked)
+    data = arrays["features"], arrays["row"], arrays["terminated"], near, on_device(picked)
     words = "" if quiet else "barrier, what will be dangerous"
-    pair = net, jax.tree.map(jnp.copy, net)
+    pair = net, net
     found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=follow)
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 

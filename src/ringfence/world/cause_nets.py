@@ -22,6 +22,7 @@ from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
 
@@ -105,7 +106,7 @@ def blank(found: Found, width: int, key: Key | None = None) -> tuple[Score, ...]
 def _blank(key: Key, cause: Cause, edge: Edge, width: int) -> Score:
     zero = jnp.zeros(())
     if edge.bounds:
-        return Distance(jnp.asarray(edge.bounds), jnp.ones(()), zero, cause, edge)
+        return Distance(on_device(edge.bounds, np.float32), jnp.ones(()), zero, cause, edge)
     k = cause.width
     return CauseNet(MLP(key, (k, width, width, width, 1)), jnp.zeros(k), jnp.ones(k), zero, cause, edge)
 
@@ -166,8 +167,8 @@ def fit_causes(
         return _Learning(fixed, jnp.maximum(1.0, learning.temperature - cooling))
 
     places = [one.beyond(PLACES, rng) for one, net in zip(cells, nets) if isinstance(net, CauseNet)]
-    beyond = [(jnp.asarray(values, jnp.float32), jnp.asarray(unknown, jnp.float32)) for values, unknown in places]
-    given = (*data, jnp.asarray(unsafe), jnp.asarray(safe), beyond)
+    beyond = [(on_device(values, np.float32), on_device(unknown, np.float32)) for values, unknown in places]
+    given = (*data, on_device(unsafe), on_device(safe), beyond)
     begun = _Learning(nets, jnp.float32(HOT))
     words = "" if quiet else "barrier, what is dangerous now"
     return regress(objective, begun, given, 2**31 - 1, key_fit, updates, batch, 2e-3, words, 1e-4, cooled).nets
@@ -185,13 +186,13 @@ def _standardised(net: Score, cells: Cells) -> Score:
     if isinstance(net, Distance):
         span = max(float(cells.high[0] - cells.low[0]), 1e-6)
         sharp = np.log(SHARP * cells.bins)
-        given = [jnp.asarray(a, jnp.float32) for a in (np.array(net.edge.bounds) / span, span, sharp)]
+        given = [on_device(a, np.float32) for a in (np.array(net.edge.bounds) / span, span, sharp)]
         return eqx.tree_at(lambda n: (n.bounds, n.scale, n.log_gain), net, given)
     centres, _ = cells.known()
     spread = np.maximum(centres.std(0), 1e-6)
     if cells.cause.width > 1 and _alike(centres.std(0)):
         spread = np.full_like(spread, spread.mean())
-    statistics = [jnp.asarray(a, jnp.float32) for a in (centres.mean(0), spread)]
+    statistics = [on_device(a, np.float32) for a in (centres.mean(0), spread)]
     return eqx.tree_at(lambda n: (n.mean, n.scale), net, statistics)
 
 

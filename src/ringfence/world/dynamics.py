@@ -24,6 +24,7 @@ from ringfence.problem.features import FeatureMap, others
 from ringfence.problem.normalise import varying
 from ringfence.problem.turns import pointing, within
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 from ringfence.world.causes import AHEAD, Heading
 
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
@@ -190,7 +191,7 @@ def _standardised(model: Dynamics, before: np.ndarray, after: np.ndarray) -> Dyn
     mean = before.mean(0)
     scale = varying(before.std(0), mean)
     step_scale = varying(moved.std(0), (np.abs(mean) + scale)[model.predicted])
-    statistics = [jnp.asarray(x, jnp.float32) for x in (mean, scale, moved.mean(0), step_scale)]
+    statistics = [on_device(x, np.float32) for x in (mean, scale, moved.mean(0), step_scale)]
     return eqx.tree_at(lambda d: (d.mean, d.scale, d.step_mean, d.step_scale), model, statistics)
 
 

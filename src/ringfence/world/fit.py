@@ -30,6 +30,7 @@ from ringfence.problem.normalise import varying
 from ringfence.types import Key, PyTree, Spec
 from ringfence.utils import stored
 from ringfence.utils.cache import cache_dir
+from ringfence.utils.device import on_device
 from ringfence.utils.files import whole
 from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
@@ -259,8 +260,8 @@ def _dynamics(
     def fit(key: Key) -> dynamics.Dynamics:
         return dynamics.fit_dynamics(
             logged.arrays["features"],
-            jnp.asarray(logged.picked("actions", steps)),
-            jnp.asarray(logged.picked("row", steps)),
+            on_device(logged.picked("actions", steps)),
+            on_device(logged.picked("row", steps)),
             blank.map,
             key,
             num_ensemble=settings.num_ensemble,
@@ -293,7 +294,7 @@ def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, qui
     def fit(key: Key) -> values.Values:
         return values.fit_values(
             logged.arrays | {"returns_to_go": logged.returns_to_go(settings.discount, alone)},
-            jnp.asarray(logged.fitted_steps),
+            on_device(logged.fitted_steps),
             logged.map,
             key,
             discount=settings.discount,
@@ -318,8 +319,7 @@ class _Search:
         """What is found, and the cells of each cause."""
         logged = self.logged
         steps = logged.fitted_steps
-        rows = np.asarray(logged.arrays["row"])[steps] + 1
-        x = np.asarray(logged.arrays["features"][rows])
+        x = logged.after(steps)
         episode = logged.store.episode_of_step[steps]
         return cause_search.find(x, logged.label[steps], episode, logged.map.names, self.seed)
 
@@ -439,7 +439,7 @@ def _label(
             f"All unsafe steps of '{logged.store.card.task}' lie in the episodes that are held out; log more of "
             "them, or take another seed."
         )
-    data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], jnp.asarray(logged.label)
+    data = logged.arrays["features"], logged.predicted(acts), logged.arrays["row"], on_device(logged.label)
     blank = _standardised(blank_barrier(logged.map, settings, found), logged, key_states)
     if found.causes:
         nets = fit_causes(
@@ -482,7 +482,7 @@ def _standardised(barrier: cbf.Barrier, logged: Logged, key: Key) -> cbf.Barrier
     flat = after.reshape(-1, width)
     mean, scale = cbf.isotropic(barrier.shape, flat.mean(0), varying(flat.std(0), flat.mean(0)))
     step_scale = varying(moved.std(0), np.abs(mean) + scale)
-    statistics = [jnp.asarray(x, jnp.float32) for x in (mean, scale, moved.mean(0), step_scale)]
+    statistics = [on_device(x, np.float32) for x in (mean, scale, moved.mean(0), step_scale)]
     return eqx.tree_at(lambda b: (b.mean, b.scale, b.step_mean, b.step_scale), barrier, statistics)
 
 

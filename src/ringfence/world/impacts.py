@@ -11,10 +11,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 
 from ringfence.logs.store import EpisodeStore
+from ringfence.utils.device import on_device
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.logged import Logged
 from ringfence.world.margins import entries
@@ -103,7 +103,7 @@ def landed(logged: Logged, acts: Dynamics) -> Logged:
     steps = np.flatnonzero(cut)
     features = np.array(again.arrays["features"])
     features[again.picked("row", steps) + 1] = logged.predicted(acts, steps)
-    return replace(again, arrays=again.arrays | {"features": jnp.asarray(features)})
+    return replace(again, arrays=again.arrays | {"features": on_device(features)})
 
 
 def _pieces(store: EpisodeStore, cut: np.ndarray) -> EpisodeStore:

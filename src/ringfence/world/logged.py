@@ -15,6 +15,7 @@ from ringfence.logs.windows import WindowData, returns_to_go
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.features import FeatureMap
 from ringfence.types import Array
+from ringfence.utils.device import on_device
 from ringfence.world.dynamics import Dynamics
 from ringfence.world.settings import Settings
 
@@ -107,7 +108,7 @@ class Logged:
     def returns_to_go(self, discount: float, each: bool = False) -> Array:
         """(T,) return-to-go of the team, or (T, N) of each agent."""
         rewards = self.store.rewards if each else self.store.rewards.mean(1)
-        return jnp.asarray(returns_to_go(rewards, self.store.lengths, discount), jnp.float32)
+        return on_device(returns_to_go(rewards, self.store.lengths, discount), np.float32)
 
 
 @jax.jit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -84,15 +84,14 @@ def entries(logged: Logged, bad: np.ndarray) -> np.ndarray:
     return bad[follows] if follows.sum() >= ENTRIES else bad
 
 
-def predicted_ends(dynamics: Dynamics, logged: Logged, ends: np.ndarray) -> list[tuple[Array, Array]]:
-    """Steps that entered danger, (before, after) each (W, N, D), as they are predicted from up to `JUDGED` steps
-    before."""
-    found = []
-    for back in range(JUDGED):
-        some = ends[_begun(logged, ends, back)]
-        if len(some):
-            found.append(_predicted(dynamics, logged, some, back))
-    return found
+def scores_of_ends(
+    score: Callable[[Array, Array], Array], dynamics: Dynamics, logged: Logged, ends: np.ndarray
+) -> np.ndarray:
+    """The score(before, after) (W,) of steps that entered danger, each (W, N, D), as they are predicted from up to
+    `JUDGED` steps before, one after another."""
+    backs = range(JUDGED)
+    found = [np.asarray(score(*_predicted(dynamics, logged, ends, back)))[_begun(logged, ends, back)] for back in backs]
+    return np.concatenate(found)
 
 
 def _begun(logged: Logged, ends: np.ndarray, back: int) -> np.ndarray:
@@ -102,10 +101,21 @@ def _begun(logged: Logged, ends: np.ndarray, back: int) -> np.ndarray:
 
 
 def _predicted(dynamics: Dynamics, logged: Logged, ends: np.ndarray, back: int) -> tuple[Array, Array]:
-    """(before, after) of steps, each (W, N, D), as they are predicted from so many steps before."""
-    rows = np.asarray(rolled(dynamics, logged, ends - back, back + 1)[0])
-    before = logged.before(ends) if back == 0 else rows[:, -2]
-    return jnp.asarray(before), jnp.asarray(rows[:, -1])
+    """(before, after) of steps, each (W, N, D), as they are predicted from so many steps before; where the episode had
+    not `_begun`, nothing in particular. One program for all `back`."""
+    starts = np.maximum(ends - back, 0)
+    along = np.minimum(starts + np.arange(AHEAD[-1])[:, None], logged.store.steps - 1)
+    return _last_two(dynamics, logged.before(starts), logged.picked("actions", along), back + 1)
+
+
+@jax.jit
+def _last_two(dynamics: Dynamics, x: Array, actions: Array, steps: int) -> tuple[Array, Array]:
+    """The last two of the states (W, N, D) along the first so many of the actions (K, W, N, A)."""
+
+    def step(k: int, both: tuple[Array, Array]) -> tuple[Array, Array]:
+        return both[1], dynamics.step(both[1], actions[k])[0]
+
+    return jax.lax.fori_loop(0, steps, step, (x, x))
 
 
 def _ends_and_safe(logged: Logged, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -127,7 +137,7 @@ def widening(
         return ()
 
     def scored(before: np.ndarray | Array, after: np.ndarray | Array) -> np.ndarray:  # (W, causes) in margins
-        return np.asarray(_by_cause(barrier, jnp.asarray(before), jnp.asarray(after)))
+        return np.asarray(_by_cause(barrier, before, after))
 
     of_ends = scored(logged.before(bad), logged.after(bad))
     of_safe = scored(logged.before(fine), logged.after(fine))
@@ -138,7 +148,7 @@ def widening(
         known = _begun(logged, bad, ahead - 1)
         if known.sum() < ENTRIES:
             break
-        ends = scored(*_predicted(dynamics, logged, bad[known], ahead - 1))
+        ends = scored(*_predicted(dynamics, logged, bad, ahead - 1))[known]
         wanted = asked[-1].copy()
         for k in range(len(wanted)):
             mine = ends[blamed[known, k], k]
@@ -186,8 +196,7 @@ def _least(net: Score, x: Array) -> Array:
 
 
 def _in_own_margin(net: Score, dynamics: Dynamics, logged: Logged, ends: np.ndarray, safe: np.ndarray) -> Score:
-    of_ends = [_least(net, after) for _, after in predicted_ends(dynamics, logged, ends)]
-    predicted = np.concatenate([np.asarray(part) for part in of_ends])
+    predicted = scores_of_ends(lambda _, after: _least(net, after), dynamics, logged, ends)
     missed = max(MISSED, OUTLIERS / len(predicted))
     of_safe = np.asarray(_least(net, safe))
     bearable = float(np.quantile(of_safe, 1 - BEARABLE))  # what cannot be foreseen is not bought by any margin

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ringfence.types import Array
@@ -81,7 +80,7 @@ def _curve(net: Score, unit: float) -> Probe:
     if net.cause.length and edge.at:
         low, high = 0.0, min(high, FARTHEST * edge.at)
     at = np.linspace(low, high, POINTS)
-    scores = np.asarray(_scores_of_values(net, jnp.asarray(at[:, None], jnp.float32))) / unit
+    scores = np.asarray(_scores_of_values(net, at[:, None].astype(np.float32))) / unit
     return _along(net.cause.name, at, scores, edge.at)
 
 
@@ -100,7 +99,7 @@ def _map(net: Score, unit: float) -> ProbeMap:
     """Scores of a cause that reads two numbers, over their plane."""
     axes = [_axis(low, high) for low, high in zip(net.edge.low, net.edge.high)]
     places = np.stack(np.meshgrid(*axes), -1)
-    return _over(net.cause.name, axes, np.asarray(_scores_of_values(net, jnp.asarray(places, jnp.float32))) / unit)
+    return _over(net.cause.name, axes, np.asarray(_scores_of_values(net, np.asarray(places, np.float32))) / unit)
 
 
 def _over(name: str, axes: Sequence[np.ndarray], scores: np.ndarray) -> ProbeMap:

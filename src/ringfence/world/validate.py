@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array
+from ringfence.utils.device import on_device
 from ringfence.world import probes
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import (
@@ -34,8 +35,8 @@ from ringfence.world.margins import (
     conformal,
     count_entries,
     entries,
-    predicted_ends,
     rolled,
+    scores_of_ends,
     widening,
 )
 from ringfence.world.model import World
@@ -123,7 +124,7 @@ def _in_units(barrier: Barrier, unit: float) -> Barrier:
 def prediction_error(dynamics: Dynamics, logged: Logged, rng: np.random.Generator) -> PredictionError:
     """Root mean square errors of held-out windows, rolled out along the logged actions."""
     held = logged.held_steps
-    left = np.asarray(logged.arrays["last_row"] - logged.arrays["row"])[held]
+    left = logged.picked("last_row", held) - logged.picked("row", held)
     ahead = int(min(AHEAD, left.max()))
     starts = held[left >= ahead]
     starts = rng.choice(starts, min(WINDOWS, len(starts)), replace=False)
@@ -186,9 +187,9 @@ def _threshold(dynamics: Dynamics, logged: Logged) -> Threshold:
 
 def _value_scores(values: Values, logged: Logged, alone: bool, rng: np.random.Generator) -> ValueScores:
     steps = rng.choice(logged.held_steps, min(STEPS, len(logged.held_steps)), replace=False)
-    before = jnp.asarray(logged.before(steps))
-    actions = jnp.asarray(logged.picked("actions", steps))
-    reward, value = _valued(values, before, actions, jnp.asarray(logged.after(steps)), alone)
+    before = on_device(logged.before(steps))
+    actions = on_device(logged.picked("actions", steps))
+    reward, value = _valued(values, before, actions, on_device(logged.after(steps)), alone)
     rewards = np.asarray(logged.arrays["rewards"])[steps].mean(1)
     returns = np.asarray(logged.returns_to_go(values.discount))[steps]
     return ValueScores(
@@ -238,7 +239,7 @@ def _barrier_scores(
     truth = unsafe[steps]
     ends = entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
-    predicted = np.concatenate([np.asarray(_score(barrier, *step)) for step in predicted_ends(dynamics, logged, ends)])
+    predicted = scores_of_ends(lambda *step: _score(barrier, *step), dynamics, logged, ends)
     if count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
         warning = (
             f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is recognised, or to set a margin"

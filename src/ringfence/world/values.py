@@ -22,6 +22,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.homogeneous import team_mean
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 
 ROWS = 100_000  # states evaluated at once
 STATES = 20_000  # that features are standardised by, or up to twice as many
@@ -104,7 +105,7 @@ def fit_values(
         return ((team_mean(out, alone) - goal) ** 2).mean()
 
     some = (np.asarray(x)[np.asarray(picked)] for x in (arrays["actions"], arrays["row"], rewards))  # on the host
-    data = arrays["features"], *(jnp.asarray(x) for x in some)
+    data = arrays["features"], *(on_device(x) for x in some)
     label = "" if quiet else "rewards, what steps are worth"
     reward = regress(loss, net, data, len(picked), key_reward, updates, 512, 4e-3, label)
     return Values(critic, reward, discount, map.joint, alone)
@@ -202,14 +203,14 @@ def _statistics(features: Array, period: int, weight: tuple[float, ...] | None) 
     """Mean and scale (D,) of some states, with every agent's view of them. A stride in step with the episodes would see
     the same few moments of all of them, e.g. the start, where everybody rests."""
     strides = itertools.count(max(1, len(features) // STATES))
-    some = features[:: next(stride for stride in strides if math.gcd(stride, period) == 1)]
-    flat = np.asarray(some.reshape(-1, features.shape[-1]), np.float64)
+    some = np.asarray(features)[:: next(stride for stride in strides if math.gcd(stride, period) == 1)]
+    flat = some.reshape(-1, features.shape[-1]).astype(np.float64)
     mean = flat.mean(0)
     scale = varying(flat.std(0), mean)
     if weight is not None:
         with np.errstate(divide="ignore"):  # what has no weight is not read
             scale = scale / np.asarray(weight)
-    return jnp.asarray(mean, jnp.float32), jnp.asarray(scale, jnp.float32)
+    return on_device(mean, np.float32), on_device(scale, np.float32)
 
 
 def blank_critic(features: int) -> Critic:
