@@ -15,6 +15,7 @@ from ringfence.guards.filter import Guard
 from ringfence.guards.options import GuardOptions
 from ringfence.proposals.base import held
 from ringfence.types import Array
+from ringfence.utils.device import on_device
 from ringfence.world import World, causes
 from ringfence.world.cause_counts import Explained, counted, some_steps
 from ringfence.world.causes import Cause
@@ -45,7 +46,7 @@ def false_safe(world: World, logged: Logged) -> float | None:
     agents, entries = logged.arrays["actions"].shape[1:]
     wanted = rng.choice((-1.0, 0.0, 1.0), (len(present), agents, entries)).astype(np.float32)
     guard = Guard(BarrierSource(world, "learned", None, False), SHIELD)
-    rows, met = _searched(guard, jnp.asarray(present), jnp.asarray(wanted))
+    rows, met = _searched(guard, on_device(present), on_device(wanted))
     found = np.asarray(rows)[np.asarray(met)]  # (found, K, N, D)
     if len(found) < FEW:
         return None

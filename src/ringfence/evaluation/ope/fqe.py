@@ -16,6 +16,7 @@ from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 
 WIDTH = 64  # units of each of the 2 hidden layers
 BEYOND = 0.5  # of the range that values can have: estimates further outside have diverged
@@ -80,25 +81,25 @@ def fitted_q(
     scale = varying(flat.std(0), location)
 
     def view(rows: np.ndarray) -> Array:
-        return jnp.asarray((x[rows] - location) / scale, jnp.float32)
+        return on_device((x[rows] - location) / scale, np.float32)
 
     earned = np.stack([logs.rewards[steps], logs.costs[steps]], -1).astype(np.float64)
     mean = earned.mean(0)
     deviation = np.maximum(earned.std(0), 1e-6)
     data = Steps(
         x=view(logs.row[steps]),
-        action=jnp.asarray(logs.actions[steps]),
+        action=on_device(logs.actions[steps]),
         next_x=view(logs.row[steps] + 1),
-        next_action=jnp.asarray(next_actions),
-        earned=jnp.asarray((earned - mean) / deviation * (1 - settings.discount), jnp.float32),
-        goes_on=jnp.asarray(~logs.terminated[steps], jnp.float32),
-        weight=jnp.asarray(_bootstrap(logs.episode[steps], settings.num_ensemble, weight_key), jnp.float32),
+        next_action=on_device(next_actions),
+        earned=on_device((earned - mean) / deviation * (1 - settings.discount), np.float32),
+        goes_on=on_device(~logs.terminated[steps], np.float32),
+        weight=on_device(_bootstrap(logs.episode[steps], settings.num_ensemble, weight_key), np.float32),
     )
     nets = _networks(data, logs.joint, settings.num_ensemble, net_key)
     # What ends for good earns nothing more, and nothing is −mean in these units.
-    fast = _fitted(nets, data, jnp.asarray(-mean / deviation, jnp.float32), settings, fit_key, label)
+    fast = _fitted(nets, data, on_device(-mean / deviation, np.float32), settings, fit_key, label)
     at_starts = jax.jit(lambda nets, x, action: jax.vmap(lambda q: q(x, action).mean(0))(nets))
-    found = np.asarray(at_starts(fast, view(starts), jnp.asarray(first_actions)), np.float64)  # (M, 2)
+    found = np.asarray(at_starts(fast, view(starts), first_actions), np.float64)  # (M, 2)
     found = (found * deviation + mean) / (1 - settings.discount)
     returns, costs = (_bounded(found[:, k], earned[:, k] / (1 - settings.discount)) for k in range(2))
     return Values(returns, costs)

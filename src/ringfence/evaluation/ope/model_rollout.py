@@ -19,6 +19,7 @@ from ringfence.guards import BarrierSource
 from ringfence.problem import normalise
 from ringfence.problem.normalise import varying
 from ringfence.types import Array, Key
+from ringfence.utils.device import on_device
 from ringfence.world import World
 
 EXACT = 0.01  # deviations by which an entry may be missed, root mean square
@@ -56,8 +57,8 @@ def observer(logs: Logs, reads_state: bool, rng: np.random.Generator) -> Observe
         weights = _linear(x.reshape(len(rows), -1), store.state[rows])
         if weights is None:
             return None
-        of_state = jnp.asarray(weights, jnp.float32)
-    return Observer(jnp.asarray(np.stack(of_agents), jnp.float32), of_state)
+        of_state = on_device(weights, np.float32)
+    return Observer(on_device(np.stack(of_agents), np.float32), of_state)
 
 
 def _linear(x: np.ndarray, y: np.ndarray) -> np.ndarray | None:

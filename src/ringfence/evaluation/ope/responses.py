@@ -15,6 +15,7 @@ from ringfence.guards.policy import Guarded
 from ringfence.problem import normalise
 from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, Proposes, PyTree
+from ringfence.utils.device import on_device
 from ringfence.world import World
 
 BATCH = 512  # states that a policy is asked in together
@@ -51,8 +52,8 @@ class Respondent:
         for first in range(0, len(rows), BATCH):
             some = np.resize(rows[first : first + BATCH], BATCH)  # one shape, one program
             store = self.logs.store
-            seen = jnp.asarray(store.observations[some])
-            state = jnp.asarray(store.state[some]) if self.reads_state and store.state is not None else None
+            seen = on_device(store.observations[some])
+            state = on_device(store.state[some]) if self.reads_state and store.state is not None else None
             key = jax.random.fold_in(root, first)
             part = self._respond(self.policy, self.world, seen, state, key, ahead=self.ahead)
             parts.append({name: np.asarray(v)[: len(rows) - first] for name, v in part.items()})
@@ -95,7 +96,7 @@ def behaviour(logs: Logs, steps: np.ndarray, responses: Responses, world: World)
     logged = logs.actions[steps]
     done = responses.action
     spread = jax.jit(lambda dynamics, x, action: dynamics.step(x, action)[1].max(-1))
-    apart = np.asarray(spread(world.dynamics, logs.x[logs.row[steps]], jnp.asarray(done)))
+    apart = np.asarray(spread(world.dynamics, logs.x[logs.row[steps]], done))
     rmse = np.sqrt(((done - logged) ** 2).mean())
     return Behaviour(
         intervention_rate=_share(responses.changed),

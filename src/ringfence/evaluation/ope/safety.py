@@ -25,8 +25,8 @@ def safety(logs: Logs, steps: np.ndarray, responses: Responses, world: World, ah
     barrier = BarrierSource(world, "learned", None, False)
     x = logs.x[logs.row[steps]]
     smallest = jax.jit(_smallest_margin)
-    of_policy = np.asarray(smallest(barrier, x, jnp.asarray(responses.plan)))[safe]
-    of_logs = np.asarray(smallest(barrier, x, jnp.asarray(logs.actions[later])))[safe]
+    of_policy = np.asarray(smallest(barrier, x, responses.plan))[safe]
+    of_logs = np.asarray(smallest(barrier, x, logs.actions[later]))[safe]
     episodes = logs.episode[steps][safe]
     asked = len(np.unique(episodes))
     violated = len(np.unique(episodes[of_policy < 1]))

@@ -19,6 +19,7 @@ from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import act_with, held, with_cost
 from ringfence.types import Array, Policy, PolicyStep, PyTree
+from ringfence.utils.device import on_device
 from ringfence.utils.progress import Progress
 from ringfence.world import World
 
@@ -40,7 +41,8 @@ def _scored(guard: Guard, before: Array, after: Array) -> Array:
 
 def _present(world: World, observations: Any, state: Any) -> Array:
     """(W, N, D) what a World sees."""
-    return world.map(jnp.asarray(observations), None if state is None else jnp.asarray(state))
+    observations, state = (None if x is None else np.asarray(x, np.float32) for x in (observations, state))
+    return on_device(world.map(observations, state))
 
 
 class _Bad:
