@@ -84,7 +84,7 @@ def forget_programs():
     was compiled is forgotten. Programs that files share stay until then."""
     yield
     maps, limit = Path("/proc/self/maps"), Path("/proc/sys/vm/max_map_count")
-    if limit.exists() and len(maps.read_bytes().splitlines()) > int(limit.read_text()) // 3:
+    if limit.exists() and len(maps.read_bytes().splitlines()) > int(limit.read_text()) // 2:
         jax.clear_caches()
         gc.collect()
 

@@ -68,6 +68,7 @@ def test_the_shield_never_makes_it_worse(small_world, bound, present):
     plan = jax.random.uniform(jax.random.key(5), (64, 3, 3, 2), minval=-1, maxval=1)
     margin = jnp.full((64, 1), 3.0)
 
+    @jax.jit
     def missing(plan):
         rows, spread = guard.predict(present, plan[:, None])
         return guard.missing(present, guard.clear(rows, spread, margin)[:, 0], margin).sum((1, 2))
@@ -156,11 +157,11 @@ def test_many_plans_are_corrected_as_few_are(small_world, bound, present):
 def test_refining_climbs_value(small_world, bound, present):
     guard = make(small_world, bound, optimizer_steps=10, num_restarts=4, safety_weight=0.0)
     plan = jnp.zeros((64, 1, 3, 3, 2))
-    value = lambda a: small_world.values.of_plan(guard.predict(present, a)[0], a)  # noqa: E731
+    value = jax.jit(lambda a: small_world.values.of_plan(guard.predict(present, a)[0], a))
     better = eqx.filter_jit(guard.refined)(present, plan, -jnp.ones_like(plan), jnp.ones_like(plan), jnp.zeros((64, 1)))
     assert (value(better) > value(plan)).mean() > 0.9 and jnp.abs(better).max() <= 1
     last = jnp.full((64, 3, 3, 2), 0.5)
-    starts = guard.started(plan, last, jax.random.key(0))[0]
+    starts = eqx.filter_jit(guard.started)(plan, last, jax.random.key(0))[0]
     assert starts.shape[1] == 4
     np.testing.assert_array_equal(starts[:, 0], plan[:, 0])
     assert (starts[:, 1] == 0.5).all()  # the last plan, moved on
@@ -171,7 +172,7 @@ def test_refining_stays_within_reach_of_its_proposal(small_world, bound, present
     guard = make(small_world, bound, optimizer_steps=10, num_restarts=6, num_samples=2, trust_radius=0.1)
     plan = jnp.stack([jnp.full((64, 3, 3, 2), v) for v in (0.0, 0.95)], 1)
     last = jnp.full((64, 3, 3, 2), 0.5)
-    starts, low, high = guard.started(plan, last, jax.random.key(0))
+    starts, low, high = eqx.filter_jit(guard.started)(plan, last, jax.random.key(0))
     better = eqx.filter_jit(guard.refined)(present, starts, low, high, jnp.zeros((64, 1)))
     for found in (starts, better):
         near = [jnp.abs(found - plan[:, k : k + 1]).max((2, 3, 4)) <= 0.1 + 1e-6 for k in range(2)]
@@ -290,10 +291,11 @@ def test_an_adapting_margin_settles_at_its_rate(small_world, bound):
 
 def test_a_cost_that_is_heard_moves_the_margin(small_world, bound, small_store):
     policy = build(Constant(small_world.spec), small_world, constraints.Separation(), "adapt", "analytic")
+    act = eqx.filter_jit(policy.act)
     seen, state = small_store.observations[:2], small_store.state[:2]
-    carry, first = policy.act(policy.initial_state(2), seen, state, jax.random.key(0))
+    carry, first = act(policy.initial_state(2), seen, state, jax.random.key(0))
     assert (carry["margin"] == np.float32(0.6)).all()  # nobody chose the first state
-    carry, _ = policy.act(policy.observe_cost(carry, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
+    carry, _ = act(policy.observe_cost(carry, np.array([0.0, 1.0])), seen, state, jax.random.key(1))
     o = policy.guard.options
     expected = 0.6 + o.adapt * (np.array([0.0, 1.0]) - o.rate)
     np.testing.assert_allclose(carry["margin"][:, 0], expected, rtol=1e-5)
@@ -332,7 +334,8 @@ def test_where_the_world_knows_nothing_danger_is_assumed(small_world, bound, pre
     barrier = BarrierSource(small_world, "learned", None, False)
     rows = jnp.stack([present, present], 1)[:, None]
     spread = jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold)
-    near, far = barrier.along(rows, 0.0 * spread), barrier.along(rows, spread)
+    along = eqx.filter_jit(barrier.along)
+    near, far = along(rows, 0.0 * spread), along(rows, spread)
     np.testing.assert_allclose(near - far, 2.0, rtol=1e-4)
 
 
@@ -340,9 +343,10 @@ def test_nothing_has_its_margin_out_of_distribution_where_a_guard_stays_within_t
     anywhere = Shown((-1e3,), (1e3,), (0,), (False,), ())
     barrier = BarrierSource(small_world, "learned", None, False, anywhere)
     rows = jnp.stack([present, present], 1)[:, None]
-    near = barrier.along(rows, jnp.zeros((64, 1, 1, 3)))
-    far = barrier.along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold))
-    at_the_edge = barrier.along(rows, jnp.full((64, 1, 1, 3), small_world.ood_threshold))
+    along = eqx.filter_jit(barrier.along)
+    near = along(rows, jnp.zeros((64, 1, 1, 3)))
+    far = along(rows, jnp.full((64, 1, 1, 3), 3.0 * small_world.ood_threshold))
+    at_the_edge = along(rows, jnp.full((64, 1, 1, 3), small_world.ood_threshold))
     assert (near > 1).any(), "any margin may be kept where it knows what happens"
     np.testing.assert_allclose(far, jnp.minimum(near, -1.0), rtol=1e-4)
     np.testing.assert_allclose(at_the_edge, jnp.minimum(near, 1.0), rtol=1e-4)
@@ -513,7 +517,7 @@ def test_policies_of_before_are_understood(small_world, small_store):
     with pytest.warns(FutureWarning, match="start of the policy Before is called initial_state now"):
         guarded = ringfence.guard(Before(), small_world)
     seen, state = small_store.observations[:2], small_store.state[:2]
-    carry, _ = guarded.act(guarded.initial_state(2), seen, state, jax.random.key(0))
+    carry, _ = eqx.filter_jit(guarded.act)(guarded.initial_state(2), seen, state, jax.random.key(0))
     assert carry["inner"].tolist() == [1.0, 1.0]
     for policy in (guarded, Constant(small_world.spec)):
         with pytest.warns(FutureWarning, match="start of a policy is called initial_state now"):

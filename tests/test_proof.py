@@ -183,21 +183,22 @@ def test_where_a_plan_is_not_proved_the_last_one_that_was_goes_on(guarded, prese
         "horizon": 1,
     }
     policy = build(Nothing(), world, None, "shield", "learned", terminal_value=False, **options)
+    decided = eqx.filter_jit(policy.decided)
     prover = Prover(world, 0.02, 0.0, 4)
     far, near = jnp.array([2.5, 0.0, 0.0, 0.0, 1.0]), jnp.array([0.15, 0.0, 0.0, 0.0, 1.0])  # dx, dy, dvx, dvy, seen
     safe, danger = (present.at[..., 4:].set(jnp.tile(other, 6)) for other in (far, near))
     wanted = jnp.full((24, 1, 1, 1, 2), 0.3)
-    carry, step = policy.decided(policy.initial_state(24), safe, wanted, jax.random.key(0))
+    carry, step = decided(policy.initial_state(24), safe, wanted, jax.random.key(0))
     assert step.info["proved"].all() and not step.info["agent_backup"].any()
     plan = prover.continued(safe, step.action[:, None])
     np.testing.assert_allclose(carry["proved_plan"], plan, atol=1e-6)
     for k in range(1, 5):
-        carry, step = policy.decided(carry, danger, wanted, jax.random.key(k))
+        carry, step = decided(carry, danger, wanted, jax.random.key(k))
         left = k < 4
         assert (step.info["proved"] == left).all() and (step.info["agent_backup"] == left).all()
         if left:
             np.testing.assert_allclose(step.action, plan[:, k], atol=1e-6)
-    carry, step = policy.decided(policy.initial_state(24), danger, wanted, jax.random.key(0))
+    carry, step = decided(policy.initial_state(24), danger, wanted, jax.random.key(0))
     assert not step.info["proved"].any()
 
 

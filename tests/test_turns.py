@@ -164,7 +164,7 @@ def test_a_world_reads_who_is_seen_only_where_that_tells_more(tmp_path, monkeypa
     seen = np.stack(seen, 1)
     costs = (np.abs(seen[:, 1:, :, 1]) < 0.4).any(-1)
     store = EpisodeStore.from_episodes(seen, actions, costs * 0.0, costs)
-    how = QUICK_WORLD | {"dynamics_updates": 1500}
+    how = QUICK_WORLD | {"dynamics_updates": 1500, "barrier": False}
     told = worlds.fit(store, cached=False, **how)
     monkeypatch.setattr(partners, "found_in", lambda x: ())
     plain = worlds.fit(store, cached=False, **how)
