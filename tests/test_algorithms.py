@@ -697,7 +697,7 @@ def test_agents_act_by_as_many_entries_as_they_have(name, played, absolute):
     state = jax.tree.map(lambda x: x + 0.1 if x.dtype == jnp.float32 else x, state)  # as if it had learned
     policy = resolve.make_policy(job, state, {})
     seen, whole = store.observations[:4], store.state[:4]
-    action = np.asarray(policy.act(policy.initial_state(4), seen, whole, jax.random.key(0))[1].action)
+    action = np.asarray(eqx.filter_jit(policy.act)(policy.initial_state(4), seen, whole, jax.random.key(0))[1].action)
     assert (action[:, 1, 1] == 0).all() and (np.abs(action[:, [0, 2]]) > 0).all() and (action[:, 1, 0] != 0).all()
     wide = store.card.updated(action_sizes=[2, 3, 2])
     with pytest.raises(UserError, match=r"action_sizes=\[2, 3, 2\]; it must say for each of the 3 agents .* 1 to 2"):

@@ -72,7 +72,7 @@ def test_drivers_are_found_without_labels(run, two_drivers):
     assert run.metrics[-1]["drivers/sure"] > 0.95
     store = two_drivers
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
-    first = np.asarray(policy.draw(jnp.zeros((2, 2, 3)), jnp.arange(2), jax.random.key(0)))[:, 0, 0]
+    first = np.asarray(eqx.filter_jit(policy.draw)(jnp.zeros((2, 2, 3)), jnp.arange(2), jax.random.key(0)))[:, 0, 0]
     assert first.min() < -0.4 and first.max() > 0.4, "one driver each"
     assert store.card.extra == {}, "nobody said who drives"
 
@@ -88,7 +88,7 @@ def test_steps_outside_an_episode_are_left_out(two_drivers):
 def test_shares_are_balanced():
     """Rows add up to one; a driver who explains all windows a little better does not get them all."""
     explained = jax.random.normal(jax.random.key(0), (40, 4)) + jnp.array([5.0, 0.0, 0.0, 0.0])
-    shares = np.asarray(drivers.balanced(explained))
+    shares = np.asarray(jax.jit(drivers.balanced)(explained))
     np.testing.assert_allclose(shares.sum(1), 1.0, atol=1e-5)
     np.testing.assert_allclose(shares.sum(0), 10.0, rtol=0.05)
 
@@ -97,7 +97,8 @@ def test_drivers_that_nobody_needs_are_left(two_drivers, tmp_path):
     """With six for two, balance alone would give each a sixth: two explain all windows, and only they are drawn."""
     search = drivers.Search(4, num_updates=100, settled=0.5)
     explained = jnp.zeros((40, 4)).at[:, 0].set(9.0)
-    early, late = (np.asarray(drivers.shares_of(search, explained, step)).mean(0) for step in (0, 60))
+    shares = jax.jit(drivers.shares_of, static_argnums=0)
+    early, late = (np.asarray(shares(search, explained, step)).mean(0) for step in (0, 60))
     np.testing.assert_allclose(early, 0.25, atol=0.02)
     np.testing.assert_allclose(late, [1.0, 0.0, 0.0, 0.0], atol=0.01)
     run = loop.train("flow", two_drivers, out=tmp_path, changes={**SMALL, "drivers": 6}, quiet=True)[0]
@@ -111,9 +112,11 @@ def test_a_guard_gets_as_many_proposals_as_it_asks_for(run, two_drivers, count):
     policy = load(run)[1]
     world = worlds.fit(two_drivers, **QUICK_WORLD, barrier=False)
     x = jnp.asarray(two_drivers.observations[:4])
-    carry, plans, _ = policy.propose(policy.initial_state(4), x, None, jax.random.key(0), count, 2, world)
+    carry, plans, _ = eqx.filter_jit(policy.propose)(
+        policy.initial_state(4), x, None, jax.random.key(0), count, 2, world
+    )
     assert plans.shape == (4, count, 2, 2, 1)
-    again, action = policy.act(policy.initial_state(4), x, None, jax.random.key(0))
+    again, action = eqx.filter_jit(policy.act)(policy.initial_state(4), x, None, jax.random.key(0))
     np.testing.assert_array_equal(carry["driver"], again["driver"])
     assert np.isfinite(plans).all()
 
@@ -153,7 +156,9 @@ def test_proposals_are_of_several_drivers(run, two_drivers):
     world = worlds.fit(two_drivers, **QUICK_WORLD)
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
     seen = jnp.zeros((5, 2, 3))
-    carry, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world)
+    carry, actions, _ = eqx.filter_jit(policy.propose)(
+        policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world
+    )
     assert actions.shape == (5, 9, 2, 2, 1)
     ways = np.asarray(actions)[:, :, 0, 0, 0]
     assert ((ways.max(1) > 0.4) & (ways.min(1) < -0.4)).all()
@@ -186,7 +191,7 @@ def test_plans_of_states_are_of_one_driver(two_drifts, tmp_path):
     assert 0.2 < up.mean() < 0.8
     world = worlds.fit(two_drifts, **QUICK_WORLD)
     seen = jnp.zeros((5, 2, 1))
-    _, actions, _ = policy.propose(policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world)
+    _, actions, _ = eqx.filter_jit(policy.propose)(policy.initial_state(5), seen, None, jax.random.key(0), 9, 2, world)
     ways = np.asarray(actions)[:, :, 0, 0, 0]
     assert ((ways.max(1) > 0.3) & (ways.min(1) < -0.3)).all()
 
@@ -262,7 +267,7 @@ def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
     def drawn(share, present, steps=1):
         options = PlanOptions(sampling_steps=steps, temperature=0.0, barrier_guidance=share)
         asked = dataclasses.replace(policy, options=options).guided_by(Line(policy.spec))
-        return np.asarray(asked.draw(x, driver, jax.random.key(0), present))
+        return np.asarray(eqx.filter_jit(asked.draw)(x, driver, jax.random.key(0), present))
 
     free = drawn(0.0, x)
     lacking = (free + 0.5).mean()
@@ -286,7 +291,7 @@ def test_flow_learns_to_keep_the_margin(two_drifts, tmp_path, monkeypatch):
     policy = load(run, sampling_steps=1, temperature=0.0)[1]
     x = jnp.zeros((8, 2, 1))
     for driver in range(2):
-        ends = x + policy.draw(x, jnp.full(8, driver), jax.random.key(0))
+        ends = x + eqx.filter_jit(policy.draw)(x, jnp.full(8, driver), jax.random.key(0))
         assert ends.max() < -0.3, "the drivers push by 0.7, up or down"
 
 

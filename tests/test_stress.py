@@ -202,7 +202,7 @@ def test_what_proposes_is_shown_that_state_and_what_was_sent_is_remembered(run):
     env = Crossing()
     observations = env.observe(env.reset(jax.random.key(0), 1))[0][:, None]
     carry = late.initial_state(8)
-    carry, step = late.act(carry, observations, None, jax.random.key(1))
+    carry, step = eqx.filter_jit(late.act)(carry, observations, None, jax.random.key(1))
     np.testing.assert_allclose(
         carry["inner"]["shown"], late.when_it_acts(late.initial_state(8), observations), atol=1e-6
     )
