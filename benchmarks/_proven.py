@@ -13,8 +13,8 @@ POOLED = ("violation_rate", "return_mean")
 
 
 def proven(folder: Path = RESULTS / "proving", files: str = "proving-*.json") -> list[dict[str, Any]]:
-    """By system, what seed 0 found, with each row as its mean over the seeds that played it (`seeds`, and the `most`
-    violations of one), the `verdicts` of all seeds, and the `causes` of all."""
+    """By system, what seed 0 found, but for `rows`, each the mean over the seeds that played it and the `most`
+    violations of one, the `verdicts` of all seeds, and the `causes` of all."""
     found = []
     for file in sorted(folder.glob(files)):
         others = sorted(folder.glob(f"seed-*/{file.name}"))
@@ -26,7 +26,8 @@ def proven(folder: Path = RESULTS / "proving", files: str = "proving-*.json") ->
 
 
 def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    if "refused" in rows[0]:
-        return rows[0]
+    for row in rows:
+        if "refused" in row:
+            return row
     pooled = {name: float(np.mean([row[name] for row in rows])) for name in POOLED}
-    return rows[0] | pooled | {"seeds": len(rows), "most": max(row["violation_rate"] for row in rows)}
+    return pooled | {"most": max(row["violation_rate"] for row in rows)}

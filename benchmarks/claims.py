@@ -109,7 +109,7 @@ def of_a_pool(row: str, verdict: Callable[[dict, dict], bool]) -> Callable[[], t
 
 
 def of_systems() -> tuple[bool, str]:
-    """The clone's and the naive driver's episodes on the proving ground, by the seed that violates most."""
+    """Episodes on the proving ground: the clone's by the seed that violates most, the naive driver's in the mean."""
     found = proven()
     rows = {one["task"].removeprefix("proving-"): one["rows"] for one in found}
     clone = {name: r["bc shield learned"]["most"] for name, r in rows.items()}

@@ -81,9 +81,10 @@ def test_every_task_has_a_page_with_its_results(made):
         # The proving ground and pooled tiers have not been played in full yet: they have no committed results.
         assert "| behaviour data | – |" in page or name.startswith("proving-") or name.endswith("-pooled")
         assert f"({name}.md)" in pages["tasks/README.md"]
-    pattern = r"^\| `bc` `default\+shield-learned`, 8 agents .*\| 4\.4[79] \|.*$"
-    one, two = re.findall(pattern, pages["tasks/crossing-hasty.md"], re.M)  # of two suites
-    assert all("| 0 | 0 | 0 % |" in row for row in (one, two))  # docs/crossing-results.md has the same rows
+    for earned in ("4.47", "4.49"):  # of two suites, of which docs/crossing-results.md has the same rows
+        pattern = rf"^\| `bc` `default\+shield-learned`, 8 agents .*\| {re.escape(earned)} \|.*$"
+        (row,) = re.findall(pattern, pages["tasks/crossing-hasty.md"], re.M)
+        assert "| 0 | 0 | 0 % |" in row
     for name in ringfence.__all__:
         assert f"`ringfence.{name}`" in pages["reference/README.md"]
 

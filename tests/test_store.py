@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import pathlib
 
 import h5py
 import jax
@@ -615,6 +616,19 @@ def test_another_kind_of_file_is_imported_or_given_as_arrays(tmp_path):
     (tmp_path / "logs.npz").rename(tmp_path / "logs.h5")  # whatever its name
     with pytest.raises(StoreError, match=r"logs\.h5' is no episode store, by its first bytes; import it"):
         EpisodeStore.load(tmp_path / "logs.h5")
+
+
+def test_a_file_that_cannot_be_read_is_refused_like_a_damaged_one(tmp_path, monkeypatch):
+    """Whoever asks for its first bytes may be refused, too."""
+    (tmp_path / "s.h5").write_bytes(b"PK")
+
+    def denied(*_, **__):
+        raise PermissionError("Permission denied")
+
+    monkeypatch.setattr(h5py, "File", denied)
+    monkeypatch.setattr(pathlib.Path, "open", denied)
+    with pytest.raises(StoreError, match=r"s\.h5' is truncated or not HDF5 \(Permission denied\)"):
+        EpisodeStore.load(tmp_path / "s.h5")
 
 
 def test_flat_logs_need_the_state_that_each_episode_ended_in():

@@ -25,7 +25,6 @@ from ringfence.problem.features import translation
 from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
-from ringfence.utils.device import leading
 from ringfence.utils.given import cost_given
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
@@ -261,8 +260,9 @@ def costs_of_one(cost: Paid, agents: int) -> np.ndarray | dict[str, np.ndarray]:
 def acted(step: PolicyStep, who: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """(action (N, A) float32, info) of one environment's step; what is not finite is refused, since nobody can act
     upon it."""
-    action = np.array(leading(step.action), np.float32)
-    info = {name: np.array(leading(value)) for name, value in step.info.items()}
+    action, info = jax.device_get((step.action, step.info))
+    action = np.array(action[0], np.float32)
+    info = {name: np.array(value[0]) for name, value in info.items()}
     if not np.isfinite(action).all():
         raise UserError(f"{who} gave actions that are not finite; it has diverged: train or fit it again.")
     if "clearance" in info and np.isnan(info["clearance"]).any():

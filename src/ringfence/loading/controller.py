@@ -244,7 +244,8 @@ def guard(
 
     policy: a policy of the library (with `initial_state` and `act`), which gives a `Guarded`; or any callable
     (observations (N, O), state (S,) or None) -> actions (N, A) within the task's bounds, or of observations alone, e.g.
-    a PyTorch network, which gives a `Controller`, for a team of `agents` where the World is of homogeneous agents.
+    a PyTorch network, which gives a `Controller`, for a team of `agents` where the World is of homogeneous agents. A
+    second parameter with a default is its own, and not the state, unless it is called `state`.
     `guard` is a name in GUARDS, `barrier` learned, analytic or both, `options` fields of GuardOptions; `hazard` defines
     the analytic one, where that is to be used. A World whose verdict is unfit is refused, unless `anyway`.
     """

@@ -21,6 +21,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -497,9 +498,7 @@ class EpisodeStore:
         except StoreError:
             raise
         except OSError as error:
-            with path.open("rb") as file:
-                begins = file.read(len(HDF5_BEGINS))
-            if begins and not HDF5_BEGINS.startswith(begins):
+            if _begins_otherwise(path):
                 raise StoreError(
                     f"'{path}' is no episode store, by its first bytes; import it with `ringfence data`, or give its "
                     "arrays to EpisodeStore.from_steps."
@@ -520,6 +519,14 @@ class EpisodeStore:
                 f"'{path}' holds other numbers than were written (its digest differs); make or import it again."
             )
         return found
+
+
+def _begins_otherwise(path: Path) -> bool:
+    """Whether a file can be read and is no HDF5, not even the beginning of one."""
+    begins = b""
+    with suppress(OSError), path.open("rb") as file:
+        begins = file.read(len(HDF5_BEGINS))
+    return not HDF5_BEGINS.startswith(begins)
 
 
 def _checked(path: Path, f: h5py.File) -> dict[str, h5py.Dataset]:

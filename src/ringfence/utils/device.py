@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
@@ -14,8 +12,3 @@ from ringfence.types import Array
 def on_device(x: ArrayLike, dtype: DTypeLike | None = None) -> Array:
     """The array on the device, of 32 bits; `jnp.asarray` compiles a program for every shape that it is given."""
     return jax.device_put(np.asarray(x, dtype))
-
-
-def leading(x: Any) -> np.ndarray:
-    """The first of a batch, on the host, for the same reason."""
-    return np.asarray(x)[0]

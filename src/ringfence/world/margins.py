@@ -102,7 +102,7 @@ def _begun(logged: Logged, ends: np.ndarray, back: int) -> np.ndarray:
 
 def _predicted(dynamics: Dynamics, logged: Logged, ends: np.ndarray, back: int) -> tuple[Array, Array]:
     """(before, after) of steps, each (W, N, D), as they are predicted from so many steps before; where the episode had
-    not `_begun`, nothing in particular. One program for all `back`."""
+    not `_begun`, nothing in particular. One program for all `back`, below the farthest of `AHEAD`."""
     starts = np.maximum(ends - back, 0)
     along = np.minimum(starts + np.arange(AHEAD[-1])[:, None], logged.store.steps - 1)
     return _last_two(dynamics, logged.before(starts), logged.picked("actions", along), back + 1)
