@@ -8,9 +8,13 @@ import numpy as np
 import pytest
 
 import ringfence
+from ringfence.loading import resolve
 from ringfence.logs.store import EpisodeStore
+from ringfence.nets import bounds
+from ringfence.nets.mlp import MLP
 from ringfence.training import loop, worlds
 from ringfence.training.runs import sound_arrays
+from ringfence.utils.precision import float32
 from tests.quick import QUICK_WORLD
 
 
@@ -72,3 +76,27 @@ def test_a_world_and_its_guard_in_a_program_of_64_bits(store, usual, wide):
     actions = [pilot.act(store.observations[t], cost=1.0) for t in range(3)]
     assert {a.dtype for a in actions} == {np.dtype(np.float32)}
     assert seen == [jnp.float64] * 3, "somebody's own function keeps its precision"
+
+
+def test_a_guard_keeps_all_bits_of_products_also_in_a_program_that_somebody_else_compiles(store, usual):
+    """On a GPU, 30 % of proven bounds of narrow sets were left by what they bound."""
+    policy = resolve.load(usual["bc"], guard="shield", world=usual["world"])[1]
+    inputs = policy.initial_state(1), store.observations[:1], None, jax.random.key(0)
+    program = jax.jit(lambda *inputs: policy.act(*inputs)).lower(*inputs).as_text()
+    products = [line for line in program.splitlines() if "stablehlo.dot_general" in line]
+    assert products and all("precision = [HIGHEST, HIGHEST]" in line for line in products)
+
+
+def test_bounds_hold_as_narrow_as_they_are():
+    """What products lose is within what bounds allow for."""
+    g = np.random.default_rng(0)
+    net = MLP(jax.random.key(0), (24, 256, 256, 8))
+    center = g.normal(size=(256, 24)).astype(np.float32)
+    inputs = bounds.Inputs(center, None, np.full_like(center, 1e-4))
+    with float32():
+        low, high = jax.jit(bounds.output_bounds)(net, inputs)
+    true = center.astype(float)
+    for layer, (weight, bias) in enumerate(zip(net.weights, net.biases)):
+        true = true @ np.asarray(weight[0], float) + np.asarray(bias[0], float)
+        true = np.maximum(true, 0) if layer < 2 else true
+    assert ((low <= true) & (true <= high)).all() and (high - low).mean() < 1e-3

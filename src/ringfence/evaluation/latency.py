@@ -11,6 +11,7 @@ import numpy as np
 from ringfence.datasets.task import Task
 from ringfence.envs.base import Env, NativeEnv
 from ringfence.types import Array, Policy
+from ringfence.utils.precision import in_float32
 
 WARM_UP = 10  # calls that are not counted
 
@@ -25,6 +26,7 @@ def _first(env: Env | NativeEnv) -> tuple[Array, Array]:
     return env.observe(state), env.global_state(state)
 
 
+@in_float32
 def plan_latency(policy: Policy, task: Task, calls: int = 200) -> dict[str, float]:
     """Milliseconds for one joint action in one environment: p50 and p99 over `calls`, after warm-up."""
     seen = _first(task.simulator)
