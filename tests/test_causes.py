@@ -19,7 +19,7 @@ from ringfence.problem.turns import Turn
 from ringfence.report.ope_page import build_ope
 from ringfence.world import cause_counts, cause_search, causes, foresight, load, margins, probes, save, verdict
 from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
-from ringfence.world.cause_nets import FAR, LEAST, blank, scores, with_margin
+from ringfence.world.cause_nets import FAR, LEAST, blank, scores, values_of, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
 from ringfence.world.logged import Logged, held_out, labels_of
@@ -70,6 +70,25 @@ def test_causes_are_found_without_names(logged):
     found, _ = cause_search.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])
     entries = {c.things[0] for c in found.causes}
     assert {(5, 6), (7, 8), (2,), (0, 1)} == entries
+
+
+@pytest.mark.parametrize("axes", ["xy", "xyz"])
+def test_danger_may_be_a_box_or_a_cylinder(axes):
+    """Vehicles are too near where they are along and aside, aircraft where they are across and in height."""
+    rng = np.random.default_rng(0)
+    others = (rng.normal(size=(9000, N, N - 1, len(axes))) * [6.0, 6.0, 2.0][-len(axes) :]).astype(np.float32)
+    across = np.linalg.norm(others[..., :-1], axis=-1)
+    unsafe = ((across < 3.0) & (np.abs(others[..., -1]) < 0.5)).any((1, 2))
+    names = [f"other{j}.d{c}" for j in range(N - 1) for c in axes]
+    found, cells = cause_search.find(others.reshape(9000, N, -1), unsafe, np.arange(9000) // 30, names)
+    (cause,), (edge,) = found.causes, found.edges
+    assert cause.name == f"other.{', '.join('d' + c for c in axes[:-1])} or {cause.ratio:.3g} d{axes[-1]}, the longer"
+    assert edge.below and abs(edge.at - 3.0) < 0.05 and abs(edge.at / cause.ratio - 0.5) < 0.01
+    assert found.explained > 0.9 and found.false_alarms < 0.01
+    x = others[:50].reshape(50, N, -1)
+    np.testing.assert_allclose(cause.of(x), values_of(cause, jnp.asarray(x)), rtol=1e-4, atol=1e-4)
+    loaded = msgspec.json.decode(msgspec.json.encode(found), type=Found)
+    assert loaded == found
 
 
 def test_danger_that_nothing_tells_has_no_cause(logged):

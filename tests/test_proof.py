@@ -17,7 +17,7 @@ from ringfence.nets import bounds
 from ringfence.nets.mlp import MLP
 from ringfence.world.barrier import Barrier
 from ringfence.world.cause_nets import CauseNet, Distance, worst
-from ringfence.world.causes import Cause, Edge
+from ringfence.world.causes import Cause, Edge, with_an_axis_apart
 
 ROWS = 10
 
@@ -151,14 +151,17 @@ def test_braking_ends_in_standing(guarded, present):
 
 
 def test_causes_are_bounded_too():
-    """Distances with one edge and several, of a length and of an entry, and a network of a cause."""
+    """Distances with one edge and several, of a length, of one with an axis apart and of an entry, and a network of a
+    cause."""
     length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
     entry = Cause("own.x", ((4,),))
     pair = Cause("own.x, own.y", ((4, 5),))
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
+    box = with_an_axis_apart(length, 1, 2.0)
     nets = (
         Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), length, edge),
+        Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), box, edge),
         Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
         CauseNet(MLP(jax.random.key(0), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), pair, edge),
     )

@@ -293,7 +293,8 @@ def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
     entries = np.array(cause.things[thing])
     center, radius = boxes.center[..., entries], boxes.radius[..., entries]
     if cause.length:
-        low, high = _length_bounds(center, radius)
+        each = [_length_bounds(*part) for part in zip(cause.parts(center), cause.parts(radius))]
+        low, high = (cause.longest(found) for found in zip(*each))
         center, radius = (low + high)[..., None] / 2, (high - low)[..., None] / 2 + ROUNDING
     gain = jnp.exp(score.log_gain)
     if isinstance(score, Distance):  # its slope is 1 at most

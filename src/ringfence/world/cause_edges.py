@@ -57,12 +57,24 @@ def _of_the_worst(steps: Steps, values: np.ndarray, score: np.ndarray, agents: n
     return found
 
 
+def least_wrong(steps: Steps, cause: Cause) -> int:
+    """How many steps a distance tells wrongly, by the edge below which danger begins that tells fewest so."""
+    agents, things = np.nonzero(cause.holds(steps.x.shape[1]))
+    values = cause.of(steps.x)[:, agents, things, 0]
+    nearest = _of_the_worst(steps, values, values, agents)
+    return int(_wrong(np.sort(nearest[steps.unsafe]), np.sort(nearest[~steps.unsafe]))[1].min())
+
+
+def _wrong(bad: np.ndarray, fine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(values, how many of bad and fine ones, which are sorted, an edge at each tells wrongly where low is bad)."""
+    tried = np.unique(np.concatenate([bad, fine]))
+    return tried, len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
+
+
 def _parting(bad: np.ndarray, fine: np.ndarray, low_is_bad: bool) -> float:
     """The value that parts most unsafe steps from safe ones: in the middle of all that do as well."""
     sign = 1.0 if low_is_bad else -1.0
-    bad, fine = np.sort(sign * bad), np.sort(sign * fine)
-    tried = np.unique(np.concatenate([bad, fine]))
-    wrong = len(bad) - np.searchsorted(bad, tried, "right") + np.searchsorted(fine, tried, "right")
+    tried, wrong = _wrong(np.sort(sign * bad), np.sort(sign * fine))
     best = int(wrong.argmin())
     following = tried[best + 1] if best + 1 < len(tried) else tried[best]
     return float(sign * 0.5 * (tried[best] + following))

@@ -76,7 +76,9 @@ Score = CauseNet | Distance
 def values_of(cause: Cause, x: Array) -> Array:
     """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
     read = x[..., np.array(cause.things)]
-    return jnp.sqrt((read**2).sum(-1, keepdims=True) + 1e-9) if cause.length else read
+    if not cause.length:
+        return read
+    return cause.longest([jnp.sqrt((part**2).sum(-1, keepdims=True) + 1e-9) for part in cause.parts(read)])
 
 
 def scores(net: Score, x: Array) -> Array:

@@ -19,12 +19,22 @@ import numpy as np
 from msgspec.structs import replace
 
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
-from ringfence.world.cause_edges import refined, within
+from ringfence.world.cause_edges import least_wrong, refined, within
 from ringfence.world.cause_siblings import siblings
-from ringfence.world.causes import Cause, Found, candidates, narrowed, only_of, only_where, wider
+from ringfence.world.causes import (
+    Cause,
+    Found,
+    candidates,
+    narrowed,
+    offsets,
+    only_of,
+    only_where,
+    wider,
+    with_an_axis_apart,
+)
 from ringfence.world.cells import Cells
 
-VERSION = 15  # of the search: what was found by another is looked for again
+VERSION = 16  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -34,6 +44,9 @@ PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one
 ENOUGH = 0.98  # share of unsafe steps that causes tell, from which on they are not looked for in another way
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
+RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which an axis is tried to count more or less, ever finer
+TRIED = (8, 3, 3, 3)  # such factors to either side
+RATIO_STEPS = 40_000  # steps that a ratio is looked for in
 
 
 def find(
@@ -42,7 +55,7 @@ def find(
     """The causes of danger in steps that led to features x (T, N, D), `unsafe` (T,) of the team or (T, N) bool of each
     agent, of these episodes (T,); with the cells of each cause."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
-    chosen = _split(steps, _best_grown(steps, names), names)
+    chosen = _with_axes_apart(steps, _split(steps, _best_grown(steps, names), names), names)
     if not chosen:
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
@@ -66,6 +79,43 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, pure).safe)
     less = gain(steps, Explained.by(steps, pure), Explained.by(steps, chosen).safe)[0]
     return pure if more - less > SURE * error else chosen
+
+
+def _with_axes_apart(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
+    """The causes, or those that are found with distances of which an axis counts by itself, where these tell more:
+    aircraft are too near where they are near across and in height, vehicles where they are along and aside."""
+    if chosen and _summary(steps, chosen).explained > ENOUGH:
+        return chosen
+    some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
+    apart = [_with_ratio(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
+    if not apart:
+        return chosen
+    pool = [*_about_whom(steps, candidates(names)), *apart]
+    found = _pruned(steps, _added(steps, [], pool))
+    if not any(one.cause.apart is not None for one in found):
+        return chosen
+    more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
+    less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
+    return found if more - less > SURE * error else chosen
+
+
+def _axes_apart(length: Cause) -> Sequence[int]:
+    """Which axes are tried to count by themselves; of two, one by itself leaves the other so, too."""
+    axes = len(length.things[0])
+    return range(axes) if axes > 2 else range(1, axes)
+
+
+def _with_ratio(steps: Steps, length: Cause, axis: int) -> Cause:
+    """The length with an axis apart that counts as much as parts most unsafe steps from safe ones."""
+    read = np.abs(steps.x[..., np.array(length.things)]).reshape(-1, len(length.things[0]))
+    most = np.maximum(np.quantile(read, 0.9995, axis=0), 1e-9)
+    ratio = float(np.delete(most, axis).max() / most[axis])
+    for factor, either in zip(RATIOS, TRIED):
+        tried = [with_an_axis_apart(length, axis, ratio * factor**k) for k in range(-either, either + 1)]
+        wrong = np.array([least_wrong(steps, one) for one in tried])
+        best = np.flatnonzero(wrong == wrong.min())
+        ratio = tried[best[len(best) // 2]].ratio
+    return with_an_axis_apart(length, axis, ratio)
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
@@ -234,8 +284,13 @@ def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained, pure: f
     enough = [(cause, gain) for cause, gain in zip(pool, gains) if gain > 0 and gain >= least]
     if not enough:
         return None
-    best, _ = min(enough, key=lambda one: (one[0].width, not one[0].length, bool(one[0].who), -one[1]))
+    best, _ = min(enough, key=lambda one: (*_complexity(one[0]), -one[1]))
     return counted(steps, best, explained)
+
+
+def _complexity(cause: Cause) -> tuple[int, bool, bool, bool]:
+    """Of causes that tell as much, the one of which this is least is taken."""
+    return cause.width, not cause.length, cause.apart is not None, bool(cause.who)
 
 
 def _gain_if(steps: Steps, one: Counted, pure: float) -> float:

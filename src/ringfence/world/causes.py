@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
@@ -27,6 +28,10 @@ class Cause(msgspec.Struct, frozen=True):
     things: tuple[tuple[int, ...], ...]  # (J, k) entries of the features
     length: bool = False  # of the entries as a vector, only how long it is
     who: tuple[tuple[int, int], ...] = ()  # agents, and things of theirs, that it holds for; none: all of them
+    # Of a length: where in `things` an axis stands that counts by itself, and how much more. The longer of both counts,
+    # so that what is nearer is in a cylinder, or in a box.
+    apart: int | None = None
+    ratio: float = 1.0
 
     @property
     def width(self) -> int:
@@ -38,7 +43,22 @@ class Cause(msgspec.Struct, frozen=True):
         read = x[..., np.array(self.things)]
         if not self.length:
             return read
-        return np.sqrt((read**2).sum(-1, keepdims=True))
+        return self.longest([np.sqrt((part**2).sum(-1, keepdims=True)) for part in self.parts(read)])
+
+    def parts(self, read: Any) -> list[Any]:
+        """Of a length: the entries (..., k) of each vector of which the longest counts."""
+        if self.apart is None:
+            return [read]
+        rest = [k for k in range(len(self.things[0])) if k != self.apart]
+        return [read[..., np.array(rest)], read[..., self.apart : self.apart + 1]]
+
+    def longest(self, lengths: Sequence[Any]) -> Any:
+        """Of the lengths of its parts, NumPy's or JAX's: what it reads."""
+        if self.apart is None:
+            return lengths[0]
+        one, other = lengths
+        longer = jnp.maximum if isinstance(one, jax.Array) else np.maximum
+        return longer(one, self.ratio * other)
 
     def holds(self, n_agents: int) -> np.ndarray:
         """(N, J) bool: the agents and things that it is about."""
@@ -117,6 +137,16 @@ def offsets(names: Sequence[str]) -> list[Cause]:
     return found
 
 
+def with_an_axis_apart(cause: Cause, axis: int, ratio: float) -> Cause:
+    """The length with one of its axes by itself, which counts so much more: the longer of both."""
+    entries = cause.name.removeprefix("length of ").split(", ")
+    kind = entries[0].split(".")[0]
+    entries[0] = entries[0].removeprefix(f"{kind}.")
+    rest = ", ".join(name for k, name in enumerate(entries) if k != axis)
+    name = f"{kind}.{rest} or {ratio:.3g} {entries[axis]}, the longer"
+    return replace(cause, name=name, apart=axis, ratio=ratio)
+
+
 class Heading(msgspec.Struct, frozen=True):
     """Entries that tell how fast a body that looks into a direction goes ahead: its velocity, or its speed, and that
     direction."""
@@ -187,7 +217,7 @@ def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
 
 def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     """The cause with one more entry of oneself, or of the same thing; of whom it is."""
-    if len(cause.things[0]) < WIDEST:
+    if len(cause.things[0]) < WIDEST and cause.apart is None:
         base = narrowed(cause, ())
         base = replace(base, length=False, name=base.name.removeprefix("length of "))
         yield from (narrowed(more, cause.who) for more in _with_one_more(base, names))
