@@ -91,6 +91,21 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     assert loaded == found
 
 
+def test_danger_may_be_how_soon_bodies_meet():
+    """Neither how far others are nor how fast they come tells it alone."""
+    rng = np.random.default_rng(0)
+    offset = rng.normal(0, 15, (9000, N, N - 1, 2))
+    velocity = rng.normal(0, 4, offset.shape)
+    far = np.linalg.norm(offset, axis=-1)
+    unsafe = far < 1.5 * -(offset * velocity).sum(-1) / far
+    names = [f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy", "dvx", "dvy")]
+    x = np.concatenate([offset, velocity], -1).reshape(9000, N, -1).astype(np.float32)
+    found, _ = cause_search.find(x, unsafe.any((1, 2)), np.arange(9000) // 30, names)
+    assert [cause.name for cause in found.causes] == ["other.distance, how fast it shrinks"]
+    assert found.explained > 0.8 and found.false_alarms < 0.05
+    np.testing.assert_allclose(found.causes[0].of(x), values_of(found.causes[0], jnp.asarray(x)), rtol=1e-3, atol=1e-3)
+
+
 def test_danger_that_nothing_tells_has_no_cause(logged):
     x, unsafe, episode = logged
     chance = np.random.default_rng(0).random(len(x)) < 0.05

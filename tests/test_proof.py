@@ -151,11 +151,12 @@ def test_braking_ends_in_standing(guarded, present):
 
 
 def test_causes_are_bounded_too():
-    """Distances with one edge and several, of a length, of one with an axis apart and of an entry, and a network of a
-    cause."""
+    """Distances with one edge and several, of a length, of one with an axis apart and of an entry, and networks of
+    causes."""
     length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
     entry = Cause("own.x", ((4,),))
     pair = Cause("own.x, own.y", ((4, 5),))
+    nearing = Cause("other.distance, how fast it shrinks", ((0, 1), (2, 3)), speeds=((4, 5), (4, 5)))
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
     box = with_an_axis_apart(length, 1, 2.0)
@@ -164,6 +165,7 @@ def test_causes_are_bounded_too():
         Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), box, edge),
         Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
         CauseNet(MLP(jax.random.key(0), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), pair, edge),
+        CauseNet(MLP(jax.random.key(4), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), nearing, edge),
     )
     barrier = Barrier({}, {}, *(jnp.ones(6),) * 4, jnp.ones(()), shape=None, causes=nets)
     center = jax.random.normal(jax.random.key(1), (40, 1, 6))

@@ -287,11 +287,28 @@ def _most_above(offset: Array, radius: Array, length: Array, slope: Array) -> Ar
     return found
 
 
+def _nearing_bounds(offset: Array, radius: Array, velocity: Array, spread: Array) -> tuple[Array, Array]:
+    """Center and radius (..., 2) of how far things are, and of how fast that comes nearer, within boxes."""
+    low, high = _length_bounds(offset, radius)
+    product = -(offset * velocity).sum(-1)
+    off = (jnp.abs(offset) * spread + radius * (jnp.abs(velocity) + spread)).sum(-1)
+    fastest = jnp.sqrt(((jnp.abs(velocity) + spread) ** 2).sum(-1))  # nothing comes nearer faster than it moves
+    least, most = product - off, product + off
+    near = jnp.maximum(low, 1e-6)
+    slow = jnp.maximum(jnp.where(least < 0, least / near, least / high), -fastest)
+    fast = jnp.minimum(jnp.where(most > 0, most / near, most / high), fastest)
+    center = jnp.stack([low + high, slow + fast], -1) / 2
+    return center, jnp.stack([high - low, fast - slow], -1) / 2 + ROUNDING * (1.0 + jnp.abs(center))
+
+
 def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
     """(...,) below the score of a cause of one of its things."""
     cause = score.cause
     entries = np.array(cause.things[thing])
     center, radius = boxes.center[..., entries], boxes.radius[..., entries]
+    if cause.speeds:
+        speeds = np.array(cause.speeds[thing])
+        center, radius = _nearing_bounds(center, radius, boxes.center[..., speeds], boxes.radius[..., speeds])
     if cause.length:
         each = [_length_bounds(*part) for part in zip(cause.parts(center), cause.parts(radius))]
         low, high = (cause.longest(found) for found in zip(*each))

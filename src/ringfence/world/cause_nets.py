@@ -23,7 +23,7 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.causes import Cause, Edge, Found
+from ringfence.world.causes import Cause, Edge, Found, nearing
 from ringfence.world.cells import CELLS, Cells
 
 HOT = 10.0  # temperature that learning begins with: many causes share a cost
@@ -76,6 +76,8 @@ Score = CauseNet | Distance
 def values_of(cause: Cause, x: Array) -> Array:
     """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
     read = x[..., np.array(cause.things)]
+    if cause.speeds:
+        return jnp.stack(nearing(read, x[..., np.array(cause.speeds)]), -1)
     if not cause.length:
         return read
     return cause.longest([jnp.sqrt((part**2).sum(-1, keepdims=True) + 1e-9) for part in cause.parts(read)])

@@ -26,6 +26,7 @@ from ringfence.world.causes import (
     Found,
     candidates,
     narrowed,
+    nearing_of,
     offsets,
     only_of,
     only_where,
@@ -34,7 +35,7 @@ from ringfence.world.causes import (
 )
 from ringfence.world.cells import Cells
 
-VERSION = 16  # of the search: what was found by another is looked for again
+VERSION = 17  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -55,7 +56,7 @@ def find(
     """The causes of danger in steps that led to features x (T, N, D), `unsafe` (T,) of the team or (T, N) bool of each
     agent, of these episodes (T,); with the cells of each cause."""
     steps = some_steps(x, unsafe, episode, np.random.default_rng([seed, 5]))
-    chosen = _with_axes_apart(steps, _split(steps, _best_grown(steps, names), names), names)
+    chosen = _with_more_shapes(steps, _split(steps, _best_grown(steps, names), names), names)
     if not chosen:
         return Found(), []
     chosen = [counted(steps, one.cause, _without(steps, chosen, one)) for one in chosen]
@@ -81,18 +82,18 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
     return pure if more - less > SURE * error else chosen
 
 
-def _with_axes_apart(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
-    """The causes, or those that are found with distances of which an axis counts by itself, where these tell more:
-    aircraft are too near where they are near across and in height, vehicles where they are along and aside."""
+def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
+    """The causes, or those that are found with more that may be read of how near things are, where these tell more.
+    Aircraft are too near where they are near across and in height, vehicles where they are along and aside; or danger
+    is how soon they meet."""
     if chosen and _summary(steps, chosen).explained > ENOUGH:
         return chosen
     some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
     apart = [_with_ratio(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
-    if not apart:
-        return chosen
-    pool = [*_about_whom(steps, candidates(names)), *apart]
-    found = _pruned(steps, _added(steps, [], pool))
-    if not any(one.cause.apart is not None for one in found):
+    shapes = [*apart, *_about_whom(steps, nearing_of(names))]
+    found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
+    found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
+    if not {one.cause for one in found} & set(shapes):
         return chosen
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]

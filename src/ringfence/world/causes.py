@@ -32,15 +32,21 @@ class Cause(msgspec.Struct, frozen=True):
     # so that what is nearer is in a cylinder, or in a box.
     apart: int | None = None
     ratio: float = 1.0
+    # (J, k) velocities relative to oneself: it reads how far each thing is, and how fast that comes nearer.
+    speeds: tuple[tuple[int, ...], ...] = ()
 
     @property
     def width(self) -> int:
         """How many numbers it reads of a thing."""
+        if self.speeds:
+            return 2
         return 1 if self.length else len(self.things[0])
 
     def of(self, x: np.ndarray) -> np.ndarray:
         """(..., J, width) what it reads of features (..., D)."""
         read = x[..., np.array(self.things)]
+        if self.speeds:
+            return np.stack(nearing(read, x[..., np.array(self.speeds)]), -1)
         if not self.length:
             return read
         return self.longest([np.sqrt((part**2).sum(-1, keepdims=True)) for part in self.parts(read)])
@@ -137,6 +143,26 @@ def offsets(names: Sequence[str]) -> list[Cause]:
     return found
 
 
+def nearing(offset: Any, velocity: Any) -> tuple[Any, Any]:
+    """How far things (..., k) are, NumPy's or JAX's, and how fast that comes nearer."""
+    far = ((offset**2).sum(-1) + 1e-9) ** 0.5
+    return far, -(offset * velocity).sum(-1) / far
+
+
+def nearing_of(names: Sequence[str]) -> list[Cause]:
+    """How far things are and how fast they come nearer, by kind, where names tell: danger of how soon they meet."""
+    found = []
+    kinds = things_of(names)
+    for length in offsets(names):
+        kind = length.name.removeprefix("length of ").split(".")[0]
+        axes = [field for field, d in kinds[kind][0].items() if d in length.things[0]]
+        if all(f"dv{axis[1:]}" in kinds[kind][0] for axis in axes):
+            things = tuple(tuple(thing[axis] for axis in axes) for thing in kinds[kind])
+            speeds = tuple(tuple(thing[f"dv{axis[1:]}"] for axis in axes) for thing in kinds[kind])
+            found.append(Cause(f"{kind}.distance, how fast it shrinks", things, speeds=speeds))
+    return found
+
+
 def with_an_axis_apart(cause: Cause, axis: int, ratio: float) -> Cause:
     """The length with one of its axes by itself, which counts so much more: the longer of both."""
     entries = cause.name.removeprefix("length of ").split(", ")
@@ -217,7 +243,7 @@ def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
 
 def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
     """The cause with one more entry of oneself, or of the same thing; of whom it is."""
-    if len(cause.things[0]) < WIDEST and cause.apart is None:
+    if len(cause.things[0]) < WIDEST and cause.apart is None and not cause.speeds:
         base = narrowed(cause, ())
         base = replace(base, length=False, name=base.name.removeprefix("length of "))
         yield from (narrowed(more, cause.who) for more in _with_one_more(base, names))
