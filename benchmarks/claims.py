@@ -119,7 +119,7 @@ def of_systems() -> tuple[bool, str]:
     refused = [one["task"].removeprefix("proving-") for one in found if "unfit" in one["verdicts"]]
     most = max(rate for name, rate in clone.items() if name in fine)
     more = [name for name in fine if naive[name] > 0.01]
-    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 15 and len(more) == 4 and refused == ["arms"]
+    holds = len(rows) == 16 and most <= 0.01 and len(fine) == 14 and len(more) == 4 and refused == ["arms", "train"]
     return holds, f"{most:.3f} at most on {len(fine)}, at nine tenths of the return; naive more on {', '.join(more)}"
 
 
@@ -911,7 +911,7 @@ CLAIMS = (
     ),
     Claim(
         "README.md",
-        "On fifteen of sixteen systems a guarded clone violates in at most 1 % of its "
+        "On fourteen of sixteen systems a guarded clone violates in at most 1 % of its "
         "episodes; on four of these a naive driver does so more often",
         PROVING,
         of_systems,
@@ -924,7 +924,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/proving-ground.md",
-        "Fifteen of sixteen guarded clones violate in at most 1 % of their episodes",
+        "Fourteen of sixteen guarded clones violate in at most 1 % of their episodes",
         PROVING,
         of_systems,
     ),

@@ -6,6 +6,7 @@ python benchmarks/guards_tables.py
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -224,8 +225,8 @@ def proving(folder: Path, files: str, filtered: bool = True) -> str:
 
 def _verdicts(found: dict) -> str:
     """What the Worlds of all seeds say of themselves."""
-    words = found["verdicts"]
-    return words[0] if len(set(words)) == 1 else ", ".join(words)
+    words = Counter(found["verdicts"])
+    return next(iter(words)) if len(words) == 1 else ", ".join(f"{word} by {n}" for word, n in words.items())
 
 
 def _in_words(system: dict | None) -> str:

@@ -128,8 +128,10 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     """The mean over the systems whose Worlds are not refused; returns as shares of what the clone alone earns."""
     found = proven()
     systems = [one["rows"] for one in found if "unfit" not in one["verdicts"]]
+    refused = ("none", "one", "two", "three")[len(found) - len(systems)]
+    clones = f"{len(systems)} of {len(found)} other systems, {refused} being refused: a clone of the logs"
     for words, danger, way in (
-        (f"{len(systems)} of {len(found)} other systems, one being refused: a clone of the logs", NO_GUARD, "none"),
+        (clones, NO_GUARD, "none"),
         ("the same clones under a guard", "a logged cost column", "shield learned"),
         ("the same clones under a guard", "the true formula and motion", "shield oracle"),
     ):
