@@ -165,12 +165,13 @@ def nearing_of(names: Sequence[str]) -> list[Cause]:
 
 def with_an_axis_apart(cause: Cause, axis: int, ratio: float) -> Cause:
     """The length with one of its axes by itself, which counts so much more: the longer of both."""
-    entries = cause.name.removeprefix("length of ").split(", ")
+    of_all = narrowed(cause, ())
+    entries = of_all.name.removeprefix("length of ").split(", ")
     kind = entries[0].split(".")[0]
     entries[0] = entries[0].removeprefix(f"{kind}.")
     rest = ", ".join(name for k, name in enumerate(entries) if k != axis)
     name = f"{kind}.{rest} or {ratio:.3g} {entries[axis]}, the longer"
-    return replace(cause, name=name, apart=axis, ratio=ratio)
+    return narrowed(replace(of_all, name=name, apart=axis, ratio=ratio), cause.who)
 
 
 class Heading(msgspec.Struct, frozen=True):

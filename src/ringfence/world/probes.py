@@ -183,7 +183,7 @@ def _put(
     length = np.maximum(np.sqrt((offset**2).sum(-1, keepdims=True)), 1e-6)
     direction = offset / length
     put = states.copy()
-    put[:, agent, place] = offset * distance / np.maximum(cause.of(states)[:, agent, thing], 1e-6)
+    put[:, agent, place] = offset / np.maximum(cause.of(states)[:, agent, thing], 1e-6) * distance
     speed = _speed_entries(names, place)
     found = []
     for share in CLOSING if speed is not None else CLOSING[:1]:
