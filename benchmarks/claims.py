@@ -132,6 +132,18 @@ def of_bad_driving() -> tuple[bool, str]:
     return (sum(far), sum(near)) == (12, 8), f"{sum(far)} of {len(rows)}, by three rows {sum(near)}"
 
 
+def of_a_sector() -> tuple[bool, str]:
+    """Episodes with a loss of separation, and return, by causes of which an axis counts by itself and without."""
+    rows = {(r["driver"], r["causes"].split()[0]): r for r in rows_of("sector.csv", guard="shield")}
+    holds, text = True, []
+    for driver in ("naive", "clone"):
+        apart, plain = rows[driver, "an"], rows[driver, "no"]
+        holds &= abs(float(apart["violated"]) - float(plain["violated"])) <= 0.01
+        holds &= 0.97 < float(apart["return"]) / float(plain["return"]) < 1.03
+        text.append(f"{driver}: {apart['violated']} and {plain['violated']}, {apart['return']} and {plain['return']}")
+    return holds, "; ".join(text)
+
+
 def of_late_actions() -> tuple[bool, str]:
     """Episodes with contact of a guard that knows of late actions, and of one that does not."""
     rows = {(r["faults"], r["guard"], r["compensated"]): r for r in stored.table(ROOT / STRESS)}
@@ -921,6 +933,12 @@ CLAIMS = (
         "the guard leaves contact in none of the episodes of `x9`, and in none of `x10`",
         "results/proving/others/x9.json",
         of_rebounds,
+    ),
+    Claim(
+        "docs/proving-ground.md",
+        "With an axis that counts by itself or without, guards do as much here",
+        "results/sector.csv",
+        of_a_sector,
     ),
     Claim(
         "docs/proving-ground.md",

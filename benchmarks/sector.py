@@ -40,7 +40,7 @@ WITH, WITHOUT = "an axis by itself", "no axis by itself"
 
 
 class Sector(ParallelEnv):
-    """Aircraft that fly across at three levels, each to where another one came from."""
+    """Aircraft that fly across at three levels, each to the other side."""
 
     metadata = {"name": "sector", "dt": DT}
 
@@ -189,7 +189,10 @@ def main() -> None:
 
 
 def table() -> str:
-    lines = ["| who acts | World | verdict | episodes with a loss of separation, % | return |", "|---|---|---|---|---|"]
+    lines = [
+        "| who acts | causes found | verdict | episodes with a loss of separation, % | return |",
+        "|---|---|---|---|---|",
+    ]
     for r in read(OUT):
         world, verdict = ("no guard", "") if r["guard"] == "none" else (r["found"], r["verdict"])
         lost = f"{100 * float(r['violated']):.3g} (≤ {100 * float(r['bound']):.3g})"

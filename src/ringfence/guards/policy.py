@@ -26,7 +26,7 @@ from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
-from ringfence.utils.precision import with_full_products
+from ringfence.utils.precision import full_products
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.card import FARTHEST, Avoidable, Foresight
@@ -113,7 +113,7 @@ class Guarded(HadStart, eqx.Module):
         unit = normalise.to_unit(action, spec.action_low, spec.action_high)
         return {**carry, "sent": carry["sent"].at[:, -1].set(unit)}
 
-    @with_full_products
+    @full_products()
     def act(self, carry: PyTree, observations: Array, state: Array | None, key: Key) -> tuple[PyTree, PolicyStep]:
         key_propose, key_decide = jax.random.split(key)
         present = self.guard.world.map(observations, state)

@@ -9,7 +9,6 @@ that are proven would not hold.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from typing import ParamSpec, TypeVar
@@ -27,9 +26,12 @@ def float32() -> Iterator[None]:
         yield
 
 
-def full_products() -> AbstractContextManager[object]:
-    """While it is open, products of matrices keep all bits of what they multiply, where JAX would round it first."""
-    return jax.default_matmul_precision("highest")
+@contextmanager
+def full_products() -> Iterator[None]:
+    """While it is open, or as a decorator while a function runs, products of matrices keep all bits of what they
+    multiply, where JAX would round it first; also within a program that somebody else compiles."""
+    with jax.default_matmul_precision("highest"):
+        yield
 
 
 def float64() -> AbstractContextManager[object]:
@@ -39,21 +41,4 @@ def float64() -> AbstractContextManager[object]:
 
 def in_float32(function: Callable[P, T]) -> Callable[P, T]:
     """The function, in 32 bits."""
-
-    @functools.wraps(function)
-    def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        with float32():
-            return function(*args, **kwargs)
-
-    return run
-
-
-def with_full_products(function: Callable[P, T]) -> Callable[P, T]:
-    """The function with full products, also within a program that somebody else compiles."""
-
-    @functools.wraps(function)
-    def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        with full_products():
-            return function(*args, **kwargs)
-
-    return run
+    return float32()(function)

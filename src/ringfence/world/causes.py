@@ -152,13 +152,10 @@ def nearing(offset: Any, velocity: Any) -> tuple[Any, Any]:
 def nearing_of(names: Sequence[str]) -> list[Cause]:
     """How far things are and how fast they come nearer, by kind, where names tell: danger of how soon they meet."""
     found = []
-    kinds = things_of(names)
-    for length in offsets(names):
-        kind = length.name.removeprefix("length of ").split(".")[0]
-        axes = [field for field, d in kinds[kind][0].items() if d in length.things[0]]
-        if all(f"dv{axis[1:]}" in kinds[kind][0] for axis in axes):
-            things = tuple(tuple(thing[axis] for axis in axes) for thing in kinds[kind])
-            speeds = tuple(tuple(thing[f"dv{axis[1:]}"] for axis in axes) for thing in kinds[kind])
+    for kind, each in things_of(names).items():
+        axes = [c for c in "xyz" if f"d{c}" in each[0]]
+        if axes and all(f"dv{c}" in each[0] for c in axes):
+            things, speeds = (tuple(tuple(one[what + c] for c in axes) for one in each) for what in ("d", "dv"))
             found.append(Cause(f"{kind}.distance, how fast it shrinks", things, speeds=speeds))
     return found
 
