@@ -22,7 +22,7 @@ from ablations import adjusted
 from attribution import ADAPT, FULL, OF_ROBOTS, QUESTIONS, SHIELD, STEADY, Question, answers
 from evidence import LEVEL, difference, evaluations, mean, of, tasks_of, variant
 from readme import put
-from scipy.stats import spearmanr
+from scipy.stats import fisher_exact, spearmanr
 
 from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.report import board, standings
@@ -132,16 +132,26 @@ def of_bad_driving() -> tuple[bool, str]:
     return (sum(far), sum(near)) == (12, 8), f"{sum(far)} of {len(rows)}, by three rows {sum(near)}"
 
 
-def of_a_sector() -> tuple[bool, str]:
-    """Episodes with a loss of separation, and return, by causes of which an axis counts by itself and without."""
-    rows = {(r["driver"], r["causes"].split()[0]): r for r in rows_of("sector.csv", guard="shield")}
-    holds, text = True, []
-    for driver in ("naive", "clone"):
-        apart, plain = rows[driver, "an"], rows[driver, "no"]
-        holds &= abs(float(apart["violated"]) - float(plain["violated"])) <= 0.01
-        holds &= 0.97 < float(apart["return"]) / float(plain["return"]) < 1.03
-        text.append(f"{driver}: {apart['violated']} and {plain['violated']}, {apart['return']} and {plain['return']}")
-    return holds, "; ".join(text)
+def of_shapes() -> tuple[bool, str]:
+    """Episodes with a violation of guarded clones by causes of more shapes, and without (Fisher's exact test)."""
+    rows = {(r["system"], r["causes"]): r for r in rows_of("shapes.csv", guard="shield", driver="clone")}
+    systems = [name for name, causes in rows if causes == "more shapes"]
+    left = {name: [_violated(rows[name, causes]) for causes in ("more shapes", "no more shapes")] for name in systems}
+    fewer = [name for name, (more, plain) in left.items() if fisher_exact(np.c_[more, plain], "less").pvalue < LEVEL]
+    refused = [name for name in systems if rows[name, "no more shapes"]["verdict"] == "unfit"]
+    fit = all(rows[name, "more shapes"]["verdict"] == "fit" for name in systems)
+    shown = ", ".join(f"{name} {plain[0]} → {more[0]}" for name, (more, plain) in left.items())
+    holds = fit and len(systems) == 4 and max(more[0] for more, _ in left.values()) <= 1 and len(fewer) == 3
+    return holds and refused == [
+        "meeting",
+        "sprayers",
+    ], f"{shown} of 100; fewer on {', '.join(fewer)}; *unfit* without: {', '.join(refused)}"
+
+
+def _violated(row: dict[str, str]) -> list[int]:
+    """Episodes with a violation, and without."""
+    count = round(float(row["violated"]) * int(row["episodes"]))
+    return [count, int(row["episodes"]) - count]
 
 
 def of_late_actions() -> tuple[bool, str]:
@@ -743,9 +753,9 @@ CLAIMS = (
     ),
     Claim(
         "docs/guard-results.md",
-        "A shield of each agent's own leaves no collision step",
+        "A shield of each agent's own leaves hardly a collision step",
         "results/own-sight/table.csv",
-        own_shield_leaves(0.0005),
+        own_shield_leaves(0.0035),
     ),
     Claim(
         "docs/guard-results.md",
@@ -936,9 +946,9 @@ CLAIMS = (
     ),
     Claim(
         "docs/proving-ground.md",
-        "With an axis that counts by itself or without, guards do as much here",
-        "results/sector.csv",
-        of_a_sector,
+        "Without them clones violate more on three, and two Worlds call themselves *unfit*",
+        "results/shapes.csv",
+        of_shapes,
     ),
     Claim(
         "docs/proving-ground.md",

@@ -17,11 +17,23 @@ from ringfence.problem import features
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.turns import Turn
 from ringfence.report.ope_page import build_ope
-from ringfence.world import cause_counts, cause_search, causes, foresight, load, margins, probes, save, verdict
+from ringfence.world import (
+    cause_candidates,
+    cause_counts,
+    cause_search,
+    causes,
+    foresight,
+    load,
+    margins,
+    probes,
+    save,
+    verdict,
+)
 from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, values_of, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
+from ringfence.world.heading import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
 from tests.quick import QUICK_WORLD, judge_in_full
 
@@ -91,19 +103,62 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     assert loaded == found
 
 
-def test_danger_may_be_how_soon_bodies_meet():
-    """Neither how far others are nor how fast they come tells it alone."""
+@pytest.mark.parametrize(
+    "what, name",
+    [
+        ("soon", "other.distance less 1.5 times how fast it shrinks"),
+        ("fast", "other.distance while length of own.vx, own.vy is high"),
+        ("seen", "other.distance ahead"),
+        ("head-on", "other.distance while how fast it shrinks is high"),
+        ("strip", "own.x, length of own.vx, own.vy"),
+    ],
+)
+def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
+    """How soon bodies meet, who is near and fast, what is in sight, who comes fast, or is fast somewhere: no entry
+    tells it alone, nor a distance."""
     rng = np.random.default_rng(0)
-    offset = rng.normal(0, 15, (9000, N, N - 1, 2))
-    velocity = rng.normal(0, 4, offset.shape)
+    offset, velocity = rng.normal(0, 15, (9000, N, N - 1, 2)), rng.normal(0, 4, (9000, N, N - 1, 2))
+    own, heading = rng.normal(0, 4, (9000, N, 2)), rng.uniform(-np.pi, np.pi, (9000, N))
+    place, fast = rng.uniform(-9, 9, (9000, N)), np.linalg.norm(own, axis=-1) > 3
     far = np.linalg.norm(offset, axis=-1)
-    unsafe = far < 1.5 * -(offset * velocity).sum(-1) / far
-    names = [f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy", "dvx", "dvy")]
-    x = np.concatenate([offset, velocity], -1).reshape(9000, N, -1).astype(np.float32)
+    away = np.arctan2(offset[..., 1], offset[..., 0]) - heading[..., None]
+    closing = -(offset * velocity).sum(-1) / far
+    unsafe = {
+        "soon": far < 1.5 * closing,
+        "fast": (far < 5) & fast[..., None],
+        "seen": (far < 8) & (np.cos(away) > 0.7),
+        "head-on": (far < 12) & (closing > 3),
+        "strip": ((place > 6) & fast)[..., None],
+    }[what]
+    names = ["own.x", "own.vx", "own.vy", "own.cos", "own.sin"]
+    names += [f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy", "dvx", "dvy")]
+    looks = np.stack([np.cos(heading), np.sin(heading)], -1)
+    others = np.concatenate([offset, velocity], -1).reshape(9000, N, -1)
+    x = np.concatenate([place[..., None], own, looks, others], -1).astype(np.float32)
     found, _ = cause_search.find(x, unsafe.any((1, 2)), np.arange(9000) // 30, names)
-    assert [cause.name for cause in found.causes] == ["other.distance, how fast it shrinks"]
-    assert found.explained > 0.8 and found.false_alarms < 0.05
+    assert [cause.name for cause in found.causes] == [name]
+    assert found.explained > 0.9 and found.false_alarms < 0.03
+    at = found.edges[0].at
+    if what == "soon":
+        assert at is not None and abs(at) < 0.1
+    elif what != "strip":  # what is in one number has two edges
+        near, second = {"fast": (5.0, 3.0), "seen": (8.0, np.arccos(0.7)), "head-on": (12.0, 3.0)}[what]
+        assert abs(at - near) < 0.1 and abs(found.causes[0].second_edge(at) - second) < 0.05
     np.testing.assert_allclose(found.causes[0].of(x), values_of(found.causes[0], jnp.asarray(x)), rtol=1e-3, atol=1e-3)
+    here = jnp.zeros((N, x.shape[-1]))
+    assert np.isfinite(jax.grad(lambda x: values_of(found.causes[0], x).sum())(here)).all()
+
+
+def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
+    names = ["other0.dx", "other0.dy", "own.cos", "own.sin"]
+    ahead, angle = (
+        next(one for one in cause_candidates.with_distances(of) if one.how == "turned")
+        for of in (names, [*names[:2], "own.yaw"])
+    )
+    x = np.random.default_rng(0).normal(0, 2, (50, 1, 3)).astype(np.float32)
+    looks = np.concatenate([x[..., :2], np.cos(x[..., 2:]), np.sin(x[..., 2:])], -1)
+    np.testing.assert_allclose(ahead.of(looks), angle.of(x), atol=1e-5)
+    np.testing.assert_allclose(values_of(angle, jnp.asarray(x)), angle.of(x), atol=1e-5)
 
 
 def test_danger_that_nothing_tells_has_no_cause(logged):
@@ -192,7 +247,7 @@ def test_a_cause_is_not_about_agents_who_have_nothing_of_it():
     told = {cause.name: edge.bounds for cause, edge in zip(found.causes, found.edges)}
     assert set(told) == {"own.charge of agent 0, agent 1", "bus.load"} and found.explained > 0.98
     assert [round(bound, 1) for bound in told["own.charge of agent 0, agent 1"]] == [0.1, 1.0]  # danger, end of logs
-    wide = next(causes.wider(found.causes[list(told).index("own.charge of agent 0, agent 1")], names))
+    wide = next(cause_candidates.wider(found.causes[list(told).index("own.charge of agent 0, agent 1")], names))
     assert wide.name == "own.charge, own.heat of agent 0, agent 1" and wide.who == ((0, 0), (1, 0))
 
 
@@ -324,7 +379,7 @@ def test_a_world_tells_danger_by_its_causes(fitted, tmp_path):
 def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
     """Beyond the logs may be a wall that nobody touched."""
     ranges = fitted.card.data.ranges
-    names = ["own.x", "own.y", "own.v", *[one.name for one in causes.offsets(NAMES)]]
+    names = ["own.x", "own.y", "own.v", *[one.name for one in cause_candidates.offsets(NAMES)]]
     assert sorted(ranges) == sorted(names), "entries of goals and others have none"
     seen = shown.Shown.by(fitted)
     row = np.zeros((N, len(NAMES)), np.float32)
@@ -365,18 +420,18 @@ def test_a_guard_stays_within_what_the_logs_have_shown(fitted):
 
 def test_who_never_went_backwards_is_not_predicted_to():
     """Nobody brakes at rest in logs of cars, so networks do not learn that they stay where they are."""
-    heading = causes.Heading((0, 1), (2, 3))
-    assert causes.Heading.of(["own.vx", "own.vy", "own.cos", "own.sin"]) == heading
-    assert causes.Heading.of(["own.speed", "own.cos", "own.sin"]) == causes.Heading((0,), (1, 2))
-    assert causes.Heading.of(["own.vx", "own.vy"]) is None
-    seeing = causes.Heading.of(["own.v", "own.cos", "own.sin", "thing_a.dvy", "own.dvx", "other1.dvx", "other1.dx"])
-    assert seeing == causes.Heading((0,), (1, 2), ((3, 1), (5, 0)))
+    heading = Heading((0, 1), (2, 3))
+    assert Heading.of(["own.vx", "own.vy", "own.cos", "own.sin"]) == heading
+    assert Heading.of(["own.speed", "own.cos", "own.sin"]) == Heading((0,), (1, 2))
+    assert Heading.of(["own.vx", "own.vy"]) is None
+    seeing = Heading.of(["own.v", "own.cos", "own.sin", "thing_a.dvy", "own.dvx", "other1.dvx", "other1.dx"])
+    assert seeing == Heading((0,), (1, 2), ((3, 1), (5, 0)))
     moved = seeing.no_slower(jnp.array([-1.0, 0.6, 0.8, 0.0, 0.0, 0.0, 0.0]), 0.0)
     np.testing.assert_allclose(moved, [0, 0.6, 0.8, -0.8, 0, -0.6, 0], atol=1e-6)
     back = jnp.array([[-0.6, -0.8, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]])
     np.testing.assert_allclose(heading.no_slower(back, 0.0), [[0, 0, 0.6, 0.8], [0.3, 0.4, 0.6, 0.8]], atol=1e-6)
     np.testing.assert_allclose(heading.no_slower(back, -0.5)[0, :2], [-0.3, -0.4], atol=1e-6)
-    np.testing.assert_allclose(causes.Heading((0,), (1, 2)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
+    np.testing.assert_allclose(Heading((0,), (1, 2)).no_slower(back, 0.1)[:, 0], [0.1, 0.3], rtol=1e-5)
 
 
 def test_a_car_that_brakes_at_rest_stays(tmp_path):
@@ -393,7 +448,7 @@ def test_a_car_that_brakes_at_rest_stays(tmp_path):
     card = {"task": "cars", "observation_names": names, "dt": 0.2, "homogeneous": True}
     store = EpisodeStore.from_episodes(seen, action, np.zeros((12, 30)), (speed[:, 1:] > 1.5) * 1.0, card=card)
     made = fit(store, **QUICK_WORLD)
-    assert made.dynamics.ahead == (causes.Heading((0, 1), (2, 3)), pytest.approx(0.0))
+    assert made.dynamics.ahead == (Heading((0, 1), (2, 3)), pytest.approx(0.0))
     rest = jnp.array([[[0.0, 0.0, 1.0, 0.0]]])
     brake = jnp.array([[[-1.0, 0.0]]])
     free = dataclasses.replace(made.dynamics, ahead=None)
@@ -427,7 +482,7 @@ def test_somebody_is_put_at_rest_and_closing():
     """Somebody 1 m away in front, who is put at half a metre: at rest, and as fast as anybody was."""
     names = ("other0.dx", "other0.dy", "other0.dvx", "other0.dvy")
     states = np.tile(np.array([1.0, 0.0, -2.0, 0.0], np.float32), (5, 1, 1))
-    (cause,) = causes.offsets(names)
+    (cause,) = cause_candidates.offsets(names)
 
     class Closing(eqx.Module):
         """Danger is how fast it closes."""
@@ -626,7 +681,7 @@ def test_foresight_is_of_what_the_barrier_reads(fitted):
 def test_foresight_reads_the_thing_in_most_danger():
     """Two others at 3 and 4 m, who change places in the list: the nearest is where it was."""
     x = np.array([3.0, 0.0, 0.0, 4.0]).reshape(1, 1, 1, 4)
-    (cause,) = causes.offsets([f"other{j}.d{c}" for j in range(2) for c in "xy"])
+    (cause,) = cause_candidates.offsets([f"other{j}.d{c}" for j in range(2) for c in "xy"])
     near, far = Edge((0.0,), (9.0,), at=1.0), Edge((0.0,), (9.0,), at=1.0, below=False)
     assert foresight._read(x, cause, near) == foresight._read(x[..., [2, 3, 0, 1]], cause, near) == 3.0
     assert foresight._read(x, cause, far) == 4.0

@@ -14,7 +14,7 @@ from ringfence.errors import Interrupted, NoSafeAction, UserError
 from ringfence.logs.collect import collect
 from ringfence.logs.store import EpisodeStore
 from ringfence.training import loop, worlds
-from ringfence.utils.functions import of_both
+from ringfence.utils.functions import memory_of, of_both
 from ringfence.utils.given import cost_given, given_as
 from tests.quick import QUICK_WORLD
 
@@ -158,6 +158,21 @@ def test_a_memory_of_a_function_of_observations_is_copied_and_reset():
     second.reset()
     assert (first(None, None), second(None, None), counts.n) == (3, 1, 3)
     assert not hasattr(of_both(lambda observations: 0), "reset")
+    assert memory_of(counts.step) is counts and memory_of(counts) is counts
+
+
+def test_a_method_of_a_class_has_no_memory():
+    """Whose `reset` is that of its objects, such as a simulator's that brings its driver along."""
+
+    class Simulator:
+        def reset(self):
+            raise AssertionError
+
+        @classmethod
+        def driven(cls, observations):
+            return 0
+
+    assert memory_of(Simulator.driven) is None and not hasattr(of_both(Simulator.driven), "reset")
 
 
 def test_a_diverged_run_does_not_act(controllers, store, monkeypatch):

@@ -96,6 +96,24 @@ def test_where_a_body_heads_for_and_what_else_moves():
     assert found == ("obs0", "obs1", *true[2:]), "nobody moves along that direction"
 
 
+@pytest.mark.parametrize("looks", ["cos and sin", "angle"])
+def test_where_a_body_looks_that_logs_its_place_and_its_speed(looks):
+    """And no velocity: the direction is the one that its place changes along, and the speed by how much."""
+    g = np.random.default_rng(0)
+    shape = (20, 31, 2)
+    turn = g.normal(size=shape).cumsum(1) * 0.1
+    pace = 0.1 + np.abs(g.normal(size=shape).cumsum(1) * 0.2)
+    look = np.stack([np.cos(turn), np.sin(turn)], -1)
+    place = g.normal(size=(20, 1, 2, 2)) * 3 + DT * (pace[..., None] * look).cumsum(1)
+    seen = (place[:, :, features.others(2)] - place[:, :, :, None])[..., 0, :]
+    heading = turn[..., None] if looks == "angle" else look
+    x = np.concatenate([g.normal(size=(*shape, 1)), pace[..., None], place, heading, seen], -1)
+    direction = ("own.heading",) if looks == "angle" else ("own.cos", "own.sin")
+    true = ("obs0", "own.v", "own.x", "own.y", *direction, "other0.dx", "other0.dy")
+    flat = x.reshape(-1, *x.shape[2:]).astype(np.float32)
+    assert inferred_names(flat, numbers(len(true)), np.arange(20) * 31) == true
+
+
 def test_others_by_distance_are_named_in_that_order():
     x, true, first = team()
     seen = x[..., 7:].reshape(*x.shape[:2], 2, 4)

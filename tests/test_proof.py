@@ -17,7 +17,7 @@ from ringfence.nets import bounds
 from ringfence.nets.mlp import MLP
 from ringfence.world.barrier import Barrier
 from ringfence.world.cause_nets import CauseNet, Distance, worst
-from ringfence.world.causes import Cause, Edge, with_an_axis_apart
+from ringfence.world.causes import Cause, Edge, in_one_number, with_an_axis_apart
 
 ROWS = 10
 
@@ -152,28 +152,48 @@ def test_braking_ends_in_standing(guarded, present):
 
 def test_causes_are_bounded_too():
     """Distances with one edge and several, of a length, of one with an axis apart and of an entry, and networks of
-    causes."""
+    causes of two numbers: all together, and each."""
     length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
     entry = Cause("own.x", ((4,),))
     pair = Cause("own.x, own.y", ((4, 5),))
-    nearing = Cause("other.distance, how fast it shrinks", ((0, 1), (2, 3)), speeds=((4, 5), (4, 5)))
+    things, own = ((0, 1), (2, 3)), ((4, 5), (4, 5))
+    both = [Cause(f"other.distance, {how}", things, also=own, how=how) for how in ("nearing", "beside", "turned")]
+    both.append(Cause("other.distance, an entry", things, also=((4,), (4,)), how="beside"))
+    both.append(Cause("other.distance, an angle", things, also=((4,), (4,)), how="turned"))
+    vector = Cause("own.x, length", ((4,),), also=((0, 1),), how="vector")
+    second = [
+        (both[0], "soon"),
+        (both[0], "coming"),
+        (both[1], "high"),
+        (both[1], "low"),
+        (both[2], "ahead"),
+        (both[3], "high"),
+    ]
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
     box = with_an_axis_apart(length, 1, 2.0)
     nets = (
         Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), length, edge),
         Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), box, edge),
+        *(
+            Distance(jnp.array([0.6]), jnp.array(1.2), jnp.array(0.3), in_one_number(one, how, 0.8, 0.7), edge)
+            for one, how in second
+        ),
         Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
-        CauseNet(MLP(jax.random.key(0), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), pair, edge),
-        CauseNet(MLP(jax.random.key(4), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), nearing, edge),
+        *(
+            CauseNet(MLP(jax.random.key(4), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), cause, edge)
+            for cause in (pair, *both, vector)
+        ),
     )
-    barrier = Barrier({}, {}, *(jnp.ones(6),) * 4, jnp.ones(()), shape=None, causes=nets)
     center = jax.random.normal(jax.random.key(1), (40, 1, 6))
     radius = 0.3 * jax.random.uniform(jax.random.key(2), center.shape)
-    low = score_below(barrier, Box(center, radius))
-    score = worst(nets, anywhere(jax.random.key(3), center, radius, 20_000))
-    assert (score.min(0) >= low).all()
-    assert np.median(score.min(0) - low) < 0.3
+    inside = anywhere(jax.random.key(3), center, radius, 20_000)
+    for some in (nets, *((net,) for net in nets)):
+        barrier = Barrier({}, {}, *(jnp.ones(6),) * 4, jnp.ones(()), shape=None, causes=some)
+        low = score_below(barrier, Box(center, radius))
+        score = worst(some, inside)
+        assert (score.min(0) >= low).all()
+        assert np.median(score.min(0) - low) < 0.6
 
 
 def test_where_a_plan_is_not_proved_the_last_one_that_was_goes_on(guarded, present):

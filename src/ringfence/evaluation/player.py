@@ -28,6 +28,7 @@ from ringfence.proposals.base import act_with
 from ringfence.proposals.options import DEFAULT
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
+from ringfence.utils.functions import memory_of
 from ringfence.utils.precision import in_float32
 from ringfence.world import World
 
@@ -190,8 +191,8 @@ class _OneByOne:
 def _of_each(function: Callable, batch: int) -> list[Callable]:
     """What acts in each of so many simulators, at the beginning of an episode: whoever has `reset`, or a method of it,
     is copied."""
-    owner: Any = function if hasattr(function, "reset") else getattr(function, "__self__", None)
-    if not callable(getattr(owner, "reset", None)):
+    owner = memory_of(function)
+    if owner is None:
         return [function] * batch
     try:
         owners = [owner, *(copy.deepcopy(owner) for _ in range(batch - 1))]

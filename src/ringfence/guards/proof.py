@@ -23,6 +23,7 @@ from ringfence.types import Array
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, soft
 from ringfence.world.cause_nets import CauseNet, Distance, Score
+from ringfence.world.causes import Cause
 from ringfence.world.dynamics import Dynamics
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
@@ -297,8 +298,70 @@ def _nearing_bounds(offset: Array, radius: Array, velocity: Array, spread: Array
     near = jnp.maximum(low, 1e-6)
     slow = jnp.maximum(jnp.where(least < 0, least / near, least / high), -fastest)
     fast = jnp.minimum(jnp.where(most > 0, most / near, most / high), fastest)
-    center = jnp.stack([low + high, slow + fast], -1) / 2
-    return center, jnp.stack([high - low, fast - slow], -1) / 2 + ROUNDING * (1.0 + jnp.abs(center))
+    return _between(jnp.stack([low, slow], -1), jnp.stack([high, fast], -1))
+
+
+def _beside_bounds(offset: Array, radius: Array, other: Array, spread: Array) -> tuple[Array, Array]:
+    """Likewise of how far things are, and of another entry, or of how long others are."""
+    low, high = _length_bounds(offset, radius)
+    least, most = (other - spread)[..., 0], (other + spread)[..., 0]
+    if other.shape[-1] > 1:
+        least, most = _length_bounds(other, spread)
+    return _between(jnp.stack([low, least], -1), jnp.stack([high, most], -1))
+
+
+def _turned_bounds(offset: Array, radius: Array, direction: Array, spread: Array) -> tuple[Array, Array]:
+    """Likewise of how far ahead and to the left things are of who looks into a direction."""
+    if direction.shape[-1] == 1:  # an angle; neither cosine nor sine changes faster
+        direction = jnp.concatenate([jnp.cos(direction), jnp.sin(direction)], -1)
+        spread = jnp.concatenate([spread, spread], -1)
+    x, y = offset[..., 0], offset[..., 1]
+    cos, sin = direction[..., 0], direction[..., 1]
+    center = jnp.stack([x * cos + y * sin, y * cos - x * sin], -1)
+    wide, high = radius[..., 0], radius[..., 1]
+    by_cos, by_sin = spread[..., 0], spread[..., 1]
+    ahead = jnp.abs(x) * by_cos + wide * (jnp.abs(cos) + by_cos) + jnp.abs(y) * by_sin + high * (jnp.abs(sin) + by_sin)
+    left = jnp.abs(y) * by_cos + high * (jnp.abs(cos) + by_cos) + jnp.abs(x) * by_sin + wide * (jnp.abs(sin) + by_sin)
+    off = jnp.stack([ahead, left], -1)
+    return center, off + ROUNDING * (1.0 + jnp.abs(center) + off)
+
+
+def _with_vector_bounds(entries: Array, radius: Array, also: Array, spread: Array) -> tuple[Array, Array]:
+    """Likewise of entries, and of how long others are."""
+    center, off = _between(*(bound[..., None] for bound in _length_bounds(also, spread)))
+    return jnp.concatenate([entries, center], -1), jnp.concatenate([radius, off], -1)
+
+
+SEVERAL_BOUNDS = {
+    "nearing": _nearing_bounds,
+    "beside": _beside_bounds,
+    "turned": _turned_bounds,
+    "vector": _with_vector_bounds,
+}
+
+
+def _second_bounds(cause: Cause, offset: Array, radius: Array, other: Array, spread: Array) -> tuple[Array, Array]:
+    """The least and the most of what a length reads of other entries."""
+    if cause.how != "ahead":
+        bounds = _nearing_bounds if cause.how in ("soon", "coming") else _beside_bounds
+        center, off = (part[..., 1] for part in bounds(offset, radius, other, spread))
+        center = {"soon": center, "low": center - cause.end}.get(cause.how, cause.end - center)
+        return center - off, center + off
+    center, off = _turned_bounds(offset, radius, other, spread)
+    ahead, left = center[..., 0], center[..., 1]
+    nearer, farther = _length_bounds(left[..., None], off[..., 1:])
+    nearer = jnp.sqrt(nearer**2 + 1e-9)
+    # Of a box the angle is least where it is most ahead, at the side that is nearer where that is ahead.
+    front, back = ahead + off[..., 0], ahead - off[..., 0]
+    least = jnp.arctan2(jnp.where(front > 0, nearer, farther), front)
+    most = jnp.arctan2(jnp.where(back > 0, farther, nearer), back)
+    return least - ROUNDING, most + ROUNDING
+
+
+def _between(low: Array, high: Array) -> tuple[Array, Array]:
+    """Center and radius of boxes from corner to corner, a little more."""
+    center = (low + high) / 2
+    return center, (high - low) / 2 + ROUNDING * (1.0 + jnp.abs(center))
 
 
 def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
@@ -306,13 +369,19 @@ def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
     cause = score.cause
     entries = np.array(cause.things[thing])
     center, radius = boxes.center[..., entries], boxes.radius[..., entries]
-    if cause.speeds:
-        speeds = np.array(cause.speeds[thing])
-        center, radius = _nearing_bounds(center, radius, boxes.center[..., speeds], boxes.radius[..., speeds])
+    also = np.array(cause.also[thing] if cause.also else (), int)
+    others = boxes.center[..., also], boxes.radius[..., also]
     if cause.length:
         each = [_length_bounds(*part) for part in zip(cause.parts(center), cause.parts(radius))]
-        low, high = (cause.longest(found) for found in zip(*each))
+        if cause.also:
+            each.append(_second_bounds(cause, center, radius, *others))
+        if cause.how == "soon":  # the sooner, the faster things come
+            (near, away), (slow, fast) = each
+            each = [(near, away), (fast, slow)]
+        low, high = (cause.in_one(found) for found in zip(*each))
         center, radius = (low + high)[..., None] / 2, (high - low)[..., None] / 2 + ROUNDING
+    elif cause.also:
+        center, radius = SEVERAL_BOUNDS[cause.how](center, radius, *others)
     gain = jnp.exp(score.log_gain)
     if isinstance(score, Distance):  # its slope is 1 at most
         found = score.of_values(center) - gain * radius[..., 0] / score.scale

@@ -16,7 +16,7 @@ from ringfence.guards.options import GuardOptions
 from ringfence.proposals.base import held
 from ringfence.types import Array
 from ringfence.utils.device import on_device
-from ringfence.world import World, causes
+from ringfence.world import World, cause_candidates
 from ringfence.world.cause_counts import Explained, counted, some_steps
 from ringfence.world.causes import Cause
 from ringfence.world.cells import Cells
@@ -70,7 +70,7 @@ def _searched(guard: Guard, present: Array, wanted: Array) -> tuple[Array, Array
 def _known(logged: Logged) -> list[Cells]:
     """Where the logs have danger: one's own place, and how far things are, as names tell, counted cell by cell."""
     names = logged.map.names
-    simple = [*_own_place(names), *causes.offsets(names)]
+    simple = [*_own_place(names), *cause_candidates.offsets(names)]
     if not simple:
         return []
     steps = np.arange(logged.store.steps)

@@ -14,8 +14,9 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.guards.correction import ASKED
 from ringfence.types import Array
-from ringfence.world import World, causes
+from ringfence.world import World, cause_candidates
 from ringfence.world.cause_nets import values_of
+from ringfence.world.causes import Cause
 
 STEEP = 100.0  # margins for the whole range: one is a hundredth of it
 SLACK = 1e-3  # of the range: predictions of what is at its end are off by so little
@@ -30,7 +31,7 @@ class Shown(eqx.Module):
     high: tuple[float, ...] = eqx.field(static=True)
     entries: tuple[int, ...] = eqx.field(static=True)
     places: tuple[bool, ...] = eqx.field(static=True)  # of these: what goes on by a velocity
-    nearest: tuple[tuple[causes.Cause, float, float], ...] = eqx.field(static=True)  # least length, and range of it
+    nearest: tuple[tuple[Cause, float, float], ...] = eqx.field(static=True)  # least length, and range of it
 
     @classmethod
     def by(cls, world: World) -> Shown:
@@ -101,7 +102,7 @@ def _varying(world: World) -> list[str]:
     return [name for name in world.map.names if name in ranges and ranges[name][1] > ranges[name][0]]
 
 
-def _lengths(world: World) -> list[causes.Cause]:
+def _lengths(world: World) -> list[Cause]:
     """How far things are away, of the kinds whose ranges are known."""
     ranges = world.card.data.ranges or {}
-    return [one for one in causes.offsets(world.map.names) if one.name in ranges]
+    return [one for one in cause_candidates.offsets(world.map.names) if one.name in ranges]

@@ -228,24 +228,64 @@ def _still(steps: _Steps, places: Sequence[_Field], named: set[int]) -> Iterator
 
 
 def _heading(steps: _Steps, found: Mapping[int, str]) -> dict[int, str]:
-    """Names of two entries that are a direction, in which a body moves that has one: its velocity is along it."""
+    """Names of a direction in which a body moves that has one, as two entries or an angle: its velocity is along it, or
+    the change of its place; in that case of its speed, too."""
     at = {name: entry for entry, name in found.items()}
-    if not {"own.vx", "own.vy"} <= set(at):
+    if {"own.vx", "own.vy"} <= set(at):
+        velocity = steps.before[..., [at["own.vx"], at["own.vy"]]].reshape(-1, 2)
+        return _direction(steps, steps.before, velocity, found)
+    if not {"own.x", "own.y"} <= set(at):
         return {}
-    velocity = steps.before[..., [at["own.vx"], at["own.vy"]]].reshape(-1, 2)
+    moved = steps.change([at["own.x"], at["own.y"]]).reshape(-1, 2)
+    for rows in (steps.after, steps.before):
+        if direction := _direction(steps, rows, moved, found):
+            return direction | _speed_ahead(steps, moved, {*found, *direction})
+    return {}
+
+
+def _direction(steps: _Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapping[int, str]) -> dict[int, str]:
+    """Names of the entries of `rows` (W, N, O) along which velocities (W N, 2) are."""
     speed = np.linalg.norm(velocity, axis=-1)
     moves = speed > np.median(speed)
     if not moves.any():
         return {}
+
+    def along(direction: np.ndarray) -> bool:
+        ahead = (velocity * direction).sum(-1)
+        return bool((ahead[moves] >= (1 - LIKE) * speed[moves]).mean() >= SHARE)
+
     free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
     for cos, sin in itertools.permutations(free, 2):
-        direction = steps.before[..., [cos, sin]].reshape(-1, 2)
-        if (np.abs(np.linalg.norm(direction, axis=-1) - 1.0) > EXACT).mean() > 1 - SHARE:
-            continue
-        ahead = (velocity * direction).sum(-1)
-        if (ahead[moves] >= (1 - LIKE) * speed[moves]).mean() >= SHARE:
+        direction = rows[..., [cos, sin]].reshape(-1, 2)
+        unit = np.abs(np.linalg.norm(direction, axis=-1) - 1.0) <= EXACT
+        if unit.mean() >= SHARE and along(direction):
             return {cos: "own.cos", sin: "own.sin"}
+    for entry in free:
+        angle = rows[..., entry].ravel()
+        if along(np.stack([np.cos(angle), np.sin(angle)], -1)):
+            return {entry: "own.heading"}
     return {}
+
+
+def _speed_ahead(steps: _Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:
+    """The name of the entry that says how far bodies with a direction move (W N, 2) in a step, where there is one."""
+    length = np.linalg.norm(moved, axis=-1).reshape(steps.before.shape[:2])
+    found = {}
+    for entry in range(len(steps.deviation)):
+        if entry in named or not steps.varies(entry):
+            continue
+        for rows in (steps.after, steps.before):
+            speed = rows[..., entry]
+            moves = speed > np.median(speed)
+            if moves.any() and (dt := float(np.median(length[moves] / np.maximum(speed[moves], 1e-9)))) > 0:
+                found[entry] = min(found.get(entry, 1.0), _off(length, dt * speed))
+    best = min(found, key=found.__getitem__, default=None)
+    return {} if best is None or found[best] > LIKE else {best: "own.v"}
+
+
+def _off(moved: np.ndarray, predicted: np.ndarray) -> float:
+    """By what share of how far things move predictions are off, in nine of ten steps."""
+    return float(np.quantile(np.abs(moved - predicted), SHARE) / max(np.quantile(np.abs(moved), SHARE), 1e-12))
 
 
 def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]:

@@ -90,7 +90,7 @@ def _map(plane: ProbeMap, subject: str, name: str) -> Drawn:
     """Scores over a plane."""
     title = f"Score over {subject}"
     scores = np.clip(plane.scores, -MARGINS, MARGINS)
-    entries = _subject(plane.name).split(", ")
+    entries = _subject(plane.name).split(", ", 1)
     half_x, half_y = (0.5 * (axis[1] - axis[0]) for axis in (plane.x, plane.y))
     extent = (plane.x[0] - half_x, plane.x[-1] + half_x, plane.y[0] - half_y, plane.y[-1] + half_y)
     with style(font_size=9, axes_grid=False):

@@ -9,15 +9,21 @@ from typing import Any
 from ringfence.errors import UserError
 
 
+def memory_of(function: Any) -> Any:
+    """Who has `reset()`, and so a memory: the function, or the object whose method it is. None: nobody."""
+    owner = function if hasattr(function, "reset") else getattr(function, "__self__", None)
+    return owner if callable(getattr(owner, "reset", None)) and not inspect.isclass(owner) else None
+
+
 class OfObservations:
     """A function that reads no state, called like one that does. It has `reset()` if the function, or whose method it
     is, has one; a copy of it has a copy of their memory."""
 
     def __init__(self, function: Callable[[Any], Any]):
         self.function = function
-        owner = function if hasattr(function, "reset") else getattr(function, "__self__", None)
-        if callable(reset := getattr(owner, "reset", None)):
-            self.reset = reset
+        owner = memory_of(function)
+        if owner is not None:
+            self.reset = owner.reset
 
     def __call__(self, observations: Any, state: Any) -> Any:
         return self.function(observations)

@@ -12,7 +12,7 @@ from ringfence.utils import stored as named
 from ringfence.utils.config import build_config
 from ringfence.utils.numbers import percent, significant
 from ringfence.utils.renamed import deprecated
-from ringfence.world.causes import Edge, Found
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.settings import Settings, settings_named
 
 FARTHEST = 15  # rows that a guard looks ahead by itself (benchmarks/proving.py plays more of them)
@@ -362,7 +362,7 @@ def _of_causes(card: Card) -> Iterator[str]:
     for name, found in card.causes.items():
         of = f" of '{name}'" if name else ""
         parts = [
-            f"{cause.name} ({percent(share, 3)}{_edge(edge)})"
+            f"{cause.name} ({percent(share, 3)}{_edge(cause, edge)})"
             for cause, share, edge in zip(found.causes, found.shares, found.edges)
         ]
         if parts:
@@ -372,8 +372,18 @@ def _of_causes(card: Card) -> Iterator[str]:
             )
 
 
-def _edge(edge: Edge) -> str:
-    return "" if edge.at is None else f", {'below' if edge.below else 'above'} {edge.at:.3g}"
+def _edge(cause: Cause, edge: Edge) -> str:
+    if edge.at is None:
+        return ""
+    found = f", {'below' if edge.below else 'above'} {edge.at:.3g}"
+    if cause.how not in ("high", "low", "coming", "ahead") or not edge.below:
+        return found
+    second = cause.second_edge(edge.at)
+    return (
+        f"{found} and within {second:.3g} rad"
+        if cause.how == "ahead"
+        else f"{found} and {'below' if cause.how == 'low' else 'above'} {second:.3g}"
+    )
 
 
 def _of_horizon(avoidable: Avoidable, kept: float) -> str:

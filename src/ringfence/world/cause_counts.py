@@ -58,8 +58,8 @@ class Steps:
     def vary(self, cause: Cause) -> np.ndarray:
         """(N, J) bool: of which agents and things all that a cause reads varies."""
         read = np.array(cause.things)
-        if cause.speeds:
-            read = np.concatenate([read, np.array(cause.speeds)], -1)
+        if cause.also:
+            read = np.concatenate([read, np.array(cause.also)], -1)
         return np.all(self.varies[:, read], -1)
 
     def part(self, some: np.ndarray) -> Steps:
@@ -210,11 +210,11 @@ def likelihood(steps: Steps, safe: np.ndarray) -> np.ndarray:
 
 def _range(steps: Steps, cause: Cause) -> tuple[np.ndarray, np.ndarray]:
     entries = np.array(cause.things)
-    if not cause.length and not cause.speeds:
+    if not cause.length and not cause.also:
         return steps.low[entries].min(0), steps.high[entries].max(0)
     some = cause.of(steps.x[:: max(1, len(steps.x) // 20_000)])
     low, high = np.quantile(some, [0.0005, 0.9995], axis=tuple(range(some.ndim - 1)))
-    return np.array([0.0, *low[1:]]), high
+    return (np.array([0.0, *low[1:]]) if cause.first_is_distance else low), high
 
 
 def _bins(cause: Cause, samples: int) -> int:

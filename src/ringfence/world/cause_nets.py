@@ -23,8 +23,9 @@ from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.causes import Cause, Edge, Found, nearing
+from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import CELLS, Cells
+from ringfence.world.readings import SEVERAL
 
 HOT = 10.0  # temperature that learning begins with: many causes share a cost
 COOLED = 0.6  # share of the updates after which it is 1: odds add up
@@ -76,11 +77,11 @@ Score = CauseNet | Distance
 def values_of(cause: Cause, x: Array) -> Array:
     """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
     read = x[..., np.array(cause.things)]
-    if cause.speeds:
-        return jnp.stack(nearing(read, x[..., np.array(cause.speeds)]), -1)
+    also = x[..., np.array(cause.also)] if cause.also else None
     if not cause.length:
-        return read
-    return cause.longest([jnp.sqrt((part**2).sum(-1, keepdims=True) + 1e-9) for part in cause.parts(read)])
+        return jnp.stack(SEVERAL[cause.how](read, also), -1) if cause.also else read
+    lengths = [jnp.sqrt((part**2).sum(-1, keepdims=True) + 1e-9) for part in cause.parts(read)]
+    return cause.in_one(lengths + cause.second(read, also))
 
 
 def scores(net: Score, x: Array) -> Array:

@@ -13,36 +13,28 @@ This is a noisy-or over causes and agents (Pearl 1988), grown greedily: P(safe) 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 from msgspec.structs import replace
 
+from ringfence.world.cause_candidates import candidates, offsets, wider, with_distances, with_vectors
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
 from ringfence.world.cause_edges import least_wrong, refined, within
 from ringfence.world.cause_siblings import siblings
-from ringfence.world.causes import (
-    Cause,
-    Found,
-    candidates,
-    narrowed,
-    nearing_of,
-    offsets,
-    only_of,
-    only_where,
-    wider,
-    with_an_axis_apart,
-)
+from ringfence.world.causes import Cause, Found, in_one_number, narrowed, only_of, only_where, with_an_axis_apart
 from ringfence.world.cells import Cells
+from ringfence.world.readings import How
 
-VERSION = 17  # of the search: what was found by another is looked for again
+VERSION = 19  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
 SURE = 3.0  # standard errors, over episodes, by which a gain has to exceed nothing
 NEEDED = 2.0  # standard errors, by which one that is kept beside all others has to
 PURE = 0.8  # share of the steps that a cause calls unsafe, and that are, of one that is no mixture of others
-ENOUGH = 0.98  # share of unsafe steps that causes tell, from which on they are not looked for in another way
+ENOUGH = 0.98  # share of unsafe steps, and of safe ones, that causes tell, from which on nothing else is tried
 NEARLY_ALL = 0.9  # of the likelihood that is left to win: what tells so much of unseen episodes is no accident
 FEW = 6  # episodes with danger, below which anything is
 RATIOS = (2**0.5, 2**0.125, 2**0.03125, 2**0.0078125)  # by which an axis is tried to count more or less, ever finer
@@ -86,18 +78,27 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str])
     """The causes, or those that are found with more that may be read of how near things are, where these tell more.
     Aircraft are too near where they are near across and in height, vehicles where they are along and aside; or danger
     is how soon they meet."""
-    if chosen and _summary(steps, chosen).explained > ENOUGH:
+    if _tell_enough(steps, chosen):
         return chosen
     some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
-    apart = [_with_ratio(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
-    shapes = [*apart, *_about_whom(steps, nearing_of(names))]
+    apart = [_axis_apart(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
+    shapes = [*apart, *_about_whom(steps, [*with_distances(names), *with_vectors(names)])]
     found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
     if not {one.cause for one in found} & set(shapes):
         return chosen
+    for k, one in enumerate(found):
+        found[k] = _in_one_number(steps, some, one, _without(steps, found, one))
+    found = _pruned(steps, found)
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
     return found if more - less > SURE * error else chosen
+
+
+def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
+    """Whether causes tell nearly all unsafe steps, and nearly all safe ones."""
+    told = _summary(steps, chosen) if chosen else Found(false_alarms=1.0)
+    return min(told.explained, 1.0 - told.false_alarms) > ENOUGH
 
 
 def _axes_apart(length: Cause) -> Sequence[int]:
@@ -106,17 +107,41 @@ def _axes_apart(length: Cause) -> Sequence[int]:
     return range(axes) if axes > 2 else range(1, axes)
 
 
-def _with_ratio(steps: Steps, length: Cause, axis: int) -> Cause:
+def _axis_apart(steps: Steps, length: Cause, axis: int) -> Cause:
     """The length with an axis apart that counts as much as parts most unsafe steps from safe ones."""
     read = np.abs(steps.x[..., np.array(length.things)]).reshape(-1, len(length.things[0]))
     most = np.maximum(np.quantile(read, 0.9995, axis=0), 1e-9)
-    ratio = float(np.delete(most, axis).max() / most[axis])
+    ratio = np.delete(most, axis).max() / most[axis]
+    return _with_ratio(steps, partial(with_an_axis_apart, length, axis), ratio)
+
+
+def _in_one_number(steps: Steps, some: Steps, one: Counted, explained: Explained) -> Counted:
+    """A cause of a distance and another number in one, near *and* fast or in sight, or near soon, where this tells
+    as much: then its edges are known as well as those of a distance are."""
+    sides: dict[str, tuple[How, ...]] = {"beside": ("high", "low"), "turned": ("ahead",), "nearing": ("soon", "coming")}
+    best = counted(steps, one.cause, explained)
+    least = (1 - SIMPLER) * best.gain
+    for how in sides.get(one.cause.how, ()):
+        far, second = some.x[..., np.array(one.cause.things)], one.cause.of(some.x)[..., 1]
+        end = float(second.min() if how == "low" else second.max())
+        wide = np.pi if how == "ahead" else second.max() - second.min()
+        ratio = np.quantile(np.sqrt((far**2).sum(-1)), 0.9995) / max(wide, 1e-9)
+        cause = _with_ratio(some, partial(in_one_number, one.cause, how, end), ratio)
+        tried = counted(steps, cause, explained)
+        if tried.gain > least:
+            best, least = tried, tried.gain
+    return best
+
+
+def _with_ratio(steps: Steps, made: Callable[[float], Cause], ratio: float) -> Cause:
+    """The cause of the ratio that parts most unsafe steps from safe ones, from one that makes both numbers as long."""
+    ratio = float(ratio)
     for factor, either in zip(RATIOS, TRIED):
-        tried = [with_an_axis_apart(length, axis, ratio * factor**k) for k in range(-either, either + 1)]
+        tried = [made(ratio * factor**k) for k in range(-either, either + 1)]
         wrong = np.array([least_wrong(steps, one) for one in tried])
         best = np.flatnonzero(wrong == wrong.min())
         ratio = tried[best[len(best) // 2]].ratio
-    return with_an_axis_apart(length, axis, ratio)
+    return made(ratio)
 
 
 def _split(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:

@@ -11,9 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
+from ringfence.world.cause_candidates import candidates
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted
 from ringfence.world.cause_edges import within
-from ringfence.world.causes import Cause, Edge, candidates
+from ringfence.world.causes import Cause, Edge
 from ringfence.world.cells import CELLS
 
 ALIKE = 0.95  # share of the steps within another entry's edges that are unsafe, where they are this one's, too

@@ -12,6 +12,7 @@ CELLS = {1: 200, 2: 48, 3: 20, 4: 11}  # along each axis, by the number of entri
 BEYOND = 0.5  # of the range of what was seen: how far outside of it cells are taken to be like the nearest ones
 APART = 1.5  # cells from the nearest visited one, from which on a place counts as never visited
 NEARBY = 4.0  # cells, deviation of the places that are asked about close to visited ones
+ALONG = 0.05  # weight of a distance beside what else a cause reads: what is there is known by who was so, however far
 VISITED = 3  # visits that make a cell known
 GAP = 0.1  # of the range of one number, unvisited: no few steps more would have filled it
 TURNS = (20.0, 0.1)  # visits, and share of the dangerous ones, that have to contradict before danger begins or ends
@@ -82,8 +83,9 @@ class Cells:
     def beyond(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """(values (count, width), unsafe (count,) bool) of places that were never visited.
 
-        Along a distance each is like the nearest that was: what is nearer than anybody came is as unsafe as that, and
-        what is farther away as safe. Anywhere else what nobody visited is unsafe: nothing says that it is not a wall.
+        Along a distance each is like the nearest that was, at the same speed where a cause reads this, too: what is
+        nearer than anybody came is as unsafe as that, and what is farther away as safe. Anywhere else what nobody
+        visited is unsafe: nothing says that it is not a wall.
         """
         from scipy.spatial import KDTree  # slow to import, and read by fits alone
 
@@ -94,10 +96,12 @@ class Cells:
         new = np.flatnonzero(far > APART)[:count]
         if not len(new):
             new = np.arange(count)
-        new = np.resize(new, count)
-        if self.cause.length:
-            return values[new], unsafe[nearest[new]]
-        return values[new], unsafe[nearest[new]] | (far[new] > APART)
+        values, far, nearest = (a[np.resize(new, count)] for a in (values, far, nearest))
+        if self.cause.first_is_distance:
+            scale = scale * [1 / ALONG, *[1.0] * (self.cause.width - 1)]
+            nearest = np.asarray(KDTree(centres / scale).query(values / scale)[1])
+            far = np.abs((values - centres[nearest]) / scale)[:, 1:].max(1, initial=0.0)
+        return values, unsafe[nearest] | (far > APART)
 
     def _around(self, centres: np.ndarray, scale: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
         """(count, width) values in and around what was visited: half of them anywhere, half close to it."""
@@ -106,7 +110,9 @@ class Cells:
         close = centres[rng.integers(len(centres), size=count - count // 2)]
         close = close + scale * rng.normal(0.0, NEARBY, close.shape)
         values = np.concatenate([anywhere, close])[rng.permutation(count)]
-        return np.maximum(values, 0.0) if self.cause.length else values
+        if self.cause.first_is_distance:
+            values[:, 0] = np.maximum(values[:, 0], 0.0)
+        return values
 
 
 def _likeliest(costs: np.ndarray, turn: float) -> np.ndarray:

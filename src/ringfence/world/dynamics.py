@@ -25,7 +25,7 @@ from ringfence.problem.normalise import varying
 from ringfence.problem.turns import pointing, within
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
-from ringfence.world.causes import AHEAD, Heading
+from ringfence.world.heading import AHEAD, Heading
 
 Seen = tuple[Array, Array]  # (..., N, J) who is seen, and whether that is known
 STATES = 20_000  # steps that features and their changes are standardised by

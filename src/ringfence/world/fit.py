@@ -36,9 +36,11 @@ from ringfence.utils.pytrees import load_named, named_arrays
 from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, impacts, margins, validate, values
 from ringfence.world.card import Card, Data
+from ringfence.world.cause_candidates import offsets
 from ringfence.world.cause_nets import fit_causes
-from ringfence.world.causes import AHEAD, Found, Heading, offsets
+from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
+from ringfence.world.heading import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ringfence.problem.features import FeatureMap
-from ringfence.world import causes
+from ringfence.world import cause_candidates
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import Foresight
 from ringfence.world.causes import Cause, Edge
@@ -91,7 +91,7 @@ def _reads(barrier: Barrier | MinBarrier, names: Sequence[str]) -> dict[str, tup
         if one.causes:
             found |= {_name(net.cause, net.edge): (net.cause, net.edge) for net in one.causes}
             continue
-        offsets = causes.offsets(names)
+        offsets = cause_candidates.offsets(names)
         inside = {d for cause in offsets for thing in cause.things for d in thing}
         found |= {_name(cause, None): (cause, None) for cause in offsets}
         found |= {name: (Cause(name, ((d,),)), None) for d, name in enumerate(names) if d not in inside}

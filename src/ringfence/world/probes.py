@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ringfence.types import Array
-from ringfence.world import cause_edges, causes
+from ringfence.world import cause_candidates, cause_edges
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.card import UNKNOWN, Probe, ProbeMap
 from ringfence.world.cause_nets import Score
@@ -75,9 +75,9 @@ def _curve(net: Score, unit: float) -> Probe:
     """Scores of a cause that reads one number, along it; of a distance from 0 to well beyond where danger begins."""
     edge = net.edge
     reach = 0.25 * (edge.high[0] - edge.low[0])
-    low = max(0.0, edge.low[0] - reach) if net.cause.length else edge.low[0] - reach
+    low = max(0.0, edge.low[0] - reach) if net.cause.is_distance else edge.low[0] - reach
     high = edge.high[0] + reach
-    if net.cause.length and edge.at:
+    if net.cause.is_distance and edge.at:
         low, high = 0.0, min(high, FARTHEST * edge.at)
     at = np.linspace(low, high, POINTS)
     scores = np.asarray(_scores_of_values(net, at[:, None].astype(np.float32))) / unit
@@ -153,8 +153,8 @@ def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Ed
     """How near things come: the causes that are a distance, or, of networks on all entries, what names tell of one."""
     each = barrier.each if isinstance(barrier, MinBarrier) else (barrier,)
     if any(one.causes for one in each):
-        return [(net.cause, net.edge) for one in each for net in one.causes if net.cause.length]
-    return [(cause, _radius(cause, logged)) for cause in causes.offsets(logged.map.names)]
+        return [(net.cause, net.edge) for one in each for net in one.causes if net.cause.is_distance]
+    return [(cause, _radius(cause, logged)) for cause in cause_candidates.offsets(logged.map.names)]
 
 
 def _radius(cause: Cause, logged: Logged) -> Edge:

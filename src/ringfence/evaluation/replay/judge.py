@@ -392,7 +392,7 @@ def _radius_of_causes(causes: Mapping[str, Found], axes: int) -> tuple[float, st
         (share, edge.at, cause.name)
         for found in causes.values()
         for cause, share, edge in zip(found.causes, found.shares, found.edges)
-        if cause.length and not cause.who and edge.at is not None and edge.below
+        if cause.is_distance and not cause.who and edge.at is not None and edge.below
         if cause.name.startswith("length of other.")
         if cause.name.removeprefix("length of ").replace("other.", "").split(", ") == offsets
     )

@@ -1,0 +1,133 @@
+"""Causes that danger may have, as names of entries tell: places, speeds, and how near things are."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+
+from msgspec.structs import replace
+
+from ringfence.problem.features import numbered
+from ringfence.world.causes import Cause, narrowed
+
+WIDEST = 4  # entries of one cause
+DIRECTIONS = (("own.cos", "own.sin"), ("own.heading",), ("own.yaw",), ("own.theta",))  # that one looks into
+
+
+def candidates(names: Sequence[str]) -> Iterator[Cause]:
+    """Every entry and every two entries of oneself, and of each kind of thing; of two also their length."""
+    yield from _sets("", [_own(names)])
+    for kind, each in things_of(names).items():
+        yield from _sets(kind, each)
+    yield from (cause for cause in offsets(names) if len(cause.things[0]) > 2)
+
+
+def offsets(names: Sequence[str]) -> list[Cause]:
+    """How far away things are, by kind, as names tell (dx, dy, dz)."""
+    found = []
+    for kind, each in things_of(names).items():
+        axes = [f"d{c}" for c in "xyz" if f"d{c}" in each[0]]
+        if axes:
+            found.append(Cause(f"length of {kind}.{', '.join(axes)}", _picked(each, axes), length=True))
+    return found
+
+
+def with_distances(names: Sequence[str]) -> list[Cause]:
+    """How far things are together with one number more, by kind, where names tell: how fast they come nearer (danger of
+    how soon they meet), or an entry or a vector of oneself or of theirs (near and fast). And where they are to who
+    looks into a direction."""
+    found = []
+    own = _own(names)
+    for kind, each in things_of(names).items():
+        axes = [c for c in "xyz" if f"d{c}" in each[0]]
+        if not axes:
+            continue
+        offset = Cause("", _picked(each, [f"d{c}" for c in axes]))
+        speed = [f"dv{c}" for c in axes]
+        if set(speed) <= set(each[0]):
+            name = f"{kind}.distance, how fast it shrinks"
+            found.append(replace(offset, name=name, also=_picked(each, speed), how="nearing"))
+        looks = next((fields for fields in DIRECTIONS if set(fields) <= set(own)), ())
+        if len(axes) == 2 and looks:
+            direction = _picked([own] * len(each), looks)
+            found.append(replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned"))
+        theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
+        for fields in ([own] * len(each), theirs):
+            for group in _numbers(list(fields[0])):
+                number = ("length of " if len(group) > 1 else "") + ", ".join(group)
+                name = f"{kind}.distance, {number}"
+                found.append(replace(offset, name=name, also=_picked(fields, group), how="beside"))
+    return found
+
+
+def with_vectors(names: Sequence[str]) -> Iterator[Cause]:
+    """An entry of oneself, or two that are a vector, with how long another vector is: e.g. a place and a speed."""
+    own = _own(names)
+    groups = list(_numbers(list(own)))
+    for base, vector in itertools.product(groups, groups):
+        if len(vector) > 1 and len(base) < 3 and not set(base) & set(vector):
+            name = f"{', '.join(base)}, length of {', '.join(vector)}"
+            yield Cause(name, _picked([own], base), also=_picked([own], vector), how="vector")
+
+
+def _picked(things: Sequence[dict[str, int]], fields: Sequence[str]) -> tuple[tuple[int, ...], ...]:
+    """(J, k) entries of these fields of each thing."""
+    return tuple(tuple(thing[field] for field in fields) for thing in things)
+
+
+def _own(names: Sequence[str]) -> dict[str, int]:
+    """Entries that are no thing's, by name."""
+    inside = {d for kind in things_of(names).values() for fields in kind for d in fields.values()}
+    return {name: d for d, name in enumerate(names) if d not in inside}
+
+
+def wider(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
+    """The cause with one more entry of oneself, or of the same thing; of whom it is."""
+    if len(cause.things[0]) < WIDEST and cause.apart is None and not cause.also:
+        base = narrowed(cause, ())
+        base = replace(base, length=False, name=base.name.removeprefix("length of "))
+        yield from (narrowed(more, cause.who) for more in _with_one_more(base, names))
+
+
+def _with_one_more(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
+    for name, d in _own(names).items():
+        if d not in cause.things[0]:
+            yield replace(cause, name=f"{cause.name}, {name}", things=tuple((*t, d) for t in cause.things))
+    for kind, each in things_of(names).items():
+        if len(each) != len(cause.things) or not set(cause.things[0]) & set(each[0].values()):
+            continue
+        for field in each[0]:
+            if each[0][field] not in cause.things[0]:
+                more = tuple((*t, thing[field]) for t, thing in zip(cause.things, each))
+                yield replace(cause, name=f"{cause.name}, {kind}.{field}", things=more)
+
+
+def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
+    """Fields of each thing, by kind: those that all of a kind have."""
+    kinds = {}
+    for kind, things in numbered(names).items():
+        shared = set.intersection(*[set(fields) for fields in things])
+        if shared:
+            kinds[kind] = [{f: d for f, d in fields.items() if f in shared} for fields in things]
+    return kinds
+
+
+def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
+    fields = list(each[0])
+    of = f"{kind}." if kind else ""
+    for field in fields:
+        yield Cause(of + field, tuple((thing[field],) for thing in each))
+    for one, two in itertools.combinations(fields, 2):
+        both = tuple((thing[one], thing[two]) for thing in each)
+        yield Cause(f"{of}{one}, {of}{two}", both)
+        yield Cause(f"length of {of}{one}, {of}{two}", both, length=True)
+
+
+def _numbers(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    """Each by itself, and those that are a vector: they differ in the axis at the end alone."""
+    yield from ((name,) for name in names)
+    axes: dict[str, list[str]] = {}
+    for name in names:
+        if name[-1] in "xyz":
+            axes.setdefault(name[:-1], []).append(name)
+    yield from (tuple(vector) for vector in axes.values() if len(vector) > 1)

@@ -1,0 +1,63 @@
+"""How fast a body that looks into a direction goes ahead, as names of entries tell."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+
+from ringfence.types import Array
+
+AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
+RELATIVE = re.compile(r"(?!own\.)[a-z_]+\d*\.dv[xy]")  # how fast things move, less one's own velocity
+
+
+class Heading(msgspec.Struct, frozen=True):
+    """Entries that tell how fast a body that looks into a direction goes ahead: its velocity, or its speed, and that
+    direction."""
+
+    velocity: tuple[int, ...]  # two, or the speed
+    direction: tuple[int, int]
+    relative: tuple[tuple[int, int], ...] = ()  # velocities of things less one's own, and along which axis
+
+    @classmethod
+    def of(cls, names: Sequence[str]) -> Heading | None:
+        """None where names tell of none."""
+        at = {name: d for d, name in enumerate(names)}
+        if not {"own.cos", "own.sin"} <= set(at):
+            return None
+        direction = at["own.cos"], at["own.sin"]
+        relative = [(d, "xy".index(name[-1])) for name, d in at.items() if RELATIVE.fullmatch(name)]
+        if {"own.vx", "own.vy"} <= set(at):
+            return cls((at["own.vx"], at["own.vy"]), direction, tuple(relative))
+        speed = next((at[name] for name in ("own.v", "own.speed") if name in at), None)
+        return None if speed is None else cls((speed,), direction, tuple(relative))
+
+    @property
+    def about(self) -> tuple[int, ...]:
+        """Entries that are relative to the velocity."""
+        return tuple(entry for entry, _ in self.relative)
+
+    def speed(self, x: Any) -> Any:
+        """(...) ahead, of features (..., D), NumPy's or JAX's: negative of who goes backwards."""
+        if len(self.velocity) == 1:
+            return x[..., self.velocity[0]]
+        cos, sin = (x[..., d] for d in self.direction)
+        vx, vy = (x[..., v] for v in self.velocity)
+        return (vx * cos + vy * sin) / (cos**2 + sin**2 + 1e-9) ** 0.5
+
+    def no_slower(self, x: Array, least: float) -> Array:
+        """Features (..., D) with that speed ahead at least, and what is relative to it as much less."""
+        lacks = jnp.maximum(least - self.speed(x), 0.0)[..., None]
+        direction = x[..., np.array(self.direction)]
+        length = jnp.sqrt((direction**2).sum(-1, keepdims=True) + 1e-9)
+        faster = lacks * direction / length
+        x = x.at[..., np.array(self.velocity)].add(faster if len(self.velocity) == 2 else lacks)
+        if not self.relative:
+            return x
+        axes = np.array([axis for _, axis in self.relative])
+        return x.at[..., np.array(self.about)].add(-faster[..., axes])
