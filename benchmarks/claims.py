@@ -134,18 +134,14 @@ def of_bad_driving() -> tuple[bool, str]:
 
 def of_shapes() -> tuple[bool, str]:
     """Episodes with a violation of guarded clones by causes of more shapes, and without (Fisher's exact test)."""
-    rows = {(r["system"], r["causes"]): r for r in rows_of("shapes.csv", guard="shield", driver="clone")}
-    systems = [name for name, causes in rows if causes == "more shapes"]
-    left = {name: [_violated(rows[name, causes]) for causes in ("more shapes", "no more shapes")] for name in systems}
-    fewer = [name for name, (more, plain) in left.items() if fisher_exact(np.c_[more, plain], "less").pvalue < LEVEL]
-    refused = [name for name in systems if rows[name, "no more shapes"]["verdict"] == "unfit"]
-    fit = all(rows[name, "more shapes"]["verdict"] == "fit" for name in systems)
-    shown = ", ".join(f"{name} {plain[0]} → {more[0]}" for name, (more, plain) in left.items())
-    holds = fit and len(systems) == 4 and max(more[0] for more, _ in left.values()) <= 1 and len(fewer) == 3
-    return holds and refused == [
-        "meeting",
-        "sprayers",
-    ], f"{shown} of 100; fewer on {', '.join(fewer)}; *unfit* without: {', '.join(refused)}"
+    rows = {(r["system"], r["seed"], r["causes"]): r for r in rows_of("shapes.csv", guard="shield", driver="clone")}
+    logs = [key[:2] for key in rows if key[2] == "more shapes"]
+    left = {key: [_violated(rows[*key, causes]) for causes in ("more shapes", "no more shapes")] for key in logs}
+    fewer = {key for key, (more, plain) in left.items() if fisher_exact(np.c_[more, plain], "less").pvalue < LEVEL}
+    never = all(more[0] == 0 and rows[*key, "more shapes"]["verdict"] == "fit" for key, (more, _) in left.items())
+    words = [f"{' '.join(key)} {plain[0]} → {more[0]}" for key, (more, plain) in left.items()]
+    holds = never and len(logs) == 7 and fewer == {key for key in logs if key[0] != "sector"}
+    return holds, f"of 100: {', '.join(words)}"
 
 
 def _violated(row: dict[str, str]) -> list[int]:
@@ -797,6 +793,17 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
+        "a little less on one tier",
+        SPREAD,
+        tested(
+            ("mpc", f"default{FULL}"),
+            ("bc", f"default{FULL}"),
+            "return",
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 1 and not any(d.holds and d.mean > 0 for d in ds),
+        ),
+    ),
+    Claim(
+        "docs/attribution.md",
         "After 6000 it earns more on two and less on none",
         SPREAD,
         tested(
@@ -814,7 +821,7 @@ CLAIMS = (
             ("madiff", f"default{SHIELD}"),
             ("madiff", f"own{SHIELD}"),
             "return",
-            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 2 and not any(d.holds and d.mean < 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 1 and not any(d.holds and d.mean < 0 for d in ds),
         ),
     ),
     Claim(
@@ -946,7 +953,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/proving-ground.md",
-        "Without them clones violate more on three, and two Worlds call themselves *unfit*",
+        "With more shapes all Worlds are *fit*, and no guarded clone violates",
         "results/shapes.csv",
         of_shapes,
     ),

@@ -1,9 +1,9 @@
 """Danger that is no distance alone: a naive driver and a clone of the logs, alone and under a shield, by a World whose
 causes may read more than that, and by one whose may not. Systems are those of _shaped.py.
 
-    python benchmarks/shapes.py             # of all; fifteen minutes a system
-    python benchmarks/shapes.py docks       # of some
-    python benchmarks/shapes.py --table     # of results/shapes.csv, into docs/proving-ground.md
+    python benchmarks/shapes.py                    # of all; fifteen minutes a system
+    python benchmarks/shapes.py docks --seed 11    # of some, by other logs
+    python benchmarks/shapes.py --table            # of results/shapes.csv, into docs/proving-ground.md
 
 Rows that are in results/shapes.csv already are not made again.
 """
@@ -27,7 +27,7 @@ from ringfence.world import cause_search
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "results" / "shapes.csv"
 LOGGED, EPISODES, SEED = 600, 100, 10
-HEAD = ("system", "driver", "causes", "verdict", "found", "guard")
+HEAD = ("system", "seed", "driver", "causes", "verdict", "found", "guard")
 HEAD += ("episodes", "return", "violated", "bound", "infeasible")
 WITH, WITHOUT = "more shapes", "no more shapes"
 
@@ -42,6 +42,7 @@ def without_more_shapes():
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("systems", nargs="*", help=", ".join(SYSTEMS))
+    parser.add_argument("--seed", type=int, default=SEED, help="of the logs")
     parser.add_argument("--table", action="store_true", help="make no rows")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -49,18 +50,18 @@ def main() -> None:
         put("docs/proving-ground.md", "shapes", table())
         return
     for name in given.systems or SYSTEMS:
-        made(name, SYSTEMS[name])
+        made(name, SYSTEMS[name], given.seed)
 
 
-def made(name: str, system: type[System]) -> None:
-    """The rows of a system that are not there."""
+def made(name: str, system: type[System], seed: int) -> None:
+    """The rows of a system, by logs of this seed, that are not there."""
     wanted = [(d, c, g) for d in ("naive", "clone") for c, g in ((WITH, "none"), (WITHOUT, "shield"), (WITH, "shield"))]
-    done = {(r["driver"], r["causes"], r["guard"]) for r in read(OUT) if r["system"] == name}
+    done = {(r["driver"], r["causes"], r["guard"]) for r in read(OUT) if (r["system"], r["seed"]) == (name, str(seed))}
     wanted = [one for one in wanted if one not in done]
     if not wanted:
         return
-    store = system.recorded(LOGGED, SEED)
-    clone = ringfence.train("bc", store, out=ROOT / "runs" / "shapes", quiet=True)[0]
+    store = system.recorded(LOGGED, seed)
+    clone = ringfence.train("bc", store, out=ROOT / "runs" / f"shapes-{seed}", quiet=True)[0]
     worlds = {WITH: ringfence.fit(store)}
     with without_more_shapes():
         worlds[WITHOUT] = ringfence.fit(store, cached=False)
@@ -73,7 +74,7 @@ def made(name: str, system: type[System]) -> None:
         r = ringfence.play(act, system, episodes=EPISODES, num_envs=100, **how)
         bound = upper_bound(round(r["violation_rate"] * EPISODES), EPISODES)
         found = "; ".join(c.name for c in world.card.causes[""].causes) or "networks on all entries"
-        row = [name, driver, causes, world.card.verdict.word, found, guard, EPISODES]
+        row = [name, seed, driver, causes, world.card.verdict.word, found, guard, EPISODES]
         row += [r["return_mean"], r["violation_rate"], bound, r.get("infeasible_rate", 0.0)]
         row = [f"{v:.5g}" if isinstance(v, float) else v for v in row]
         append(OUT, dict(zip(HEAD, row)), HEAD)
@@ -81,16 +82,18 @@ def made(name: str, system: type[System]) -> None:
 
 
 def table() -> str:
-    rows = {(r["system"], r["driver"], r["causes"], r["guard"]): r for r in read(OUT)}
+    rows = {(r["system"], r["seed"], r["driver"], r["causes"], r["guard"]): r for r in read(OUT)}
     lines = [
-        "| system | who acts | no guard | shield, without more shapes | shield |",
+        "| logs | who acts | no guard | shield, without more shapes | shield |",
         "|---|---|---|---|---|",
     ]
-    for name in SYSTEMS:
+    for name, seed in sorted({key[:2] for key in rows}, key=lambda of: (list(SYSTEMS).index(of[0]), int(of[1]))):
         for driver in ("naive", "clone"):
-            each = [rows.get((name, driver, *of)) for of in ((WITH, "none"), (WITHOUT, "shield"), (WITH, "shield"))]
+            of = ((WITH, "none"), (WITHOUT, "shield"), (WITH, "shield"))
+            each = [rows.get((name, seed, driver, *one)) for one in of]
             if all(each):
-                lines.append(f"| {name} | {driver} | {' | '.join(short(r) for r in each)} |")
+                shown = " | ".join(short(r) for r in each)
+                lines.append(f"| {name} {seed} | {driver} | {shown} |")
     return "\n".join(lines)
 
 
