@@ -796,10 +796,10 @@ CLAIMS = (
         "a little less on one tier",
         SPREAD,
         tested(
-            ("mpc", f"default{FULL}"),
             ("bc", f"default{FULL}"),
+            ("mpc", f"default{FULL}"),
             "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 1 and not any(d.holds and d.mean > 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 1 and not any(d.holds and d.mean < 0 for d in ds),
         ),
     ),
     Claim(
