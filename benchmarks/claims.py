@@ -821,7 +821,7 @@ CLAIMS = (
             ("madiff", f"default{SHIELD}"),
             ("madiff", f"own{SHIELD}"),
             "return",
-            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 1 and not any(d.holds and d.mean < 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 2 and not any(d.holds and d.mean < 0 for d in ds),
         ),
     ),
     Claim(
