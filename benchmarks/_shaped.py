@@ -66,6 +66,10 @@ class System(ParallelEnv):
         """(N, N − 1) who the others are."""
         return np.array([[j for j in range(self.n) if j != i] for i in range(self.n)])
 
+    def gaps(self, places):
+        """(N, N) how far each is from each; far from oneself."""
+        return _length(places[:, None] - places[None]) + 9 * np.eye(self.n)
+
     def _by_agent(self, rows):
         return {a: row.astype(np.float32) for a, row in zip(self.possible_agents, rows)}
 
@@ -187,12 +191,8 @@ class Carts(System):
         while True:
             self.p, self.goal = rng.uniform(-4, 4, (2, 4, 2))
             self.v = np.zeros((4, 2))
-            if min(self._gaps(self.p).min(), self._gaps(self.goal).min()) > 1:
+            if min(self.gaps(self.p).min(), self.gaps(self.goal).min()) > 1:
                 return
-
-    def _gaps(self, places):
-        """(N, N) how far each is from each; far from oneself."""
-        return _length(places[:, None] - places[None]) + 9 * np.eye(self.n)
 
     def seen(self):
         others = self.others()
@@ -211,7 +211,7 @@ class Meeting(Carts):
 
     def danger(self):
         gap = self.p[:, None] - self.p[None]
-        far = self._gaps(self.p)
+        far = self.gaps(self.p)
         closing = -(gap * (self.v[:, None] - self.v[None])).sum(-1) / far
         return bool((far - 0.4 < 1.2 * closing).any())
 
@@ -248,7 +248,7 @@ class Docks(Carts):
         self.goal = docks[rng.permutation(4)] + rng.normal(0, 1.0, 2)
 
     def danger(self):
-        return bool(((self._gaps(self.p).min(1) < self.near) & (_length(self.v) > self.slow)).any())
+        return bool(((self.gaps(self.p).min(1) < self.near) & (_length(self.v) > self.slow)).any())
 
     @classmethod
     def naive(cls, seen, state=None):
@@ -286,8 +286,7 @@ class Sprayers(System):
     def begin(self, rng):
         while True:
             self.p, self.goal = rng.uniform(-3.5, 3.5, (2, 4, 2))
-            gaps = [_length(x[:, None] - x[None]) + 9 * np.eye(4) for x in (self.p, self.goal)]
-            if min(gaps[0].min(), gaps[1].min()) > 1.2:
+            if min(self.gaps(self.p).min(), self.gaps(self.goal).min()) > 1.2:
                 break
         gap = self.goal - self.p
         self.heading = np.arctan2(gap[:, 1], gap[:, 0]) + rng.normal(0, 0.3, 4)
@@ -305,7 +304,7 @@ class Sprayers(System):
 
     def danger(self):
         gap = self.p[None] - self.p[:, None]
-        far = _length(gap) + 9 * np.eye(4)
+        far = self.gaps(self.p)
         ahead = (gap * self.looks()[:, None]).sum(-1) / far
         return bool(((far < self.far) & (ahead > np.cos(self.wide))).any())
 

@@ -197,16 +197,19 @@ def _own_speed(steps: _Steps, place: _Field) -> int | None:
 
 
 def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray | None = None) -> float:
-    """By what share of their changes places are off what speeds predict, in nine of ten steps, of all or `where`
-    (W, N, k); the seconds of a step are those that predict best."""
-    some = ... if where is None else where
-    change = steps.change(places)[some].ravel()
+    """By what share of their changes places are off what speeds predict, of all or `where` (W, N, k)."""
+    return _off(steps, steps.change(places)[... if where is None else where].ravel(), speeds, where)
+
+
+def _off(steps: _Steps, change: np.ndarray, speeds: Sequence[int], where: np.ndarray | None = None) -> float:
+    """By what share of changes (M,) they are off what speeds predict, in nine of ten steps; the seconds of a step are
+    those that predict best."""
     if not change.size:
         return 1.0
     least = np.quantile(np.abs(change), SHARE)
     found = [1.0]
     for rows in (steps.after, steps.before, 0.5 * (steps.after + steps.before)):
-        speed = rows[..., list(speeds)][some].ravel()
+        speed = rows[..., list(speeds)][... if where is None else where].ravel()
         moves = np.abs(speed) > np.median(np.abs(speed))
         if least > 0 and moves.any() and (dt := float(np.median(change[moves] / speed[moves]))) > 0:
             found.append(float(np.quantile(np.abs(change - dt * speed), SHARE) / least))
@@ -269,23 +272,11 @@ def _direction(steps: _Steps, rows: np.ndarray, velocity: np.ndarray, found: Map
 
 def _speed_ahead(steps: _Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:
     """The name of the entry that says how far bodies with a direction move (W N, 2) in a step, where there is one."""
-    length = np.linalg.norm(moved, axis=-1).reshape(steps.before.shape[:2])
-    found = {}
-    for entry in range(len(steps.deviation)):
-        if entry in named or not steps.varies(entry):
-            continue
-        for rows in (steps.after, steps.before):
-            speed = rows[..., entry]
-            moves = speed > np.median(speed)
-            if moves.any() and (dt := float(np.median(length[moves] / np.maximum(speed[moves], 1e-9)))) > 0:
-                found[entry] = min(found.get(entry, 1.0), _off(length, dt * speed))
-    best = min(found, key=found.__getitem__, default=None)
-    return {} if best is None or found[best] > LIKE else {best: "own.v"}
-
-
-def _off(moved: np.ndarray, predicted: np.ndarray) -> float:
-    """By what share of how far things move predictions are off, in nine of ten steps."""
-    return float(np.quantile(np.abs(moved - predicted), SHARE) / max(np.quantile(np.abs(moved), SHARE), 1e-12))
+    length = np.linalg.norm(moved, axis=-1)
+    free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
+    off = {e: _off(steps, length, [e]) for e in free}
+    best = min(off, key=off.__getitem__, default=None)
+    return {} if best is None or off[best] > LIKE else {best: "own.v"}
 
 
 def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]:

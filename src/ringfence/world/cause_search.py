@@ -75,9 +75,9 @@ def _best_grown(steps: Steps, names: Sequence[str]) -> list[Counted]:
 
 
 def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str]) -> list[Counted]:
-    """The causes, or those that are found with more that may be read of how near things are, where these tell more.
-    Aircraft are too near where they are near across and in height, vehicles where they are along and aside; or danger
-    is how soon they meet."""
+    """The causes, or those that are found with more that may be read, where these tell more. Aircraft are too near
+    where they are near across and in height, vehicles where they are along and aside, or near and fast; what is ahead
+    is in danger, or what would meet soon; or who is fast in some place."""
     if _tell_enough(steps, chosen):
         return chosen
     some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
