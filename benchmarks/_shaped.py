@@ -6,104 +6,8 @@ its README alone.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
-import gymnasium
 import numpy as np
-from pettingzoo import ParallelEnv
-
-from ringfence.logs.store import EpisodeStore
-
-CARE = (0.0, 0.5, 1.0)  # of the drivers who are logged
-
-
-class System(ParallelEnv):
-    """Agents who see rows of numbers, share a reward, and a cost where any of them is in danger."""
-
-    n: ClassVar[int]
-    steps: ClassVar[int]
-    dt: ClassVar[float]  # s
-    names: ClassVar[list[str]]  # of the numbers that each sees
-    actions: ClassVar[int]
-    noise: ClassVar[tuple[float, float]]  # of logged drivers: how much of it stays for a step, and how much comes
-
-    def __init__(self):
-        self.possible_agents = [f"agent_{i}" for i in range(self.n)]
-        self.metadata = {"name": type(self).__name__.lower(), "dt": self.dt}
-
-    def observation_space(self, agent):
-        return gymnasium.spaces.Box(-np.inf, np.inf, (len(self.names),))
-
-    def action_space(self, agent):
-        return gymnasium.spaces.Box(-1.0, 1.0, (self.actions,))
-
-    def reset(self, seed=None, options=None):
-        rng = np.random.default_rng(seed)
-        self.agents = list(self.possible_agents)
-        self.t = 0
-        self.begin(rng)
-        while self.danger():
-            self.begin(rng)
-        return self._by_agent(self.seen()), {a: {} for a in self.agents}
-
-    def step(self, actions):
-        reward, cost = self.moved(np.array([actions[a] for a in self.possible_agents]))
-        agents = self.agents
-        over = self.t >= self.steps
-        self.agents = [] if over else agents
-        seen = self._by_agent(self.seen())
-        rewards = {a: reward for a in agents}
-        infos = {a: {"cost": cost} for a in agents}
-        return seen, rewards, {a: False for a in agents}, {a: over for a in agents}, infos
-
-    def moved(self, actions):
-        """(reward, cost) of actions (N, A)."""
-        reward = self.move(np.clip(actions, -1, 1))
-        self.t += 1
-        return reward, float(self.danger())
-
-    def others(self):
-        """(N, N − 1) who the others are."""
-        return np.array([[j for j in range(self.n) if j != i] for i in range(self.n)])
-
-    def gaps(self, places):
-        """(N, N) how far each is from each; far from oneself."""
-        return _length(places[:, None] - places[None]) + 9 * np.eye(self.n)
-
-    def _by_agent(self, rows):
-        return {a: row.astype(np.float32) for a, row in zip(self.possible_agents, rows)}
-
-    @classmethod
-    def recorded(cls, episodes: int, seed: int) -> EpisodeStore:
-        """Logs of drivers who take care not at all, by half or fully, with noise."""
-        rng = np.random.default_rng(seed)
-        env = cls()
-        keep, more = cls.noise
-        kept = []
-        for _ in range(episodes):
-            care = rng.choice(CARE)
-            env.reset(seed=int(rng.integers(2**31)))
-            noise = np.zeros((cls.n, cls.actions))
-            rows, steps = [env.seen()], []
-            for _ in range(cls.steps):
-                noise = keep * noise + rng.normal(0, more, noise.shape)
-                action = np.clip(cls.careful(rows[-1], care) + noise, -1, 1)
-                steps.append((action, *env.moved(action)))
-                rows.append(env.seen())
-            kept.append((rows, *zip(*steps)))
-        observations, actions, rewards, costs = (np.array(x) for x in zip(*kept))
-        rewards = np.repeat(rewards[..., None], cls.n, -1)
-        about = {"task": cls.__name__.lower(), "observation_names": cls.names, "dt": cls.dt}
-        card = {**about, "provenance": "benchmarks/_shaped.py"}
-        return EpisodeStore.from_episodes(observations, actions, rewards, costs, card=card)
-
-
-def _length(vectors):
-    return np.sqrt((vectors**2).sum(-1))
-
-
-def _names(own: list[str], kind: str, others: int, each: list[str]) -> list[str]:
-    return own + [f"{kind}{k}_{e}" for k in range(others) for e in each]
+from _system import Carts, System, entries, length
 
 
 class Sector(System):
@@ -111,7 +15,7 @@ class Sector(System):
     height."""
 
     n, steps, dt, actions, noise = 4, 60, 5.0, 3, (0.85, 0.35)  # they turn, climb and accelerate
-    names = _names(
+    names = entries(
         ["x", "y", "altitude", "speed", "heading_sin", "heading_cos", "climb", "exit_dx", "exit_dy", "exit_dz"],
         "intruder",
         3,
@@ -148,13 +52,13 @@ class Sector(System):
         return bool(((np.hypot(gap[:, 0], gap[:, 1]) < self.across) & (gap[:, 2] < self.in_height)).any())
 
     def move(self, actions):
-        before = _length((self.exit - self.p)[:, :2])
+        before = length((self.exit - self.p)[:, :2])
         turn, climb, faster = actions.T
         self.heading = self.heading + self.turn * turn
         self.climb = self.climb + 0.6 * (self.climb_rate * climb - self.climb)
         self.speed = np.clip(self.speed + self.faster * faster, self.slowest, self.fastest)
         self.p = self.p + self.dt * self.velocity()
-        after = _length((self.exit - self.p)[:, :2])
+        after = length((self.exit - self.p)[:, :2])
         return float((before - after).mean() - 0.3 * np.abs(self.exit - self.p)[:, 2].mean())
 
     @classmethod
@@ -180,32 +84,6 @@ class Sector(System):
         return action
 
 
-class Carts(System):
-    """Carts in a square that push themselves along x and y."""
-
-    n, steps, dt, actions, noise = 4, 80, 0.1, 2, (0.9, 0.3)
-    names = _names(["x", "y", "vx", "vy", "to_goal_x", "to_goal_y"], "cart", 3, ["dx", "dy", "dvx", "dvy"])
-    push, fastest = 1.5, 1.5  # m/s², m/s along each axis
-
-    def begin(self, rng):
-        while True:
-            self.p, self.goal = rng.uniform(-4, 4, (2, 4, 2))
-            self.v = np.zeros((4, 2))
-            if min(self.gaps(self.p).min(), self.gaps(self.goal).min()) > 1:
-                return
-
-    def seen(self):
-        others = self.others()
-        relative = [self.p[others] - self.p[:, None], self.v[others] - self.v[:, None]]
-        return np.concatenate([self.p, self.v, self.goal - self.p, np.concatenate(relative, -1).reshape(self.n, -1)], 1)
-
-    def move(self, actions):
-        before = _length(self.goal - self.p)
-        self.v = np.clip(self.v + self.dt * self.push * actions, -self.fastest, self.fastest)
-        self.p = self.p + self.dt * self.v
-        return float((before - _length(self.goal - self.p)).mean())
-
-
 class Meeting(Carts):
     """Too near where two would be 0.4 m apart within 1.2 s, at the speed at which they come nearer."""
 
@@ -225,7 +103,7 @@ class Meeting(Carts):
         """Away from who is near, and past them on the right."""
         action = cls.naive(seen)
         offset = seen[:, 6:].reshape(4, 3, 4)[..., :2]
-        far = _length(offset)[..., None]
+        far = length(offset)[..., None]
         aside = np.stack([-offset[..., 1], offset[..., 0]], -1) / far
         away = -2 * (2 - far) * offset / far + 0.8 * aside
         return action + care * np.where(far < 2, away, 0.0).sum(1)
@@ -235,7 +113,7 @@ class Docks(Carts):
     """Docks that lie together: who is within 2 m of another may drive no faster than 0.5 m/s."""
 
     steps, dt, noise = 80, 0.2, (0.85, 0.12)
-    names = _names(
+    names = entries(
         ["px", "py", "velocity_x", "velocity_y", "dock_dx", "dock_dy"], "cart", 3, ["dx", "dy", "dvx", "dvy"]
     )
     near, slow = 2.0, 0.5
@@ -248,25 +126,18 @@ class Docks(Carts):
         self.goal = docks[rng.permutation(4)] + rng.normal(0, 1.0, 2)
 
     def danger(self):
-        return bool(((self.gaps(self.p).min(1) < self.near) & (_length(self.v) > self.slow)).any())
+        return bool(((self.gaps(self.p).min(1) < self.near) & (length(self.v) > self.slow)).any())
 
     @classmethod
     def naive(cls, seen, state=None):
         """To the dock, as fast as it can stop there."""
-        return cls._driven(seen, 1.4)
+        return cls.driven(seen, 1.4)
 
     @classmethod
     def careful(cls, seen, care):
         """Slower where somebody is near."""
-        near = _length(seen[:, 6:].reshape(4, 3, 4)[..., :2]).min(1) < cls.near + 0.8
-        return cls._driven(seen, np.where(near, 0.3 + (1 - care) * 1.1, 1.4)[:, None])
-
-    @classmethod
-    def _driven(cls, seen, fastest):
-        gap = seen[:, 4:6]
-        far = _length(gap)[:, None]
-        wanted = gap / np.maximum(far, 1e-6) * np.minimum(fastest, np.sqrt(1.5 * far))
-        return np.clip(0.5 * (wanted - seen[:, 2:4]) / (cls.dt * cls.push), -1, 1)
+        near = length(seen[:, 6:].reshape(4, 3, 4)[..., :2]).min(1) < cls.near + 0.8
+        return cls.driven(seen, np.where(near, 0.3 + (1 - care) * 1.1, 1.4)[:, None])
 
 
 class Sprayers(System):
@@ -274,7 +145,7 @@ class Sprayers(System):
     another looks."""
 
     n, steps, dt, actions, noise = 4, 80, 0.1, 2, (0.9, 0.25)  # they turn and accelerate
-    names = _names(
+    names = entries(
         ["x", "y", "speed", "heading_cos", "heading_sin", "plant_dx", "plant_dy"],
         "robot",
         3,
@@ -309,11 +180,11 @@ class Sprayers(System):
         return bool(((far < self.far) & (ahead > np.cos(self.wide))).any())
 
     def move(self, actions):
-        before = _length(self.goal - self.p)
+        before = length(self.goal - self.p)
         self.heading = self.heading + self.dt * self.turn * actions[:, 0]
         self.speed = np.clip(self.speed + self.dt * self.push * actions[:, 1], 0.0, self.fastest)
         self.p = self.p + self.dt * self.speed[:, None] * self.looks()
-        return float((before - _length(self.goal - self.p)).mean())
+        return float((before - length(self.goal - self.p)).mean())
 
     @classmethod
     def naive(cls, seen, state=None):
@@ -337,7 +208,4 @@ class Sprayers(System):
     def _off(seen, gap):
         """By what angle (N,) something is to the left of where one looks, and how far away."""
         off = np.arctan2(gap[:, 1], gap[:, 0]) - np.arctan2(seen[:, 4], seen[:, 3])
-        return (off + np.pi) % (2 * np.pi) - np.pi, _length(gap)
-
-
-SYSTEMS = {cls.__name__.lower(): cls for cls in (Sector, Meeting, Docks, Sprayers)}
+        return (off + np.pi) % (2 * np.pi) - np.pi, length(gap)

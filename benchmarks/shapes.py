@@ -1,5 +1,6 @@
 """Danger that is no distance alone: a naive driver and a clone of the logs, alone and under a shield, by a World whose
-causes may read more than that, and by one whose may not. Systems are those of _shaped.py.
+causes may read more than that, and by one whose may not. Systems are those of _shaped.py,
+_shaped_more.py and _shaped_last.py.
 
     python benchmarks/shapes.py                    # of all; fifteen minutes a system
     python benchmarks/shapes.py docks --seed 11    # of some, by other logs
@@ -17,7 +18,10 @@ from pathlib import Path
 from unittest import mock
 
 from _rows import append, read
-from _shaped import SYSTEMS, System
+from _shaped import Docks, Meeting, Sector, Sprayers
+from _shaped_last import Downwash, Pickers, Swarm
+from _shaped_more import Bikes, Boats, Crowd, Depot, Junction, Persons
+from _system import System
 from readme import put
 
 import ringfence
@@ -29,6 +33,9 @@ OUT = ROOT / "results" / "shapes.csv"
 LOGGED, EPISODES, SEED = 600, 100, 10
 HEAD = ("system", "seed", "driver", "causes", "verdict", "found", "guard")
 HEAD += ("episodes", "return", "violated", "bound", "infeasible")
+LED = (Sector, Meeting, Docks, Sprayers, Persons, Crowd, Boats, Bikes, Depot, Junction)
+SYSTEMS: tuple[type[System], ...] = (*LED, Downwash, Pickers, Swarm)
+NAMED = {cls.__name__.lower(): cls for cls in SYSTEMS}
 WITH, WITHOUT = "more shapes", "no more shapes"
 
 
@@ -41,7 +48,7 @@ def without_more_shapes():
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("systems", nargs="*", help=", ".join(SYSTEMS))
+    parser.add_argument("systems", nargs="*", help=", ".join(NAMED))
     parser.add_argument("--seed", type=int, default=SEED, help="of the logs")
     parser.add_argument("--table", action="store_true", help="make no rows")
     given = parser.parse_args()
@@ -49,8 +56,8 @@ def main() -> None:
     if given.table:
         put("docs/proving-ground.md", "shapes", table())
         return
-    for name in given.systems or SYSTEMS:
-        made(name, SYSTEMS[name], given.seed)
+    for name in given.systems or NAMED:
+        made(name, NAMED[name], given.seed)
 
 
 def made(name: str, system: type[System], seed: int) -> None:
@@ -87,7 +94,7 @@ def table() -> str:
         "| logs | who acts | no guard | shield, without more shapes | shield |",
         "|---|---|---|---|---|",
     ]
-    for name, seed in sorted({key[:2] for key in rows}, key=lambda of: (list(SYSTEMS).index(of[0]), int(of[1]))):
+    for name, seed in sorted({key[:2] for key in rows}, key=lambda of: (list(NAMED).index(of[0]), int(of[1]))):
         for driver in ("naive", "clone"):
             of = ((WITH, "none"), (WITHOUT, "shield"), (WITH, "shield"))
             each = [rows.get((name, seed, driver, *one)) for one in of]

@@ -109,28 +109,35 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
         ("soon", "other.distance less 1.5 times how fast it shrinks"),
         ("fast", "other.distance while length of own.vx, own.vy is high"),
         ("seen", "other.distance ahead"),
+        ("ahead", "other.distance ahead"),
         ("head-on", "other.distance while how fast it shrinks is high"),
         ("strip", "own.x, length of own.vx, own.vy"),
+        ("crowded", "other.distance of the second nearest"),
+        ("lost", "other.distance of the nearest"),
     ],
 )
 def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
-    """How soon bodies meet, who is near and fast, what is in sight, who comes fast, or is fast somewhere: no entry
-    tells it alone, nor a distance."""
+    """How soon bodies meet, who is near and fast, what is in sight, or where one drives, who comes fast, is fast
+    somewhere, crowded or alone: no entry tells it alone, nor a distance."""
     rng = np.random.default_rng(0)
     offset, velocity = rng.normal(0, 15, (9000, N, N - 1, 2)), rng.normal(0, 4, (9000, N, N - 1, 2))
     own, heading = rng.normal(0, 4, (9000, N, 2)), rng.uniform(-np.pi, np.pi, (9000, N))
     place, fast = rng.uniform(-9, 9, (9000, N)), np.linalg.norm(own, axis=-1) > 3
     far = np.linalg.norm(offset, axis=-1)
-    away = np.arctan2(offset[..., 1], offset[..., 0]) - heading[..., None]
+    where = np.arctan2(offset[..., 1], offset[..., 0])
+    away, off = where - heading[..., None], where - np.arctan2(own[..., 1], own[..., 0])[..., None]
     closing = -(offset * velocity).sum(-1) / far
     unsafe = {
         "soon": far < 1.5 * closing,
         "fast": (far < 5) & fast[..., None],
         "seen": (far < 8) & (np.cos(away) > 0.7),
+        "ahead": (far < 8) & (np.cos(off) > 0.7),
         "head-on": (far < 12) & (closing > 3),
         "strip": ((place > 6) & fast)[..., None],
+        "crowded": (np.sort(far, -1)[..., 1] < 9)[..., None],
+        "lost": (far.min(-1) > 25)[..., None],
     }[what]
-    names = ["own.x", "own.vx", "own.vy", "own.cos", "own.sin"]
+    names = ["own.x", "own.vx", "own.vy", *(["own.cos", "own.sin"] if what != "ahead" else ["obs3", "obs4"])]
     names += [f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy", "dvx", "dvy")]
     looks = np.stack([np.cos(heading), np.sin(heading)], -1)
     others = np.concatenate([offset, velocity], -1).reshape(9000, N, -1)
@@ -141,8 +148,10 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     at = found.edges[0].at
     if what == "soon":
         assert at is not None and abs(at) < 0.1
+    elif what in ("crowded", "lost"):
+        assert abs(at - {"crowded": 9, "lost": 25}[what]) < 0.1 and found.edges[0].below == (what == "crowded")
     elif what != "strip":  # what is in one number has two edges
-        near, second = {"fast": (5.0, 3.0), "seen": (8.0, np.arccos(0.7)), "head-on": (12.0, 3.0)}[what]
+        near, second = {"fast": (5.0, 3.0), "head-on": (12.0, 3.0)}.get(what, (8.0, np.arccos(0.7)))
         assert abs(at - near) < 0.1 and abs(found.causes[0].second_edge(at) - second) < 0.05
     np.testing.assert_allclose(found.causes[0].of(x), values_of(found.causes[0], jnp.asarray(x)), rtol=1e-3, atol=1e-3)
     here = jnp.zeros((N, x.shape[-1]))

@@ -152,6 +152,24 @@ def test_names_that_say_nothing_of_whose_an_entry_is_give_way():
     assert inferred_names(x, half, first) == half
 
 
+def test_things_are_called_as_given_names_call_them():
+    """So that things of a kind, which they number, are of one; a name that says nothing, or not enough, is none."""
+    x, true, first = team()
+    post = np.random.default_rng(1).normal(size=(1, 1, 2)) + x[..., [3, 4]]
+    x = np.concatenate([x, post], -1)
+
+    def named(goal: tuple[str, str], other: tuple[str, str]) -> tuple[str, ...]:
+        given = ["column"] * 3 + [*goal] + [f"seen {d}" for d in range(5, len(true))] + [*other]
+        found = inferred_names(x, given, first)
+        return (*found[3:5], *found[-2:])
+
+    still = ("still_a.dx", "still_a.dy", "still_b.dx", "still_b.dy")
+    assert named(("post_0_dx", "post_0_dy"), ("post1X", "post1Y")) == ("post0.dx", "post0.dy", "post1.dx", "post1.dy")
+    assert named(("to_goal_x", "to_goal_y"), ("obs7", "obs8")) == ("to_goal.dx", "to_goal.dy", *still[2:])
+    assert named(("goal_x", "goal_y"), ("goal_dx", "goal_dy")) == still
+    assert named(("other_0_dx", "other_0_dy"), ("dx", "dy"))[2:] == still[2:]
+
+
 def test_the_card_says_which_names_were_inferred_and_a_formula_reads_them(own_store):
     bare = dataclasses.replace(own_store, card=own_store.card.updated(observation_names=None))
     world = worlds.fit(bare, labels="formula", **QUICK_WORLD)

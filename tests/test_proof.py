@@ -151,8 +151,8 @@ def test_braking_ends_in_standing(guarded, present):
 
 
 def test_causes_are_bounded_too():
-    """Distances with one edge and several, of a length, of one with an axis apart and of an entry, and networks of
-    causes of two numbers: all together, and each."""
+    """Distances with one edge and several, of a length, of one with an axis apart, of the second nearest and of an
+    entry, and networks of causes of two numbers: all together, and each."""
     length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
     entry = Cause("own.x", ((4,),))
     pair = Cause("own.x, own.y", ((4, 5),))
@@ -172,9 +172,11 @@ def test_causes_are_bounded_too():
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)
     box = with_an_axis_apart(length, 1, 2.0)
+    second_nearest = Cause("other.distance of the second nearest", ((0, 1, 2, 3),), length=True, nearest=(2, 2))
     nets = (
         Distance(jnp.array([0.4]), jnp.array(1.2), jnp.array(0.3), length, edge),
         Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), box, edge),
+        Distance(jnp.array([0.9]), jnp.array(1.2), jnp.array(0.3), second_nearest, edge),
         *(
             Distance(jnp.array([0.6]), jnp.array(1.2), jnp.array(0.3), in_one_number(one, how, 0.8, 0.7), edge)
             for one, how in second

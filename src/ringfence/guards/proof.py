@@ -27,6 +27,7 @@ from ringfence.world.causes import Cause
 from ringfence.world.dynamics import Dynamics
 
 EXACT = ("seen",)  # entries that are no measurements, by the ends of their names
+SHORT = 0.01  # length of a vector that may point anywhere, for all that a bound says
 ROUNDING = 1e-5
 
 
@@ -312,18 +313,33 @@ def _beside_bounds(offset: Array, radius: Array, other: Array, spread: Array) ->
 
 def _turned_bounds(offset: Array, radius: Array, direction: Array, spread: Array) -> tuple[Array, Array]:
     """Likewise of how far ahead and to the left things are of who looks into a direction."""
-    if direction.shape[-1] == 1:  # an angle; neither cosine nor sine changes faster
-        direction = jnp.concatenate([jnp.cos(direction), jnp.sin(direction)], -1)
-        spread = jnp.concatenate([spread, spread], -1)
+    angle, turns = direction[..., 0], spread[..., 0]
+    if direction.shape[-1] > 1:
+        angle, turns = _angle_bounds(direction, spread)
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    across, back = jnp.sin(jnp.minimum(turns, np.pi / 2)), 1.0 - jnp.cos(jnp.minimum(turns, np.pi))
+    by_cos = jnp.abs(sin) * across + jnp.abs(cos) * back
+    by_sin = jnp.abs(cos) * across + jnp.abs(sin) * back
     x, y = offset[..., 0], offset[..., 1]
-    cos, sin = direction[..., 0], direction[..., 1]
     center = jnp.stack([x * cos + y * sin, y * cos - x * sin], -1)
     wide, high = radius[..., 0], radius[..., 1]
-    by_cos, by_sin = spread[..., 0], spread[..., 1]
     ahead = jnp.abs(x) * by_cos + wide * (jnp.abs(cos) + by_cos) + jnp.abs(y) * by_sin + high * (jnp.abs(sin) + by_sin)
     left = jnp.abs(y) * by_cos + high * (jnp.abs(cos) + by_cos) + jnp.abs(x) * by_sin + wide * (jnp.abs(sin) + by_sin)
     off = jnp.stack([ahead, left], -1)
     return center, off + ROUNDING * (1.0 + jnp.abs(center) + off)
+
+
+def _angle_bounds(direction: Array, spread: Array) -> tuple[Array, Array]:
+    """The angle in the middle of boxes of vectors, and by how much others in them are off it at most: at a corner, or
+    by anything where a box has vectors of next to no length."""
+    middle = jnp.arctan2(direction[..., 1], direction[..., 0])
+    off = jnp.zeros_like(middle)
+    for signs in np.ndindex(2, 2):
+        corner = direction + spread * (2.0 * np.array(signs) - 1.0)
+        turned = jnp.arctan2(corner[..., 1], corner[..., 0]) - middle
+        off = jnp.maximum(off, jnp.abs((turned + np.pi) % (2 * np.pi) - np.pi))
+    short = _length_bounds(direction, spread)[0] < SHORT
+    return middle, jnp.where(short, np.pi, off) + ROUNDING
 
 
 def _with_vector_bounds(entries: Array, radius: Array, also: Array, spread: Array) -> tuple[Array, Array]:

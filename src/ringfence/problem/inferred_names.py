@@ -27,6 +27,7 @@ LESS = 0.5  # of a change that is left of that of a velocity relative to one's o
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
 AXES = "xyz"
 SAID = re.compile(r"own\.|other\d+\.")
+MEANING = ("own", "other", "agent", "obs", "state")  # words that name something else, or nothing
 
 
 @dataclass
@@ -63,6 +64,7 @@ def inferred_names(
     found |= dict(_still(steps, moving, set(found)))
     found |= _heading(steps, found)
     found |= dict(_things(steps, found))
+    found |= _as_given(found, names)
     return tuple(name if name in keep else found.get(entry, name) for entry, name in enumerate(names))
 
 
@@ -299,6 +301,39 @@ def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]
         for axis, (place, speed) in zip(AXES, entries):
             yield place, f"thing_{letter}.d{axis}"
             yield speed, f"thing_{letter}.dv{axis}"
+
+
+def _as_given(found: Mapping[int, str], names: Sequence[str]) -> dict[int, str]:
+    """Names of things that stand still or move by themselves, as given ones call them: `person0.dx` and `person0.dy`
+    for `person0_dx` and `person0_dy`, so that several persons are of one kind. Without those whose names say nothing,
+    or the same as another's."""
+    entries: dict[str, list[int]] = {}
+    for entry, name in found.items():
+        if re.match(r"(still|thing)_", name):
+            entries.setdefault(name.split(".")[0], []).append(entry)
+    called = {thing: _common_words([names[entry] for entry in of]) for thing, of in entries.items()}
+    taken = list(called.values())
+    return {
+        entry: found[entry].replace(thing, word)
+        for thing, word in called.items()
+        for entry in entries[thing]
+        if word and taken.count(word) == 1
+    }
+
+
+def _common_words(names: Sequence[str]) -> str:
+    """What names have in common but for their axes, with a number at the end if they have one: "" where that is no
+    word, or means something else."""
+    split = [[part.lower() for part in re.findall(r"[A-Z]?[a-z]+|[A-Z]+|\d+", name)] for name in names]
+    if len({len(parts) for parts in split}) > 1:
+        return ""
+    alike = [parts[0] for parts in zip(*split) if len(set(parts)) == 1]
+    words = [part for part in alike if not part.isdigit()]
+    numbers = [part for part in alike if part.isdigit()]
+    apart = [part for parts in zip(*split) if len(set(parts)) > 1 for part in parts]
+    if not words or len(numbers) > 1 or any(part.isdigit() for part in apart) or words[0] in MEANING:
+        return ""
+    return "".join(words) + numbers[0] if numbers else "_".join(words)
 
 
 def _is_relative(steps: _Steps, entry: int, own: int) -> bool:

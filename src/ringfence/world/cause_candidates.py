@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
@@ -11,7 +12,9 @@ from ringfence.problem.features import numbered
 from ringfence.world.causes import Cause, narrowed
 
 WIDEST = 4  # entries of one cause
-DIRECTIONS = (("own.cos", "own.sin"), ("own.heading",), ("own.yaw",), ("own.theta",))  # that one looks into
+# That one looks into; who has no such entry looks to where he moves.
+DIRECTIONS = (("own.cos", "own.sin"), ("own.heading",), ("own.yaw",), ("own.theta",), ("own.vx", "own.vy"))
+ORDINALS = ("", "second ", "third ", "fourth ", "fifth ", "sixth ")  # nearest of several things, that causes read
 
 
 def candidates(names: Sequence[str]) -> Iterator[Cause]:
@@ -38,7 +41,7 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
     looks into a direction."""
     found = []
     own = _own(names)
-    for kind, each in things_of(names).items():
+    for kind, each in (things_of(names) | _lone_things(names)).items():
         axes = [c for c in "xyz" if f"d{c}" in each[0]]
         if not axes:
             continue
@@ -52,12 +55,23 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
             direction = _picked([own] * len(each), looks)
             found.append(replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned"))
         theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
-        for fields in ([own] * len(each), theirs):
+        mine = {name: d for name, d in own.items() if d not in each[0].values()}
+        for fields in ([mine] * len(each), theirs):
             for group in _numbers(list(fields[0])):
                 number = ("length of " if len(group) > 1 else "") + ", ".join(group)
                 name = f"{kind}.distance, {number}"
                 found.append(replace(offset, name=name, also=_picked(fields, group), how="beside"))
     return found
+
+
+def of_several(names: Sequence[str]) -> Iterator[Cause]:
+    """How far away the nearest of several things is, the second nearest, and so on: who is crowded, or alone."""
+    for cause in offsets(names):
+        count = len(cause.things)
+        kind = cause.name.removeprefix("length of ").split(".")[0]
+        for k, ordinal in enumerate(ORDINALS[:count] if count > 1 else (), 1):
+            name = f"{kind}.distance of the {ordinal}nearest"
+            yield replace(cause, name=name, things=(sum(cause.things, ()),), nearest=(k, count))
 
 
 def with_vectors(names: Sequence[str]) -> Iterator[Cause]:
@@ -109,6 +123,15 @@ def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
         shared = set.intersection(*[set(fields) for fields in things])
         if shared:
             kinds[kind] = [{f: d for f, d in fields.items() if f in shared} for fields in things]
+    return kinds
+
+
+def _lone_things(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
+    """Likewise things that no number tells from others of their kind, e.g. a goal: each is a kind of one."""
+    kinds: dict[str, list[dict[str, int]]] = {}
+    for d, name in enumerate(names):
+        if match := re.fullmatch(r"([a-z_]+)\.(dv?[xyz])", name):
+            kinds.setdefault(match[1], [{}])[0][match[2]] = d
     return kinds
 
 

@@ -80,8 +80,8 @@ def values_of(cause: Cause, x: Array) -> Array:
     also = x[..., np.array(cause.also)] if cause.also else None
     if not cause.length:
         return jnp.stack(SEVERAL[cause.how](read, also), -1) if cause.also else read
-    lengths = [jnp.sqrt((part**2).sum(-1, keepdims=True) + 1e-9) for part in cause.parts(read)]
-    return cause.in_one(lengths + cause.second(read, also))
+    lengths = [jnp.sqrt((part**2).sum(-1) + 1e-9) for part in cause.parts(read)]
+    return cause.in_one(lengths + cause.second(read, also))[..., None]
 
 
 def scores(net: Score, x: Array) -> Array:

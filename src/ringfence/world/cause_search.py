@@ -19,7 +19,14 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.cause_candidates import candidates, offsets, wider, with_distances, with_vectors
+from ringfence.world.cause_candidates import (
+    candidates,
+    of_several,
+    offsets,
+    wider,
+    with_distances,
+    with_vectors,
+)
 from ringfence.world.cause_counts import Counted, Explained, Steps, counted, gain, likelihood, some_steps
 from ringfence.world.cause_edges import least_wrong, refined, within
 from ringfence.world.cause_siblings import siblings
@@ -27,7 +34,7 @@ from ringfence.world.causes import Cause, Found, in_one_number, narrowed, only_o
 from ringfence.world.cells import Cells
 from ringfence.world.readings import How
 
-VERSION = 19  # of the search: what was found by another is looked for again
+VERSION = 20  # of the search: what was found by another is looked for again
 MOST = 8  # causes
 SIMPLER = 0.02  # share of a gain that a simpler cause may lack
 LEAST_GAIN = 0.002  # of the likelihood that there is to win
@@ -82,7 +89,8 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str])
         return chosen
     some = steps.part(np.arange(len(steps.x)) % max(1, len(steps.x) // RATIO_STEPS) == 0)
     apart = [_axis_apart(some, one, axis) for one in _about_whom(steps, offsets(names)) for axis in _axes_apart(one)]
-    shapes = [*apart, *_about_whom(steps, [*with_distances(names), *with_vectors(names)])]
+    several = [one for one in _about_whom(steps, of_several(names)) if _is_of_several(steps, one)]
+    shapes = [*apart, *_about_whom(steps, [*with_distances(names), *with_vectors(names)]), *several]
     found = _added(steps, [], [*_about_whom(steps, candidates(names)), *shapes])
     found = _pruned(steps, list({one.cause: one for one in reversed(found)}.values())[::-1])
     if not {one.cause for one in found} & set(shapes):
@@ -93,6 +101,14 @@ def _with_more_shapes(steps: Steps, chosen: list[Counted], names: Sequence[str])
     more, error = gain(steps, Explained.by(steps, chosen), Explained.by(steps, found).safe)
     less = gain(steps, Explained.by(steps, found), Explained.by(steps, chosen).safe)[0]
     return found if more - less > SURE * error else chosen
+
+
+def _is_of_several(steps: Steps, cause: Cause) -> bool:
+    """Whether the distance of the k-th nearest tells what that of each does not: that of the nearest does so where it
+    is dangerous to be far from all, and that of the farthest where it is to be near all."""
+    k, count = cause.nearest or (0, 0)
+    below = counted(steps, cause, Explained.by(steps, [])).cells.edge.below
+    return k > 1 if below else k < count
 
 
 def _tell_enough(steps: Steps, chosen: list[Counted]) -> bool:
@@ -316,7 +332,7 @@ def _simplest(steps: Steps, pool: Sequence[Cause], explained: Explained, pure: f
 
 def _complexity(cause: Cause) -> tuple[int, bool, bool, bool]:
     """Of causes that tell as much, the one of which this is least is taken."""
-    return cause.width, not cause.length, cause.apart is not None, bool(cause.who)
+    return cause.width, not cause.length, cause.apart is not None or cause.nearest is not None, bool(cause.who)
 
 
 def _gain_if(steps: Steps, one: Counted, pure: float) -> float:

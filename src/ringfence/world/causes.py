@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from ringfence.world.readings import SEVERAL, How, in_one, second
+from ringfence.world.readings import SEVERAL, How, in_one, second, shortest
 
 
 class Cause(msgspec.Struct, frozen=True):
@@ -23,6 +23,9 @@ class Cause(msgspec.Struct, frozen=True):
     # so that what is nearer is in a cylinder, or in a box.
     apart: int | None = None
     ratio: float = 1.0
+    # Of a length whose entries are those of several things: (k, how many), the k-th shortest of theirs counts. Who is
+    # crowded has a second one near, and who is lost has nobody.
+    nearest: tuple[int, int] | None = None
     # (J, m) entries that are read together with those of `things`, and how: as several numbers, or of a length in one.
     also: tuple[tuple[int, ...], ...] = ()
     how: How = ""
@@ -50,7 +53,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_distance(self) -> bool:
         """Whether it reads how far something is, or how long, and nothing else."""
-        return self.length and not self.also
+        return self.length and not self.also and self.nearest is None
 
     def of(self, x: np.ndarray) -> np.ndarray:
         """(..., J, width) what it reads of features (..., D)."""
@@ -58,15 +61,18 @@ class Cause(msgspec.Struct, frozen=True):
         also = x[..., np.array(self.also)] if self.also else None
         if not self.length:
             return np.stack(SEVERAL[self.how](read, also), -1) if self.also else read
-        lengths = [np.sqrt((part**2).sum(-1, keepdims=True)) for part in self.parts(read)]
-        return self.in_one(lengths + self.second(read, also))
+        lengths = [np.sqrt((part**2).sum(-1)) for part in self.parts(read)]
+        return self.in_one(lengths + self.second(read, also))[..., None]
 
     def second(self, read: Any, also: Any) -> list[Any]:
         """Of a length, what it reads of other entries (..., m), NumPy's or JAX's, if it reads any."""
-        return [second(self.how, read, also, self.end)[..., None]] if self.also else []
+        return [second(self.how, read, also, self.end)] if self.also else []
 
     def parts(self, read: Any) -> list[Any]:
-        """Of a length: the entries (..., k) of each vector of which the longest counts."""
+        """Of a length: the entries (..., k) of each vector of which the longest counts; of several things (..., K, k)
+        those of all."""
+        if self.nearest is not None:
+            return [read.reshape(*read.shape[:-1], self.nearest[1], -1)]
         if self.apart is None:
             return [read]
         rest = [k for k in range(len(self.things[0])) if k != self.apart]
@@ -74,6 +80,8 @@ class Cause(msgspec.Struct, frozen=True):
 
     def in_one(self, lengths: Sequence[Any]) -> Any:
         """Of the lengths of its parts, or of a length and a second number, NumPy's or JAX's: what it reads."""
+        if self.nearest is not None:
+            return shortest(lengths[0], self.nearest[0])
         if len(lengths) == 1:
             return lengths[0]
         one, other = lengths

@@ -75,7 +75,7 @@ def _curve(net: Score, unit: float) -> Probe:
     """Scores of a cause that reads one number, along it; of a distance from 0 to well beyond where danger begins."""
     edge = net.edge
     reach = 0.25 * (edge.high[0] - edge.low[0])
-    low = max(0.0, edge.low[0] - reach) if net.cause.is_distance else edge.low[0] - reach
+    low = max(0.0, edge.low[0] - reach) if net.cause.first_is_distance else edge.low[0] - reach
     high = edge.high[0] + reach
     if net.cause.is_distance and edge.at:
         low, high = 0.0, min(high, FARTHEST * edge.at)

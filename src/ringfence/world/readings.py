@@ -27,12 +27,15 @@ def beside(offset: Any, also: Any) -> tuple[Any, Any]:
 
 
 def turned(offset: Any, direction: Any) -> tuple[Any, Any]:
-    """How far ahead of who looks into a direction, (cos, sin) or an angle, things are, and how far to the left."""
+    """How far ahead of who looks into a direction, a vector or an angle, things are, and how far to the left."""
     x, y = offset[..., 0], offset[..., 1]
     cos, sin = direction[..., 0], direction[..., -1]
     if direction.shape[-1] == 1:
         numbers = _numbers_of(direction)
         cos, sin = numbers.cos(cos), numbers.sin(sin)
+    else:
+        long = _length(direction)
+        cos, sin = cos / long, sin / long
     return x * cos + y * sin, y * cos - x * sin
 
 
@@ -65,6 +68,11 @@ def in_one(how: How, distance: Any, other: Any, ratio: float) -> Any:
     if how == "soon":
         return distance - ratio * other
     return _numbers_of(distance).maximum(distance, ratio * other)
+
+
+def shortest(lengths: Any, k: int) -> Any:
+    """(...,) the k-th shortest of lengths (..., K)."""
+    return _numbers_of(lengths).sort(lengths, axis=-1)[..., k - 1]
 
 
 def _length(vectors: Any) -> Any:
