@@ -793,13 +793,24 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
-        "a little less on one tier",
+        "less on one. A zero proposal",
+        SPREAD,
+        tested(
+            ("icbf", f"split{FULL}"),
+            ("bc", f"default{FULL}"),
+            "return",
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 1,
+        ),
+    ),
+    Claim(
+        "docs/attribution.md",
+        "A zero proposal (`mpc`) earns less on three",
         SPREAD,
         tested(
             ("bc", f"default{FULL}"),
             ("mpc", f"default{FULL}"),
             "return",
-            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 1 and not any(d.holds and d.mean < 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 3 and not any(d.holds and d.mean < 0 for d in ds),
         ),
     ),
     Claim(
