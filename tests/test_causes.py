@@ -107,6 +107,7 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     "what, name",
     [
         ("soon", "other.distance less 1.5 times how fast it shrinks"),
+        ("braking", "post.distance less 1.5 times how fast it shrinks"),
         ("fast", "other.distance while length of own.vx, own.vy is high"),
         ("seen", "other.distance ahead"),
         ("ahead", "other.distance ahead"),
@@ -117,8 +118,8 @@ def test_danger_may_be_a_box_or_a_cylinder(axes):
     ],
 )
 def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
-    """How soon bodies meet, who is near and fast, what is in sight, or where one drives, who comes fast, is fast
-    somewhere, crowded or alone: no entry tells it alone, nor a distance."""
+    """How soon bodies meet, or what stands still, who is near and fast, what is in sight, or where one drives, who
+    comes fast, is fast somewhere, crowded or alone: no entry tells it alone, nor a distance."""
     rng = np.random.default_rng(0)
     offset, velocity = rng.normal(0, 15, (9000, N, N - 1, 2)), rng.normal(0, 4, (9000, N, N - 1, 2))
     own, heading = rng.normal(0, 4, (9000, N, 2)), rng.uniform(-np.pi, np.pi, (9000, N))
@@ -129,6 +130,7 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     closing = -(offset * velocity).sum(-1) / far
     unsafe = {
         "soon": far < 1.5 * closing,
+        "braking": far < 1.5 * (offset * own[..., None, :]).sum(-1) / far,
         "fast": (far < 5) & fast[..., None],
         "seen": (far < 8) & (np.cos(away) > 0.7),
         "ahead": (far < 8) & (np.cos(off) > 0.7),
@@ -139,6 +141,8 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     }[what]
     names = ["own.x", "own.vx", "own.vy", *(["own.cos", "own.sin"] if what != "ahead" else ["obs3", "obs4"])]
     names += [f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy", "dvx", "dvy")]
+    if what == "braking":
+        names = [name.replace("other", "post").replace(".dv", ".obs") for name in names]
     looks = np.stack([np.cos(heading), np.sin(heading)], -1)
     others = np.concatenate([offset, velocity], -1).reshape(9000, N, -1)
     x = np.concatenate([place[..., None], own, looks, others], -1).astype(np.float32)
@@ -146,7 +150,7 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     assert [cause.name for cause in found.causes] == [name]
     assert found.explained > 0.9 and found.false_alarms < 0.03
     at = found.edges[0].at
-    if what == "soon":
+    if what in ("soon", "braking"):
         assert at is not None and abs(at) < 0.1
     elif what in ("crowded", "lost"):
         assert abs(at - {"crowded": 9, "lost": 25}[what]) < 0.1 and found.edges[0].below == (what == "crowded")

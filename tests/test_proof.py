@@ -160,6 +160,7 @@ def test_causes_are_bounded_too():
     both = [Cause(f"other.distance, {how}", things, also=own, how=how) for how in ("nearing", "beside", "turned")]
     both.append(Cause("other.distance, an entry", things, also=((4,), (4,)), how="beside"))
     both.append(Cause("other.distance, an angle", things, also=((4,), (4,)), how="turned"))
+    both.append(Cause("post.distance, nearing", things, also=own, how="nearing", against=True))
     vector = Cause("own.x, length", ((4,),), also=((0, 1),), how="vector")
     second = [
         (both[0], "soon"),
@@ -168,6 +169,7 @@ def test_causes_are_bounded_too():
         (both[1], "low"),
         (both[2], "ahead"),
         (both[3], "high"),
+        (both[5], "soon"),
     ]
     edge = Edge((0.0,), (3.0,), bounds=(0.5,), inside=True)
     walls = Edge((-2.0,), (2.0,), bounds=(-1.0, 1.0), inside=True)

@@ -386,7 +386,7 @@ def _cause_below(score: Score, boxes: Box, thing: int) -> Array:
     entries = np.array(cause.things[thing])
     center, radius = boxes.center[..., entries], boxes.radius[..., entries]
     also = np.array(cause.also[thing] if cause.also else (), int)
-    others = boxes.center[..., also], boxes.radius[..., also]
+    others = boxes.center[..., also] * (-1.0 if cause.against else 1.0), boxes.radius[..., also]
     if cause.length:
         each = [_length_bounds(*part) for part in zip(cause.parts(center), cause.parts(radius))]
         if cause.also:

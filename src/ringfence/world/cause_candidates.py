@@ -40,22 +40,26 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
     how soon they meet), or an entry or a vector of oneself or of theirs (near and fast). And where they are to who
     looks into a direction."""
     found = []
-    own = _own(names)
-    for kind, each in (things_of(names) | _lone_things(names)).items():
+    own, lone = _own(names), _lone_things(names)
+    of_lone = {d for each in lone.values() for d in each[0].values()}
+    for kind, each in (things_of(names) | lone).items():
         axes = [c for c in "xyz" if f"d{c}" in each[0]]
         if not axes:
             continue
         offset = Cause("", _picked(each, [f"d{c}" for c in axes]))
         speed = [f"dv{c}" for c in axes]
-        if set(speed) <= set(each[0]):
+        theirs_is_known = set(speed) <= set(each[0])
+        own_speed = [f"own.v{c}" for c in axes]
+        if theirs_is_known or set(own_speed) <= set(own):
             name = f"{kind}.distance, how fast it shrinks"
-            found.append(replace(offset, name=name, also=_picked(each, speed), how="nearing"))
+            also = _picked(each, speed) if theirs_is_known else _picked([own] * len(each), own_speed)
+            found.append(replace(offset, name=name, also=also, how="nearing", against=not theirs_is_known))
         looks = next((fields for fields in DIRECTIONS if set(fields) <= set(own)), ())
         if len(axes) == 2 and looks:
             direction = _picked([own] * len(each), looks)
             found.append(replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned"))
         theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
-        mine = {name: d for name, d in own.items() if d not in each[0].values()}
+        mine = {name: d for name, d in own.items() if kind not in lone or d not in of_lone}
         for fields in ([mine] * len(each), theirs):
             for group in _numbers(list(fields[0])):
                 number = ("length of " if len(group) > 1 else "") + ", ".join(group)

@@ -77,7 +77,7 @@ Score = CauseNet | Distance
 def values_of(cause: Cause, x: Array) -> Array:
     """(..., N, J, k) what a cause reads of features (..., N, D), as `Cause.of`; a length has a slope everywhere."""
     read = x[..., np.array(cause.things)]
-    also = x[..., np.array(cause.also)] if cause.also else None
+    also = cause.read_also(x)
     if not cause.length:
         return jnp.stack(SEVERAL[cause.how](read, also), -1) if cause.also else read
     lengths = [jnp.sqrt((part**2).sum(-1) + 1e-9) for part in cause.parts(read)]

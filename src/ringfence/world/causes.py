@@ -30,6 +30,7 @@ class Cause(msgspec.Struct, frozen=True):
     also: tuple[tuple[int, ...], ...] = ()
     how: How = ""
     end: float = 0.0  # of the values of what is high or low where danger is
+    against: bool = False  # what is read of `also` counts the other way: one's own velocity, to what stands still
 
     @property
     def width(self) -> int:
@@ -58,11 +59,18 @@ class Cause(msgspec.Struct, frozen=True):
     def of(self, x: np.ndarray) -> np.ndarray:
         """(..., J, width) what it reads of features (..., D)."""
         read = x[..., np.array(self.things)]
-        also = x[..., np.array(self.also)] if self.also else None
+        also = self.read_also(x)
         if not self.length:
             return np.stack(SEVERAL[self.how](read, also), -1) if self.also else read
         lengths = [np.sqrt((part**2).sum(-1)) for part in self.parts(read)]
         return self.in_one(lengths + self.second(read, also))[..., None]
+
+    def read_also(self, x: Any) -> Any:
+        """(..., J, m) what is read of `also` in features (..., D), NumPy's or JAX's; None where there is none."""
+        if not self.also:
+            return None
+        also = x[..., np.array(self.also)]
+        return -also if self.against else also
 
     def second(self, read: Any, also: Any) -> list[Any]:
         """Of a length, what it reads of other entries (..., m), NumPy's or JAX's, if it reads any."""
