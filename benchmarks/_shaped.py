@@ -11,8 +11,7 @@ from _system import Carts, System, entries, length
 
 
 class Sector(System):
-    """Aircraft that fly across at three levels, each to the other side; too near below 9.26 km across *and* 300 m in
-    height."""
+    """Aircraft at three levels: no two may be within 9.26 km across *and* 300 m in height."""
 
     n, steps, dt, actions, noise = 4, 60, 5.0, 3, (0.85, 0.35)  # they turn, climb and accelerate
     names = entries(
@@ -85,7 +84,7 @@ class Sector(System):
 
 
 class Meeting(Carts):
-    """Too near where two would be 0.4 m apart within 1.2 s, at the speed at which they come nearer."""
+    """No two carts may come nearer so fast that they would be 0.4 m apart in 1.2 s."""
 
     def danger(self):
         gap = self.p[:, None] - self.p[None]
@@ -110,7 +109,7 @@ class Meeting(Carts):
 
 
 class Docks(Carts):
-    """Docks that lie together: who is within 2 m of another may drive no faster than 0.5 m/s."""
+    """Docks that lie together: within 2 m of another cart nobody may drive faster than 0.5 m/s."""
 
     steps, dt, noise = 80, 0.2, (0.85, 0.12)
     names = entries(
@@ -141,8 +140,7 @@ class Docks(Carts):
 
 
 class Sprayers(System):
-    """Robots that spray ahead of them and drive from plant to plant: nobody may be within 1.5 m and 40 degrees of where
-    another looks."""
+    """Robots that spray ahead of them: nobody may be within 1.5 m and 40 degrees of where another looks."""
 
     n, steps, dt, actions, noise = 4, 80, 0.1, 2, (0.9, 0.25)  # they turn and accelerate
     names = entries(

@@ -54,6 +54,7 @@ def main() -> None:
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     if given.table:
+        put("docs/proving-ground.md", "shaped", systems())
         put("docs/proving-ground.md", "shapes", table())
         return
     for name in given.systems or NAMED:
@@ -86,6 +87,13 @@ def made(name: str, system: type[System], seed: int) -> None:
         row = [f"{v:.5g}" if isinstance(v, float) else v for v in row]
         append(OUT, dict(zip(HEAD, row)), HEAD)
         print(row, flush=True)
+
+
+def systems() -> str:
+    """What is dangerous, as each says."""
+    said = {cls: " ".join((cls.__doc__ or "").split()).rstrip(".") for cls in SYSTEMS}
+    lines = [f"| `{cls.__name__.lower()}` | {said[cls]} |" for cls in SYSTEMS]
+    return "\n".join(["| system | what is dangerous |", "|---|---|", *lines])
 
 
 def table() -> str:

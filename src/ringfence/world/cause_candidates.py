@@ -39,33 +39,47 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
     """How far things are together with one number more, by kind, where names tell: how fast they come nearer (danger of
     how soon they meet), or an entry or a vector of oneself or of theirs (near and fast). And where they are to who
     looks into a direction."""
-    found = []
-    own, lone = _own(names), _lone_things(names)
+    found: list[Cause] = []
+    own, several, lone = _own(names), things_of(names), _lone_things(names)
     of_lone = {d for each in lone.values() for d in each[0].values()}
-    for kind, each in (things_of(names) | lone).items():
+    moving = {name: d for name, d in own.items() if d not in of_lone}
+    for kind, each in (several | lone).items():
         axes = [c for c in "xyz" if f"d{c}" in each[0]]
-        if not axes:
-            continue
-        offset = Cause("", _picked(each, [f"d{c}" for c in axes]))
-        speed = [f"dv{c}" for c in axes]
-        theirs_is_known = set(speed) <= set(each[0])
-        own_speed = [f"own.v{c}" for c in axes]
-        if theirs_is_known or set(own_speed) <= set(own):
-            name = f"{kind}.distance, how fast it shrinks"
-            also = _picked(each, speed) if theirs_is_known else _picked([own] * len(each), own_speed)
-            found.append(replace(offset, name=name, also=also, how="nearing", against=not theirs_is_known))
-        looks = next((fields for fields in DIRECTIONS if set(fields) <= set(own)), ())
-        if len(axes) == 2 and looks:
-            direction = _picked([own] * len(each), looks)
-            found.append(replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned"))
-        theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
-        mine = {name: d for name, d in own.items() if kind not in lone or d not in of_lone}
-        for fields in ([mine] * len(each), theirs):
-            for group in _numbers(list(fields[0])):
-                number = ("length of " if len(group) > 1 else "") + ", ".join(group)
-                name = f"{kind}.distance, {number}"
-                found.append(replace(offset, name=name, also=_picked(fields, group), how="beside"))
+        if axes:
+            offset = Cause(f"{kind}.distance", _picked(each, [f"d{c}" for c in axes]))
+            found += _nearing(offset, each, axes, own)
+            found += _turned(offset, kind, own)
+            found += _beside(offset, [own if kind in several else moving] * len(each))
+            theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
+            found += _beside(offset, theirs)
     return found
+
+
+def _nearing(
+    offset: Cause, each: Sequence[dict[str, int]], axes: Sequence[str], own: dict[str, int]
+) -> Iterator[Cause]:
+    """How far things are, and how fast that shrinks: by their velocity, or of what logs none by one's own."""
+    theirs, mine = [f"dv{c}" for c in axes], [f"own.v{c}" for c in axes]
+    name = f"{offset.name}, how fast it shrinks"
+    if set(theirs) <= set(each[0]):
+        yield replace(offset, name=name, also=_picked(each, theirs), how="nearing")
+    elif set(mine) <= set(own):
+        yield replace(offset, name=name, also=_picked([own] * len(each), mine), how="nearing", against=True)
+
+
+def _turned(offset: Cause, kind: str, own: dict[str, int]) -> Iterator[Cause]:
+    """How far ahead things in a plane are, and how far aside."""
+    looks = next((fields for fields in DIRECTIONS if set(fields) <= set(own)), ())
+    if len(offset.things[0]) == 2 and looks:
+        direction = _picked([own] * len(offset.things), looks)
+        yield replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned")
+
+
+def _beside(offset: Cause, fields: Sequence[dict[str, int]]) -> Iterator[Cause]:
+    """How far things are, and a number more: of these fields, or how long several are as a vector."""
+    for group in _numbers(list(fields[0])):
+        number = ("length of " if len(group) > 1 else "") + ", ".join(group)
+        yield replace(offset, name=f"{offset.name}, {number}", also=_picked(fields, group), how="beside")
 
 
 def of_several(names: Sequence[str]) -> Iterator[Cause]:
