@@ -162,6 +162,20 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
     assert np.isfinite(jax.grad(lambda x: values_of(found.causes[0], x).sum())(here)).all()
 
 
+def test_what_has_room_for_one_is_dangerous_for_two():
+    place = np.random.default_rng(0).uniform(-6, 6, (30_000, N, 2))
+    unsafe = (np.abs(place) < 3).all(-1).sum(1) > 1
+    relative = place[:, features.others(N)] - place[:, :, None]
+    x = np.concatenate([place, relative.reshape(30_000, N, -1)], -1).astype(np.float32)
+    names = ["own.x", "own.y", *(f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy"))]
+    found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 30, names)
+    (cause,) = found.causes
+    assert cause.name == "other.place, own.place"
+    assert found.explained > 0.9 and found.false_alarms < 0.1
+    np.testing.assert_allclose(cause.of(x)[:, 0, 0], place[:, :2].reshape(30_000, 4), atol=1e-5)
+    np.testing.assert_allclose(values_of(cause, jnp.asarray(x)), cause.of(x), atol=1e-5)
+
+
 def test_who_looks_somewhere_does_so_by_an_angle_or_its_cosine_and_sine():
     names = ["other0.dx", "other0.dy", "own.cos", "own.sin"]
     ahead, angle = (

@@ -161,6 +161,7 @@ def test_causes_are_bounded_too():
     both.append(Cause("other.distance, an entry", things, also=((4,), (4,)), how="beside"))
     both.append(Cause("other.distance, an angle", things, also=((4,), (4,)), how="turned"))
     both.append(Cause("post.distance, nearing", things, also=own, how="nearing", against=True))
+    places = Cause("other.place, own.place", things, also=own, how="both")
     vector = Cause("own.x, length", ((4,),), also=((0, 1),), how="vector")
     second = [
         (both[0], "soon"),
@@ -185,8 +186,9 @@ def test_causes_are_bounded_too():
         ),
         Distance(jnp.array([-1.0, 1.0]), jnp.array(1.0), jnp.array(0.0), entry, walls),
         *(
-            CauseNet(MLP(jax.random.key(4), (2, 16, 16, 1)), jnp.zeros(2), jnp.ones(2), jnp.array(0.1), cause, edge)
-            for cause in (pair, *both, vector)
+            CauseNet(MLP(jax.random.key(4), (k, 16, 16, 1)), jnp.zeros(k), jnp.ones(k), jnp.array(0.1), cause, edge)
+            for cause in (pair, *both, vector, places)
+            for k in (cause.width,)
         ),
     )
     center = jax.random.normal(jax.random.key(1), (40, 1, 6))

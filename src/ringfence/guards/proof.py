@@ -348,11 +348,18 @@ def _with_vector_bounds(entries: Array, radius: Array, also: Array, spread: Arra
     return jnp.concatenate([entries, center], -1), jnp.concatenate([radius, off], -1)
 
 
+def _both_bounds(offset: Array, radius: Array, place: Array, spread: Array) -> tuple[Array, Array]:
+    """Likewise of where one is, and where things are."""
+    center, off = jnp.concatenate([place, place + offset], -1), jnp.concatenate([spread, spread + radius], -1)
+    return center, off + ROUNDING * (1.0 + jnp.abs(center))
+
+
 SEVERAL_BOUNDS = {
     "nearing": _nearing_bounds,
     "beside": _beside_bounds,
     "turned": _turned_bounds,
     "vector": _with_vector_bounds,
+    "both": _both_bounds,
 }
 
 

@@ -52,6 +52,8 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
             found += _beside(offset, [own if kind in several else moving] * len(each))
             theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
             found += _beside(offset, theirs)
+        if kind in several:
+            found += _both(kind, each, axes, own)
     return found
 
 
@@ -73,6 +75,14 @@ def _turned(offset: Cause, kind: str, own: dict[str, int]) -> Iterator[Cause]:
     if len(offset.things[0]) == 2 and looks:
         direction = _picked([own] * len(offset.things), looks)
         yield replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned")
+
+
+def _both(kind: str, each: Sequence[dict[str, int]], axes: Sequence[str], own: dict[str, int]) -> Iterator[Cause]:
+    """Where one is, and where things are: what has room for one is dangerous for two."""
+    place = [f"own.{c}" for c in axes]
+    if set(place) <= set(own) and 0 < 2 * len(axes) <= WIDEST:
+        offset = _picked(each, [f"d{c}" for c in axes])
+        yield Cause(f"{kind}.place, own.place", offset, also=_picked([own] * len(each), place), how="both")
 
 
 def _beside(offset: Cause, fields: Sequence[dict[str, int]]) -> Iterator[Cause]:

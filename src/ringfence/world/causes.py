@@ -38,7 +38,7 @@ class Cause(msgspec.Struct, frozen=True):
         if self.length:
             return 1
         entries = len(self.things[0])
-        return {"": entries, "vector": entries + 1}.get(self.how, 2)
+        return {"": entries, "vector": entries + 1, "both": 2 * entries}.get(self.how, 2)
 
     @property
     def first_is_distance(self) -> bool:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 # Nothing more; as several numbers, see SEVERAL; in one, see `second`.
-How = Literal["", "nearing", "beside", "turned", "vector", "high", "low", "ahead", "coming", "soon"]
+How = Literal["", "nearing", "beside", "turned", "vector", "both", "high", "low", "ahead", "coming", "soon"]
 
 
 def nearing(offset: Any, velocity: Any) -> tuple[Any, Any]:
@@ -44,7 +44,13 @@ def with_vector(entries: Any, also: Any) -> tuple[Any, ...]:
     return *(entries[..., k] for k in range(entries.shape[-1])), _length(also)
 
 
-SEVERAL = {"nearing": nearing, "beside": beside, "turned": turned, "vector": with_vector}
+def both(offset: Any, place: Any) -> tuple[Any, ...]:
+    """Where one is oneself, and where things are."""
+    axes = range(place.shape[-1])
+    return *(place[..., k] for k in axes), *(place[..., k] + offset[..., k] for k in axes)
+
+
+SEVERAL = {"nearing": nearing, "beside": beside, "turned": turned, "vector": with_vector, "both": both}
 
 
 def second(how: How, offset: Any, also: Any, end: float) -> Any:
