@@ -152,7 +152,7 @@ def test_braking_ends_in_standing(guarded, present):
 
 def test_causes_are_bounded_too():
     """Distances with one edge and several, of a length, of one with an axis apart, of the second nearest and of an
-    entry, and networks of causes of two numbers: all together, and each."""
+    entry, and networks of causes of two numbers: several together, and each."""
     length = Cause("length of other.dx, other.dy", ((0, 1), (2, 3)), length=True)
     entry = Cause("own.x", ((4,),))
     pair = Cause("own.x, own.y", ((4, 5),))
@@ -191,10 +191,10 @@ def test_causes_are_bounded_too():
             for k in (cause.width,)
         ),
     )
-    center = jax.random.normal(jax.random.key(1), (40, 1, 6))
+    center = jax.random.normal(jax.random.key(1), (30, 1, 6))
     radius = 0.3 * jax.random.uniform(jax.random.key(2), center.shape)
-    inside = anywhere(jax.random.key(3), center, radius, 20_000)
-    for some in (nets, *((net,) for net in nets)):
+    inside = anywhere(jax.random.key(3), center, radius, 6_000)
+    for some in (nets[:3], *((net,) for net in nets)):
         barrier = Barrier({}, {}, *(jnp.ones(6),) * 4, jnp.ones(()), shape=None, causes=some)
         low = score_below(barrier, Box(center, radius))
         score = worst(some, inside)
