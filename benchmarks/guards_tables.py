@@ -179,6 +179,7 @@ def proposals() -> str:
 def sizes() -> str:
     """A row per task and number of agents, a column per guard."""
     rows = stored.table(RESULTS / "spread-teams" / "table.csv")
+    seeds = set()
     out = ["| learned from | agents | " + " | ".join(SIZES) + " |", "|---" * (2 + len(SIZES)) + "|"]
     for task in dict.fromkeys(r["task"] for r in rows):
         for n in (2, 3, 4, 6):
@@ -186,9 +187,10 @@ def sizes() -> str:
             for guard in SIZES.values():
                 name = f"default{guard}" + f"+agents{n}" * (n != 3)
                 found = [r for r in rows if (r["task"], r["algorithm"], r["variant"]) == (task, "bc", name)]
-                seeds = f" ({len(found)} seeds)" if len(found) > 1 else ""
-                cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'cost_safe_start'):.3f}{seeds}")
+                seeds.add(len(found))
+                cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'cost_safe_start'):.3f}")
             out.append(f"| `{task}` | {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
+    assert len(seeds) == 1, f"the page names one number of seeds, the rows have {seeds}"
     return "\n".join(out)
 
 
