@@ -823,13 +823,13 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
-        "After 6000 it earns more on two and less on none",
+        "After 6000 it earns more on three and less on none",
         SPREAD,
         tested(
             ("madiff", f"long{SHIELD}"),
             ("bc-return", f"default{SHIELD}"),
             "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 2 and not any(d.holds and d.mean > 0 for d in ds),
+            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 3 and not any(d.holds and d.mean > 0 for d in ds),
         ),
     ),
     Claim(
