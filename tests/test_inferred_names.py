@@ -177,5 +177,5 @@ def test_the_card_says_which_names_were_inferred_and_a_formula_reads_them(own_st
     for entry, name in world.card.data.inferred_names.items():
         true = given[int(entry.removeprefix("obs"))]
         assert name == true or (name.startswith("still_") and true.startswith("landmark"))
-    assert "Nobody named these entries" in str(world.card) and "other0.dx (obs" in str(world.card)
+    assert "Logs tell what these entries are" in str(world.card) and "other0.dx (obs" in str(world.card)
     assert worlds.fit(own_store, **QUICK_WORLD).card.data.inferred_names is None

@@ -22,8 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
-from ringfence.problem import partners, turns
-from ringfence.problem.inferred_names import inferred_names
+from ringfence.problem import on_map, partners, turns
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.partners import Mirrored
 from ringfence.problem.turns import Turn
@@ -104,7 +103,7 @@ class FeatureMap:
             return self._of_state(state)
         assert observations is not None, "a map of observations is given some"
         rows = np.arange(self.plus.shape[0])[:, None]
-        return observations[..., rows, self.plus]
+        return self._less(observations[..., rows, self.plus], lambda entries: observations[..., rows, entries])
 
     def _of_state(self, state: X | None) -> X:
         if state is None:
@@ -112,18 +111,22 @@ class FeatureMap:
                 f"View '{self.view}' needs the global state, which this data does not have; "
                 "store it or use view='decentralized'."
             )
-        entries = state[..., self.plus]
+        return self._less(state[..., self.plus], lambda entries: state[..., entries])
+
+    def _less(self, entries: X, source: Callable[[np.ndarray], X]) -> X:
+        """(..., N, D) entries less those that are taken from them, which `source` gives."""
         taken = self.minus >= 0
-        if not taken.any():
-            return entries
-        return entries - state[..., np.maximum(self.minus, 0)] * taken
+        return entries - source(np.maximum(self.minus, 0)) * taken if taken.any() else entries
 
     def written(self, observations: Array, state: Array | None, features: Array) -> tuple[Array, Array | None]:
         """The source with entries that the view holds as they are taken from features (..., N, D); differences of two
         entries follow from these."""
         if self.source == "observations":
-            rows = np.arange(self.plus.shape[0])[:, None]
-            return observations.at[..., rows, self.plus].set(features), state
+            rows, differ = np.nonzero(self.minus >= 0)
+            wide = np.arange(self.plus.shape[0])[:, None]
+            plain = observations.at[..., wide, self.plus].set(features)
+            whole = plain[..., rows, self.minus[rows, differ]] + features[..., rows, differ]
+            return plain.at[..., rows, self.plus[rows, differ]].set(whole), state
         assert state is not None, "a map of the state is given one"
         plain = self.minus < 0
         return observations, state.at[..., self.plus[plain]].set(features[..., plain])
@@ -177,6 +180,15 @@ def numbered(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
         if match:
             found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
     return {kind: [fields for _, fields in sorted(things.items())] for kind, things in found.items()}
+
+
+def given_names(map: FeatureMap, entries: Sequence[str], state: Sequence[str] | None = None) -> list[str]:
+    """What the first agent's entries are called in the data that the map reads: `cart0_x less x` where it takes one
+    from another."""
+    given = [*(entries if "observations" in map.reads else ()), *(state or ())]
+    given += [f"state{d}" for d in range(len(state or ()), map.width)]
+    both = zip(map.plus[0].tolist(), map.minus[0].tolist())
+    return [given[one] if less < 0 else f"{given[one]} less {given[less]}" for one, less in both]
 
 
 def others_offsets(names: Sequence[str]) -> np.ndarray:
@@ -380,9 +392,7 @@ def from_data(
         raise unknown("view", view, VIEWS)
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
-    if view != "centralized":
-        observation_names = inferred_names(observations, observation_names, first_rows, keep)
-    plain = _pruned_map(view, observations, state, observation_names, state_names, set(keep))
+    plain = _pruned_map(view, observations, state, observation_names, state_names, first_rows, set(keep))
     steps = _logged_steps(plain, observations, state, first_rows)
     if steps is not None:
         plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
@@ -404,32 +414,36 @@ def _pruned_map(
     state: np.ndarray | None,
     observation_names: tuple[str, ...],
     state_names: tuple[str, ...],
+    first_rows: np.ndarray | None,
     keep: set[str],
 ) -> FeatureMap:
     """A map of the entries that tell something new."""
     m, n, width = observations.shape
-    own = [observations[:, :, d] for d in range(width)]
     shared = [] if state is None else [np.broadcast_to(state[:, d : d + 1], (m, n)) for d in range(state.shape[1])]
-    known: set[int] = set()
     if view == "centralized":
-        columns = shared
-        names = state_names
-    elif view == "decentralized" or state is None:
-        columns = own
-        names = observation_names
-    else:
-        columns = own + shared
-        names = observation_names + state_names
-        known = {width + d for d in _observed_too(observations, state, keep, state_names)}
-    kept = _telling(columns, known)
+        kept = _some(_telling(shared, set()))
+        table = np.tile(np.array(kept), (n, 1))
+        return FeatureMap(view, tuple(state_names[d] for d in kept), "state", table, np.full_like(table, -1))
+    joined = (state, state_names) if view == "pruned" and state is not None else None
+    seen = on_map.relative(observations, observation_names, joined, first_rows, keep)
+    relative = seen.of(observations, state)
+    columns = [relative[..., c] for c in range(relative.shape[-1])]
+    known: set[int] = set()
+    if joined is not None:
+        known = {len(columns) + d for d in _observed_too(observations, joined[0], keep, state_names) | seen.of_state}
+        # One index table needs one source: of a pruned view, observations with the state appended to each of them.
+        columns = columns + shared
+        seen = seen.with_entries(range(width, width + len(shared)), state_names)
+    kept = _some(_telling(columns, known))
+    plus, minus = seen.plus[:, kept], seen.minus[:, kept]
+    kind = _Joint if max(plus.max(), minus.max()) >= width else FeatureMap
+    return kind(view, tuple(seen.names[d] for d in kept), "observations", plus, minus)
+
+
+def _some(kept: list[int]) -> list[int]:
     if not kept:
         raise UserError("Every observation entry is constant, so there is nothing to plan over; check the store.")
-    table = np.tile(np.array(kept), (n, 1))
-    # One index table needs one source: of a pruned view, observations with the state appended to each of them.
-    joins = view == "pruned" and state is not None and max(kept) >= width
-    kind = _Joint if joins else FeatureMap
-    source: Source = "state" if view == "centralized" else "observations"
-    return kind(view, tuple(names[d] for d in kept), source, table, np.full_like(table, -1))
+    return kept
 
 
 def _telling(columns: list[np.ndarray], known: set[int]) -> list[int]:
@@ -568,12 +582,27 @@ class _Joint(FeatureMap):
             raise UserError("This view was fitted with a global state; pass it when acting.")
         assert observations is not None, "a map of observations is given some"
         width = observations.shape[-1]
-        index = self.plus[0]
-        own = observations[..., index[index < width]]
-        shared = state[..., None, index[index >= width] - width]
-        shape = (*own.shape[:-1], shared.shape[-1])
-        xp: Any = np if isinstance(own, np.ndarray) else jnp
-        return xp.concatenate([own, xp.broadcast_to(shared, shape)], -1)
+        rows = np.arange(self.plus.shape[0])[:, None]
+        xp: Any = np if isinstance(observations, np.ndarray) else jnp
+
+        def source(entries: np.ndarray) -> X:
+            own = observations[..., rows, np.minimum(entries, width - 1)]
+            return xp.where(entries < width, own, state[..., np.maximum(entries - width, 0)])
+
+        return self._less(source(self.plus), source)
+
+    def written(self, observations: Array, state: Array | None, features: Array) -> tuple[Array, Array | None]:
+        observations, _ = super().written(observations, None, features)  # what is of the state is beyond its end
+        assert state is not None, "a map of the state is given one"
+        width = observations.shape[-1]
+        of_state = self.plus >= width
+        plain = of_state & (self.minus < 0)
+        state = state.at[..., self.plus[plain] - width].set(features[..., plain])
+        rows, differ = np.nonzero(of_state & (self.minus >= 0))
+        shared = jnp.broadcast_to(state[..., None, :], (*observations.shape[:-1], state.shape[-1]))
+        both = jnp.concatenate([observations, shared], -1)
+        whole = both[..., rows, self.minus[rows, differ]] + features[..., rows, differ]
+        return observations, state.at[..., self.plus[rows, differ] - width].set(whole)
 
 
 def from_dict(data: Mapping[str, Any]) -> FeatureMap:

@@ -265,7 +265,7 @@ def _of_data(card: Card) -> Iterator[str]:
     yield f"{line}judged on {held_out.episodes} that nothing was fitted to ({held_out.steps} steps)."
     if inferred := card.data.inferred_names:
         named = ", ".join(f"{name} ({entry})" for entry, name in inferred.items())
-        yield f"Nobody named these entries; what agents see of each other says what they are: {named}."
+        yield f"Logs tell what these entries are, where nobody named them or they are places on a map: {named}."
     if card.data.partners:
         yield "Who is in lists of the nearest is found by what two see of each other; predictions read what these do."
     if card.data.impacts:

@@ -215,10 +215,8 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> 
 
 def _inferred_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, str]:
     """Names that nobody gave, by what their entries are called."""
-    if map.reads_state:
-        return {}
-    given = store.entry_names
-    return {given[d]: name for d, name in zip(map.plus[0], map.names) if given[d] != name}
+    given = features.given_names(map, store.entry_names, store.card.state_names)
+    return {entry: name for entry, name in zip(given, map.names) if entry != name}
 
 
 def _ranges(logged: Logged) -> dict[str, tuple[float, float]]:

@@ -29,6 +29,7 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.logs.late import Lateness
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints
+from ringfence.problem.features import given_names
 from ringfence.problem.names import Names
 from ringfence.training import worlds
 from ringfence.training.runs import Run
@@ -286,11 +287,9 @@ def check_view(world: World, store: EpisodeStore) -> None:
     names = store.card.observation_names
     if names and not world.map.reads_state:
         called = {name: entry for entry, name in (world.card.data.inferred_names or {}).items()}
-        for inferred, entry in zip(world.map.names, world.map.plus[0]):
-            if names[int(entry)] != (name := called.get(inferred, inferred)):
-                raise UserError(
-                    f"The World reads '{name}' where these logs hold '{names[int(entry)]}'; fit a World to these logs."
-                )
+        for inferred, entry in zip(world.map.names, given_names(world.map, names)):
+            if entry != (name := called.get(inferred, inferred)):
+                raise UserError(f"The World reads '{name}' where these logs hold '{entry}'; fit a World to these logs.")
     mine = [np.asarray(bound, float) for bound in (world.spec.action_low, world.spec.action_high)]
     theirs = [np.asarray(bound, float) for bound in store.card.bounds]
     if not all(np.allclose(a, b, rtol=1e-4) for a, b in zip(mine, theirs)):

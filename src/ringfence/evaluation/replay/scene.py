@@ -10,8 +10,8 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
+from ringfence.problem import on_map
 from ringfence.problem.features import others
-from ringfence.problem.inferred_names import inferred_names
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.names import Names
 
@@ -19,8 +19,10 @@ NOBODY = 1e6  # m: how far away is who is not there
 
 
 def names_of(store: EpisodeStore) -> Names:
-    """What names say of a store's entries; names that nobody gave are told from the logs."""
-    given = inferred_names(store.observations, store.entry_names, store.first_rows)
+    """What names say of a store's entries; names that nobody gave are told from the logs. Others and things that are
+    seen as places on a map keep theirs, and stay where they were."""
+    seen = on_map.relative(store.observations, store.entry_names, None, store.first_rows)
+    given = [old if less else new for old, new, less in zip(store.entry_names, seen.names, seen.minus[0] >= 0)]
     return Names.of(given, store.card.state_names or () if store.state is not None else (), store.n_agents)
 
 
