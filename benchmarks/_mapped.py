@@ -52,13 +52,22 @@ class Unnamed(Mapped):
     names = [f"obs{d}" for d in range(len(Mapped.names))]
 
 
-class Stated(Mapped):
-    """The same carts, who see themselves alone; the global state has everybody's place and velocity."""
+class Alone(Mapped):
+    """The same carts, who see themselves alone; there is no global state."""
 
     names = Mapped.names[:6]
 
     def around(self):
         return np.zeros((self.n, 0))
+
+    @classmethod
+    def careful(cls, seen, care):
+        """Slower."""
+        return cls.driven(cls._relative(seen), 1.4 - 0.8 * care)
+
+
+class Stated(Alone):
+    """The same; a global state has everybody's place and velocity."""
 
     @property
     def state_space(self):
@@ -66,11 +75,6 @@ class Stated(Mapped):
 
     def state(self):
         return np.concatenate([self.p, self.v], 1).ravel().astype(np.float32)
-
-    @classmethod
-    def careful(cls, seen, care):
-        """Slower."""
-        return cls.driven(cls._relative(seen), 1.4 - 0.8 * care)
 
     @classmethod
     def recorded(cls, episodes, seed):
@@ -91,7 +95,7 @@ class Listed(Mapped):
     away = (2, 4)
 
     def around(self):
-        others = np.argsort(self.gaps(self.p), 1)[:, :2]
+        others = np.argsort(self.gaps(self.p) + 99 * np.eye(self.n), 1)[:, :2]
         return np.concatenate([self.p[others], self.v[others]], -1).reshape(self.n, -1)
 
 

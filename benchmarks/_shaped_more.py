@@ -181,3 +181,48 @@ class Junction(Carts):
         first = (theirs < mine) & (theirs < 1.8) & ((place * velocity).sum(-1) < 0.5)
         waits = ((mine > 1) & (mine < 2.3) & (first | (theirs < 1))).any(1)
         return cls.driven(seen, np.where(waits, 1.3 * (1 - care), 1.3)[:, None])
+
+
+class Rays(Carts):
+    """Carts among four posts that they do not see; a lidar of twelve rays does, and none may be shorter than 0.3 m."""
+
+    n = 3
+    names = ["x", "y", "vx", "vy", "to_goal_x", "to_goal_y", *(f"lidar_{k}" for k in range(12))]
+    post, cart, near, sight, apart = 0.4, 0.3, 0.3, 5.0, 1.2  # m: radii, and how far they see
+    rays = np.stack([f(np.arange(12) * np.pi / 6) for f in (np.cos, np.sin)], 1)
+
+    def begin(self, rng):
+        self.posts = rng.uniform(-3, 3, (4, 2))
+        while True:
+            super().begin(rng)
+            if min(length(at[:, None] - self.posts).min() for at in (self.p, self.goal)) > self.apart:
+                return
+            self.posts = rng.uniform(-3, 3, (4, 2))
+
+    def lidar(self):
+        """(N, 12) m how far each sees."""
+        at = np.concatenate([np.repeat(self.posts[None], self.n, 0), self.p[self.others()]], 1)
+        radius = np.repeat([self.post, self.cart], [4, self.n - 1])
+        offset = at - self.p[:, None]
+        along = offset @ self.rays.T  # (N, things, rays)
+        aside = (offset**2).sum(-1)[..., None] - along**2
+        hit = (along > 0) & (aside < radius[:, None] ** 2)
+        far = along - np.sqrt(np.maximum(radius[:, None] ** 2 - aside, 0))
+        return np.clip(np.where(hit, far, self.sight).min(1), 0, self.sight)
+
+    def seen(self):
+        return np.concatenate([self.p, self.v, self.goal - self.p, self.lidar()], 1)
+
+    def danger(self):
+        return bool((self.lidar() < self.near).any())
+
+    @classmethod
+    def naive(cls, seen, state=None):
+        """To the goal, past nobody."""
+        return cls.driven(seen, 1.2)
+
+    @classmethod
+    def careful(cls, seen, care):
+        """Away from what is near."""
+        weight = np.where(seen[:, 6:] < 1.0, 2.4 * (1.1 - seen[:, 6:]), 0.0)
+        return cls.naive(seen) - care * weight @ cls.rays

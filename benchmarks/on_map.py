@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
-from _mapped import Listed, Mapped, Posts, Stated, Unnamed, Walkers
+from _mapped import Alone, Listed, Mapped, Posts, Stated, Unnamed, Walkers
 from _paired import Pair, in_words
 from readme import put
 
@@ -25,7 +25,7 @@ from ringfence.problem import on_map
 from ringfence.problem.inferred_names import inferred_names
 
 OUT = Path(__file__).resolve().parent.parent / "results" / "on_map.csv"
-SYSTEMS = (Mapped, Unnamed, Stated, Listed, Posts, Walkers)
+SYSTEMS = (Mapped, Unnamed, Alone, Stated, Listed, Posts, Walkers)
 NAMED = {cls.__name__.lower(): cls for cls in SYSTEMS}
 
 

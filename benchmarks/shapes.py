@@ -20,24 +20,25 @@ from unittest import mock
 from _paired import Pair, in_words
 from _shaped import Docks, Meeting, Sector, Sprayers
 from _shaped_last import Downwash, Pickers, Swarm
-from _shaped_more import Bikes, Boats, Crowd, Depot, Junction, Persons
+from _shaped_more import Bikes, Boats, Crowd, Depot, Junction, Persons, Rays
 from _system import System
 from readme import put
 
-from ringfence.world import cause_search
+from ringfence.world import cause_candidates, cause_search
 
 ROOT = Path(__file__).resolve().parent.parent
 OUT = ROOT / "results" / "shapes.csv"
 SEED = 10
-LED = (Sector, Meeting, Docks, Sprayers, Persons, Crowd, Boats, Bikes, Depot, Junction)
+LED = (Sector, Meeting, Docks, Sprayers, Persons, Crowd, Boats, Bikes, Depot, Junction, Rays)
 SYSTEMS: tuple[type[System], ...] = (*LED, Downwash, Pickers, Swarm)
 NAMED = {cls.__name__.lower(): cls for cls in SYSTEMS}
 
 
 @contextmanager
 def without_more_shapes():
-    """The search for causes as it would be without those that read more of how near things are."""
-    with mock.patch.object(cause_search, "_with_more_shapes", lambda steps, chosen, names: chosen):
+    """The search for causes as it would be without those that read more of how near things are, or rows of entries."""
+    plain = mock.patch.object(cause_search, "_with_more_shapes", lambda steps, chosen, names: chosen)
+    with plain, mock.patch.object(cause_candidates, "_rows", lambda names: ()):
         yield
 
 

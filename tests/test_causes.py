@@ -77,6 +77,27 @@ def test_every_cause_is_found_and_no_other(logged, each):
     assert found.explained > 0.75 and found.false_alarms < 0.05 and len(cells) == 3
 
 
+@pytest.mark.parametrize("called", ["lidar_{}", "own.ray{}", "scan[{}]"])
+def test_rays_of_a_lidar_are_one_cause(called):
+    """Twelve of them: nearer than any was is dangerous, too."""
+    rng = np.random.default_rng(0)
+    rays = np.minimum(rng.uniform(0.5, 9, (300, 1, N, 12)) + rng.normal(0, 0.2, (300, 40, N, 12)).cumsum(1), 5.0)
+    unsafe = (rays < 0.6).any((2, 3)).reshape(-1)
+    x = np.concatenate([rng.normal(size=(300, 40, N, 1)), rays.clip(0.2)], -1).reshape(-1, N, 13).astype(np.float32)
+    names = ["own.v", *(called.format(k) for k in range(12))]
+    found, _ = cause_search.find(x, unsafe, np.repeat(np.arange(300), 40), names)
+    (cause,), (edge,) = found.causes, found.edges
+    assert (cause.name, cause.length, len(cause.things)) == (called[:-2].rstrip("[_{"), True, 12)
+    assert edge.at == pytest.approx(0.6, abs=0.01) and edge.below
+    assert edge.bounds == (pytest.approx(0.6, abs=0.01),)
+    assert found.explained > 0.99
+
+
+def test_numbers_alone_make_no_row():
+    rows = cause_candidates.candidates([f"obs{d}" for d in range(5)] + ["a_1", "a_2"])
+    assert not any(len(cause.things) > 1 for cause in rows)
+
+
 def test_causes_are_found_without_names(logged):
     x, unsafe, episode = logged
     found, _ = cause_search.find(x, unsafe.any(1), episode, [f"e{d}" for d in range(x.shape[-1])])

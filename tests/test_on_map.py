@@ -104,6 +104,29 @@ def test_of_the_state_where_nobody_sees_another(dotted):
     assert "s4" in kept.names
 
 
+def test_of_the_team_where_nobody_sees_another_and_there_is_no_state():
+    """Whoever judges for the team knows what each observes; one agent's own policy does not."""
+    team = Team()
+    x = np.concatenate([team.own, team.post - team.place], -1)
+    names = ("x", "y", "vx", "vy", "goal_x", "goal_y")
+    assert len(team.map(x, names).names) == 6
+    map = team.map(x, names, team=True)
+    assert set(map.names) == {*OWN, "goal.dx", "goal.dy", *of_others(2)}
+    assert not map.reads_state
+    assert map.width == 6
+    assert map.beyond(6, None) is None
+    assert map.beyond(5, None) is not None
+    at = [map.names.index(name) for name in of_others(2)]
+    assert np.allclose(map(x, None)[..., at], flat(team.others() - team.own[..., None, :]), atol=1e-5)
+    assert features.given_names(map, names)[at[0]] == "x of agent 1 less x"
+    assert features.from_dict(features.to_dict(map)) == map
+    given = jnp.asarray(x[0], jnp.float32)
+    again, _ = map.written(jnp.zeros_like(given), None, map(given, None))
+    assert np.allclose(again, given, atol=1e-5)
+    unnamed = [f"obs{d}" for d in range(6)]
+    assert len(team.map(x, unnamed, team=True).names) == 6, "nothing says what is a place"
+
+
 @pytest.mark.parametrize("agents", [1, 3])
 def test_things_that_stand_and_that_walk(agents):
     team = Team(agents)

@@ -105,8 +105,9 @@ class Task:
         """What is learned from: the store, or every agent's own part of it."""
         return store.split_agents() if self.homogeneous and store.n_agents > 1 else store
 
-    def feature_map(self, view: str, store: EpisodeStore | None = None) -> features.FeatureMap:
-        """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary."""
+    def feature_map(self, view: str, store: EpisodeStore | None = None, team: bool = False) -> features.FeatureMap:
+        """s̃_i of this task. Tasks that exist only as data need the store to see which entries vary. Whoever acts or
+        judges for the whole `team` reads everybody's observations."""
         if self.env is not None:
             return self.env.feature_map(view)
         if store is None:
@@ -124,6 +125,7 @@ class Task:
             keep=constraints.reads(self.hazard, store.n_agents, names),
             homogeneous=self.homogeneous,
             dt=store.card.dt,
+            team=team,
         )
 
     def spec(self, feature_map: features.FeatureMap, store: EpisodeStore | None = None) -> Spec:

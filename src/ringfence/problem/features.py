@@ -186,6 +186,8 @@ def given_names(map: FeatureMap, entries: Sequence[str], state: Sequence[str] | 
     """What the first agent's entries are called in the data that the map reads: `cart0_x less x` where it takes one
     from another."""
     given = [*(entries if "observations" in map.reads else ()), *(state or ())]
+    if isinstance(map, _Team):
+        given += [f"{entry} of agent {i}" for i in range(map.plus.shape[0]) for entry in entries]
     given += [f"state{d}" for d in range(len(state or ()), map.width)]
     both = zip(map.plus[0].tolist(), map.minus[0].tolist())
     return [given[one] if less < 0 else f"{given[one]} less {given[less]}" for one, less in both]
@@ -378,6 +380,7 @@ def from_data(
     keep: Collection[str] = (),
     homogeneous: bool = False,
     dt: float | None = None,
+    team: bool = False,
 ) -> FeatureMap:
     """The views of anybody's data: entries that never vary, or repeat an earlier one for every agent, are pruned, and
     so are entries of the state that every agent's observation tells already, in other coordinates (but for those in
@@ -386,13 +389,14 @@ def from_data(
 
     observations (M, N, O), state (M, S) or None, of all rows: a log in the order of its sites or goals holds entries
     that vary only later on. `first_rows` (E,) are those that episodes begin with. `dt` is the seconds between rows, of
-    agents who are `homogeneous`, where it is known; else it is what the rows tell.
+    agents who are `homogeneous`, where it is known; else it is what the rows tell. A pruned view of a `team` without a
+    state has the others' places, of whom an agent sees none itself, from their observations.
     """
     if view not in VIEWS:
         raise unknown("view", view, VIEWS)
     if view == "centralized" and state is None:
         raise UserError("View 'centralized' needs the global state, which this data does not have; use view='pruned'.")
-    plain = _pruned_map(view, observations, state, observation_names, state_names, first_rows, set(keep))
+    plain = _pruned_map(view, observations, state, observation_names, state_names, first_rows, set(keep), team)
     steps = _logged_steps(plain, observations, state, first_rows)
     if steps is not None:
         plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
@@ -416,6 +420,7 @@ def _pruned_map(
     state_names: tuple[str, ...],
     first_rows: np.ndarray | None,
     keep: set[str],
+    team: bool,
 ) -> FeatureMap:
     """A map of the entries that tell something new."""
     m, n, width = observations.shape
@@ -424,19 +429,25 @@ def _pruned_map(
         kept = _some(_telling(shared, set()))
         table = np.tile(np.array(kept), (n, 1))
         return FeatureMap(view, tuple(state_names[d] for d in kept), "state", table, np.full_like(table, -1))
-    joined = (state, state_names) if view == "pruned" and state is not None else None
+    joined = None
+    if view == "pruned" and state is not None:
+        joined = state, state_names
+    elif view == "pruned" and team:
+        joined = as_state(observations), None
     seen = on_map.relative(observations, observation_names, joined, first_rows, keep)
-    relative = seen.of(observations, state)
+    relative = seen.of(observations, joined[0] if joined else None)
     columns = [relative[..., c] for c in range(relative.shape[-1])]
     known: set[int] = set()
-    if joined is not None:
-        known = {len(columns) + d for d in _observed_too(observations, joined[0], keep, state_names) | seen.of_state}
+    if view == "pruned" and state is not None:
+        known = {len(columns) + d for d in _observed_too(observations, state, keep, state_names) | seen.of_state}
         # One index table needs one source: of a pruned view, observations with the state appended to each of them.
         columns = columns + shared
         seen = seen.with_entries(range(width, width + len(shared)), state_names)
     kept = _some(_telling(columns, known))
     plus, minus = seen.plus[:, kept], seen.minus[:, kept]
-    kind = _Joint if max(plus.max(), minus.max()) >= width else FeatureMap
+    kind = FeatureMap
+    if max(plus.max(), minus.max()) >= width:
+        kind = _Team if state is None else _Joint
     return kind(view, tuple(seen.names[d] for d in kept), "observations", plus, minus)
 
 
@@ -605,6 +616,33 @@ class _Joint(FeatureMap):
         return observations, state.at[..., self.plus[rows, differ] - width].set(whole)
 
 
+@dataclass(frozen=True, eq=False)
+class _Team(_Joint):
+    """The same where there is no global state: everybody's observations, one after the other, are it."""
+
+    @property
+    def reads(self) -> tuple[Source, ...]:
+        return ("observations",)
+
+    @property
+    def width(self) -> int:
+        """Of an observation: the state has one of each agent."""
+        return -(-super().width // (self.plus.shape[0] + 1))
+
+    def __call__(self, observations: X | None, state: X | None) -> X:
+        assert observations is not None, "a map of observations is given some"
+        return super().__call__(observations, as_state(observations))
+
+    def written(self, observations: Array, state: Array | None, features: Array) -> tuple[Array, Array | None]:
+        """What others are seen by is theirs to write."""
+        return FeatureMap.written(self, observations, None, features)[0], state
+
+
+def as_state(observations: X) -> X:
+    """(..., N O) of observations (..., N, O)."""
+    return observations.reshape(*observations.shape[:-2], -1)
+
+
 def from_dict(data: Mapping[str, Any]) -> FeatureMap:
     """The map that a run's config.json describes."""
     plus = data["plus"]
@@ -618,7 +656,7 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
         raise UserError(f"The run's feature map is damaged: steps of {data['dt']} s are none; train the run again.")
     if not 0 <= data.get("late", 1.0) <= 1:
         raise UserError(f"The run's feature map is damaged: {data['late']} is no share of a step; train the run again.")
-    kind = _Joint if data["joint"] else FeatureMap
+    kind = _Team if data.get("team") else _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
     map = replace(map, turns=_turns(data), mirrored=_mirrored(data))
     if data.get("dt") is not None:
@@ -653,6 +691,7 @@ def to_dict(map: FeatureMap) -> dict[str, Any]:
         "plus": map.plus.tolist(),
         "minus": map.minus.tolist(),
         "joint": isinstance(map, _Joint),
+        **({"team": True} if isinstance(map, _Team) else {}),
         "follows": list(map.follows),
         **({"turns": [list(turn) for turn in map.turns]} if map.turns else {}),
         **({"mirrored": [[list(entries), sign] for entries, sign in map.mirrored]} if map.mirrored else {}),

@@ -114,13 +114,14 @@ class Columns:
 def relative(
     observations: np.ndarray,
     names: Sequence[str],
-    joined: tuple[np.ndarray, Sequence[str]] | None = None,
+    joined: tuple[np.ndarray, Sequence[str] | None] | None = None,
     first_rows: np.ndarray | None = None,
     keep: Collection[str] = (),
 ) -> Columns:
     """The columns of observations (M, N, O), with the names that follow from logs (problem/inferred_names.py): others
     and things by how far they are from who sees them. Where an agent sees no other, others are those of the global
-    state (M, S) that is `joined`, with its names. Entries to `keep` stay."""
+    state (M, S) that is `joined`, with its names, or without any if it is made of everybody's observations: then they
+    are where their names say. Entries to `keep` stay."""
     columns = Columns.as_seen(observations.shape[1], names)
     steps = _Steps.of(observations, first_rows)
     state = None if joined is None else joined[0]
@@ -135,7 +136,8 @@ def relative(
     columns = columns.less(of_others)
     found = called(columns)
     if joined is not None and not any(re.match(r"other\d+\.", name) for name in found):
-        columns = columns.with_others(_of_state(steps, free, names, joined, keep))
+        seen = free if joined[1] is not None else list(_own_axes(steps, free, found).values())
+        columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
     own = _own_axes(steps, free, found)
     of_things = _of_things(steps, [d for d in free if d not in of_others], names, own)
@@ -217,11 +219,12 @@ def _of_state(
     steps: _Steps,
     free: Sequence[int],
     names: Sequence[str],
-    joined: tuple[np.ndarray, Sequence[str]],
+    joined: tuple[np.ndarray, Sequence[str] | None],
     keep: Collection[str],
 ) -> dict[int, list[int]]:
     """Own entries that the state tells of every agent: the state's entries of each."""
     state, called = joined
+    stays = [s for s, name in enumerate(called or ()) if name in keep]
     known = np.asarray(state[steps.rows], np.float64)
     found: dict[int, list[int]] = {}
     for own in [d for d in free if steps.smooth(d)]:
@@ -231,7 +234,7 @@ def _of_state(
             gap = np.abs(known - steps.before[:, agent, own, None])  # (W, S)
             same = (gap <= EXACT * steps.deviation[own]).mean(0) >= SHARE
             entries = np.flatnonzero(same).tolist()
-            where += [s for s in entries if s not in (*taken, *where) and called[s] not in keep][:1]
+            where += [s for s in entries if s not in (*taken, *where, *stays)][:1]
         if len(where) == steps.before.shape[1]:
             found[own] = where
     return found if _are_places(found, names) else {}

@@ -78,7 +78,8 @@ def make_job(
     if task.env is None and store is not None and a.limit is not None and store.card.cost_limit is not None:
         limits[a.limit] = float(store.card.cost_limit)
     config = algos.configured(a, preset, {**limits, **changes})
-    feature_map = task.feature_map(config.view, store)
+    wanted = a.world_settings(config)
+    feature_map = task.feature_map(config.view, store, team=wanted is not None)  # who reads a World, sees as it does
     spec = task.spec(feature_map, store)
     cost_source = a.cost_source(config)
     hazard = _bound(task, spec, cost_source, config.view, store)
@@ -86,7 +87,6 @@ def make_job(
     if store is not None and cost_source != "nothing" and not store.costs.any():
         _refuse_blank_costs(a.name, task, store, cost_source)
     settings = None
-    wanted = a.world_settings(config)
     if wanted is not None and store is not None:
         settings = dataclasses.asdict(worlds.settings_for(store, task, **{**wanted, **(world or {})}))
     elif world:

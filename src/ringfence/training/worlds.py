@@ -81,7 +81,7 @@ def fit(
     require_resolved(store)
     task = task or registry.from_store(store)
     settings, store = settings_for(store, task, **changes), task.logs(store)
-    map = task.feature_map(settings.view, store)
+    map = task.feature_map(settings.view, store, team=settings.execution == "centralized")
     spec = task.spec(map, store)
     needed = settings.labels == "formula" and settings.barrier
     for note in odd_names(store) if needed else odd_danger(store, task):

@@ -14,15 +14,32 @@ from ringfence.world.causes import Cause, narrowed
 WIDEST = 4  # entries of one cause
 # That one looks into; who has no such entry looks to where he moves.
 DIRECTIONS = (("own.cos", "own.sin"), ("own.heading",), ("own.yaw",), ("own.theta",), ("own.vx", "own.vy"))
+ROW = 3  # entries at least that names number
+NAMELESS = ("obs", "state", "entry")  # what numbers alone tell apart is no row
 ORDINALS = ("", "second ", "third ", "fourth ", "fifth ", "sixth ")  # nearest of several things, that causes read
 
 
 def candidates(names: Sequence[str]) -> Iterator[Cause]:
     """Every entry and every two entries of oneself, and of each kind of thing; of two also their length."""
+    yield from _rows(names)
     yield from _sets("", [_own(names)])
     for kind, each in things_of(names).items():
         yield from _sets(kind, each)
     yield from (cause for cause in offsets(names) if len(cause.things[0]) > 2)
+
+
+def _rows(names: Sequence[str]) -> Iterator[Cause]:
+    """Entries that names number, of which any may be dangerous: rays of a lidar (`lidar_0`, `ray3`), cells of a
+    battery. As numbers, and as how long they are: what is nearer than anything was, is as dangerous."""
+    found: dict[str, list[tuple[int, int]]] = {}
+    for d, name in enumerate(names):
+        if (match := re.fullmatch(r"([\w.]*?[a-z])[._[ ]?(\d+)]?", name)) and match[1] not in NAMELESS:
+            found.setdefault(match[1], []).append((int(match[2]), d))
+    for name, row in found.items():
+        if len(row) >= ROW:
+            entries = tuple((d,) for _, d in sorted(row))
+            yield Cause(name, entries)
+            yield Cause(name, entries, length=True)
 
 
 def offsets(names: Sequence[str]) -> list[Cause]:

@@ -144,6 +144,8 @@ def _fitted(
     whole = logged = Logged.of(store, map, out, labels)
     moved = store.digest("observations", "state", "actions", "episode_ends", "terminated") + _digest(out)
     moved += "".join(_bounds(store)) + "".join(str(tuple(turn)) for turn in map.turns)
+    if "observations" in map.reads and (map.minus >= 0).any():  # the same arrays are other features then
+        moved += f"less {_digest(map.plus)} {_digest(map.minus)}"
 
     world = blank_world(map, spec, settings)
     value = _values(logged, moved, world.values, parts, quiet)
