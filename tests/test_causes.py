@@ -1,6 +1,7 @@
 """Causes of danger: found by what is never safe, learned by small networks, asked, judged."""
 
 import dataclasses
+import types
 
 import equinox as eqx
 import jax
@@ -780,6 +781,17 @@ def test_velocities_follow_from_speed_and_heading():
     guess = jnp.asarray(rows, jnp.float32).at[1:, :, 3:].set(0.0)
     np.testing.assert_allclose(found.agreed(guess[None])[0], rows, atol=1e-5)
     assert features.from_dict(features.to_dict(found)) == found
+
+
+def test_no_card_asks_for_more_rows_than_a_planner_plans():
+    from ringfence.guards.policy import _held_by_plans
+
+    asked = {"horizon": 15, "within_logs": True}
+    planner = types.SimpleNamespace(rows_planned=7)
+    assert _held_by_plans(planner, asked) == {"horizon": 7, "within_logs": True}
+    assert _held_by_plans(planner, {"horizon": 5}) == {"horizon": 5}
+    assert _held_by_plans(planner, {"terminal_value": True}) == {"terminal_value": True}
+    assert _held_by_plans(lambda obs: obs, asked) == asked
 
 
 def test_a_guard_looks_as_far_as_the_card_asks(fitted):

@@ -22,6 +22,7 @@ from ringfence.guards.reasons import reasons
 from ringfence.guards.shown import Shown
 from ringfence.problem import constraints, normalise
 from ringfence.problem.features import translation
+from ringfence.problem.homogeneous import agent_policy
 from ringfence.proposals.base import held, in_bounds_of
 from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
@@ -372,7 +373,7 @@ def build(
     if barrier != "analytic":
         require(world.card, anyway)
     if usual is None:
-        usual = {name: by_card(world, name, changes)} if barrier == "learned" else {}
+        usual = {name: _held_by_plans(proposal, by_card(world, name, changes))} if barrier == "learned" else {}
     _refuse_two_horizons(changes)
     if world.card.data.action_delay:
         changes = {"delay": world.card.data.action_delay, **changes}
@@ -395,6 +396,12 @@ def build(
     bound = None if hazard is None else constraints.bind_or_none(hazard, world.spec.feature_names, world.spec.n_agents)
     shown = Shown.by(world) if options.within_logs else None
     return Guarded(proposal, Guard(BarrierSource(world, barrier, bound, options.terminal_value, shown), options))
+
+
+def _held_by_plans(proposal: Any, asked: dict[str, Any]) -> dict[str, Any]:
+    """What a card asks for, but no more rows than plans of the proposal hold, where it plans."""
+    rows = getattr(agent_policy(proposal), "rows_planned", None)
+    return asked if rows is None or "horizon" not in asked else asked | {"horizon": min(asked["horizon"], rows)}
 
 
 def _refuse_two_horizons(changes: Mapping[str, Any]) -> None:

@@ -7,6 +7,7 @@ much as the place does, since one's own place is seen, too.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +18,7 @@ from ringfence.problem.inferred_names import inferred_names
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
-FIRST = 64  # of these, by which most entries are told apart
+FIRST = 8  # of these, by which most entries are told apart
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 SHARE = 0.9  # of the rows that have to agree
@@ -135,7 +136,7 @@ def relative(
     of_others = _of_others(steps, free, names)
     columns = columns.less(of_others)
     found = called(columns)
-    if joined is not None and not any(re.match(r"other\d+\.", name) for name in found):
+    if joined is not None and len(columns.plus) > 1 and not any(re.match(r"other\d+\.", name) for name in found):
         seen = free if joined[1] is not None else list(_own_axes(steps, free, found).values())
         columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
@@ -185,16 +186,23 @@ class _Steps:
         x = self.before[:, 0, entry]
         return len(np.unique(x)) >= DISTINCT * len(x)
 
-    def is_of_another(self, entry: int, own: int) -> bool:
-        """Whether what each agent sees there is what another has there of its own."""
-        x = self.before
-        near = EXACT * self.deviation[own]
-        for rows in (x[:FIRST], x):
-            gap = np.abs(rows[:, :, None, entry] - rows[:, None, :, own])  # (W, who sees, whose)
-            gap[:, np.arange(x.shape[1]), np.arange(x.shape[1])] = np.inf
-            if ((gap.min(2) <= near).mean(0) < SHARE).any():
-                return False
-        return not self.is_shared(entry)
+    def of_another(self, own: int, entries: Sequence[int]) -> list[int]:
+        """Those of the entries where what each agent sees is what another has at `own`."""
+        entries = [d for d in entries if d != own]
+        few = self.before[:: len(self.before) // FIRST + 1]
+        likely = self._like(few, own, entries, 1).mean(0)[0] > 0.5
+        left = [d for d, may_be in zip(entries, likely) if may_be and not self.is_shared(d)]
+        same = (self._like(self.before, own, left, self.before.shape[1]).mean(0) >= SHARE).all(0)
+        return [d for d, is_so in zip(left, same) if is_so]
+
+    def _like(self, rows: np.ndarray, own: int, entries: Sequence[int], agents: int) -> np.ndarray:
+        """(W, agents, k) bool: whether rows (W, N, O) have there, for the first so many, what another has at `own`."""
+        found = np.zeros((len(rows), agents, len(entries)), bool)
+        for i, j in itertools.product(range(agents), range(rows.shape[1])):
+            if i != j:
+                gap = np.abs(rows[:, i, list(entries)] - rows[:, j, own, None])
+                found[:, i] |= gap <= EXACT * self.deviation[own]
+        return found
 
     def is_shared(self, entry: int) -> bool:
         """Whether all see the same there, e.g. what time it is."""
@@ -209,9 +217,8 @@ def _of_others(steps: _Steps, free: Sequence[int], names: Sequence[str]) -> dict
     for own in [d for d in continuous if steps.smooth(d)]:
         if own in found:
             continue
-        for entry in continuous:
-            if entry not in (own, *found, *found.values()) and steps.is_of_another(entry, own):
-                found[entry] = own
+        left = [d for d in continuous if d not in found and d not in found.values()]
+        found |= dict.fromkeys(steps.of_another(own, left), own)
     return found if _are_places(set(found.values()), names) else {}
 
 

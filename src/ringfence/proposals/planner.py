@@ -55,11 +55,16 @@ class Planner(HadStart, eqx.Module):
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
 
+    @property
+    def rows_planned(self) -> int:
+        """Rows of a plan beside the present one."""
+        return self.horizon - 1
+
     def __check_init__(self):
         o = self.options
-        if o.replan > self.horizon - 1:
+        if o.replan > self.rows_planned:
             raise UserError(
-                f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.horizon - 1}."
+                f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.rows_planned}."
             )
         if o.barrier_guidance:
             raise UserError(
@@ -107,9 +112,9 @@ class Planner(HadStart, eqx.Module):
         along the rows that the World foresees if it reads the same view, else along the plans themselves."""
         if self.options.replan > 1:
             raise UserError("A guard decides at every step; use replan=1.")
-        if rows > self.horizon - 1:
+        if rows > self.rows_planned:
             raise UserError(
-                f"horizon={rows} rows are judged, but plans hold {self.horizon - 1} steps; use at most as many, or a "
+                f"horizon={rows} rows are judged, but plans hold {self.rows_planned} steps; use at most as many, or a "
                 "longer horizon."
             )
         past, present = self._context(carry, observations, state)
