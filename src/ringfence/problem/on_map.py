@@ -90,18 +90,16 @@ class Columns:
         found = self
         for own, of_agents in fields.items():
             theirs = np.array([[of_agents[j] for j in range(n) if j != i] for i in range(n)])
-            called = self.names[own].removeprefix("own.")
-            names = [f"other{k}.d{called}" for k in range(n - 1)]
-            if called == self.names[own]:
-                names = [f"{called} of another {k}" for k in range(n - 1)]
-            more = replace(
-                found,
-                plus=np.concatenate([found.plus, width + theirs], 1),
-                minus=np.concatenate([found.minus, np.repeat(self.plus[:, own, None], n - 1, 1)], 1),
-                names=(*found.names, *names),
-                of_state=found.of_state | set(of_agents),
+            given = self.names[own]
+            called = "other{}.d" + given[4:] if given.startswith("own.") else given + " of another {}"
+            names = [called.format(k) for k in range(n - 1)]
+            mine = np.repeat(self.plus[:, own, None], n - 1, 1)
+            found = Columns(
+                np.concatenate([found.plus, width + theirs], 1),
+                np.concatenate([found.minus, mine], 1),
+                (*found.names, *names),
+                found.of_state | set(of_agents),
             )
-            found = more
         return found
 
     def with_entries(self, entries: Sequence[int], names: Sequence[str]) -> Columns:
