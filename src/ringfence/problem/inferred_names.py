@@ -12,6 +12,7 @@ import itertools
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -50,7 +51,7 @@ def inferred_names(
     begin with."""
     if observations.shape[1] < 2 or any(SAID.match(name) for name in names):
         return tuple(names)
-    steps = _Steps.of(observations, first_rows)
+    steps = Steps.of(observations, first_rows)
     if steps is None:
         return tuple(names)
     fields = _with_speeds(steps, [_with_own(steps, f) for f in _fields(steps)]) or _listed(steps)
@@ -69,15 +70,16 @@ def inferred_names(
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
+class Steps:
     """Some logged steps, evenly spread."""
 
+    rows: np.ndarray  # (W,)
     before: np.ndarray  # (W, N, O)
     after: np.ndarray
-    deviation: np.ndarray  # (O,)
+    deviation: np.ndarray  # (O,) the least of any agent
 
     @classmethod
-    def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> _Steps | None:
+    def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> Self | None:
         """None where there are too few."""
         many = min(ROWS, MOST // (observations[0].size or 1))
         rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), many).astype(int))
@@ -86,7 +88,7 @@ class _Steps:
         if len(rows) < FEWEST:
             return None
         before, after = (np.asarray(observations[some], np.float64) for some in (rows, rows + 1))
-        return cls(before, after, before.std(0).min(0))
+        return cls(rows, before, after, before.std(0).min(0))
 
     def varies(self, entry: int) -> bool:
         return self.deviation[entry] > 0
@@ -100,7 +102,7 @@ class _Steps:
         return (self.after - self.before)[..., list(entries)]
 
 
-def _fields(steps: _Steps) -> Iterator[_Field]:
+def _fields(steps: Steps) -> Iterator[_Field]:
     """What agents 0 and 1 see of each other with opposite signs, where the others do so, too."""
     x = steps.before
     _, agents, width = x.shape
@@ -118,7 +120,7 @@ def _fields(steps: _Steps) -> Iterator[_Field]:
             yield _Field(tuple(entries))
 
 
-def _listed(steps: _Steps) -> list[_Field]:
+def _listed(steps: Steps) -> list[_Field]:
     """The same where others are listed by how near they are: who is in which place changes, and is found by what two
     see of each other."""
     seen = [part for part in partners.found_in(steps.before) if part.sign < 0]
@@ -132,7 +134,7 @@ def _listed(steps: _Steps) -> list[_Field]:
     return _with_speeds(steps, fields, stays)
 
 
-def _own_of_listed(steps: _Steps, entries: Sequence[int], who: np.ndarray, known: np.ndarray) -> int | None:
+def _own_of_listed(steps: Steps, entries: Sequence[int], who: np.ndarray, known: np.ndarray) -> int | None:
     """The entry of one's own that what is seen of others is the difference of, where there is one."""
     x = steps.before
     seen = x[..., list(entries[: who.shape[-1]])]
@@ -148,13 +150,13 @@ def _pairs(agents: int) -> Iterator[tuple[int, int]]:
     return ((i, j) for i in range(agents) for j in range(i + 1, agents))
 
 
-def _mirrored(steps: _Steps, entries: list[int]) -> bool:
+def _mirrored(steps: Steps, entries: list[int]) -> bool:
     """Whether any two agents see each other with opposite signs; others are the team without oneself, in order."""
     x = steps.before
     return all(steps.equal(x[:, i, entries[j - 1]], -x[:, j, entries[i]], entries[i]) for i, j in _pairs(x.shape[1]))
 
 
-def _with_own(steps: _Steps, found: _Field) -> _Field:
+def _with_own(steps: Steps, found: _Field) -> _Field:
     """The field with the entry of one's own that it is the difference of, where there is one."""
     x = steps.before
     for own in range(x.shape[2]):
@@ -166,19 +168,19 @@ def _with_own(steps: _Steps, found: _Field) -> _Field:
     return found
 
 
-def _with_speeds(steps: _Steps, fields: list[_Field], where: np.ndarray | None = None) -> list[_Field]:
+def _with_speeds(steps: Steps, fields: list[_Field], where: np.ndarray | None = None) -> list[_Field]:
     """The fields, each with the one that is its rate of change, in all steps or `where` (W, N, k) the first k of the
     others stay who they are."""
     places = None if where is None else where.shape[-1]
     for place in fields:
         others = [f for f in fields if f is not place and f.speed is not place]
-        left = [_unlike(steps, place.entries[:places], f.entries[:places], where) for f in others]
+        left = [unlike(steps, place.entries[:places], f.entries[:places], where) for f in others]
         if left and min(left) <= LIKE:
             place.speed = others[int(np.argmin(left))]
     return fields
 
 
-def _of_axis(steps: _Steps, place: _Field, axis: str) -> dict[int, str]:
+def _of_axis(steps: Steps, place: _Field, axis: str) -> dict[int, str]:
     """Names, by entry, of the places and speeds of others and of oneself along an axis."""
     own_speed = place.speed.own if place.speed else _own_speed(steps, place)
     own = {f"own.{axis}": place.own, f"own.v{axis}": own_speed}
@@ -189,21 +191,21 @@ def _of_axis(steps: _Steps, place: _Field, axis: str) -> dict[int, str]:
     return found
 
 
-def _own_speed(steps: _Steps, place: _Field) -> int | None:
+def _own_speed(steps: Steps, place: _Field) -> int | None:
     """The entry that is the rate of change of one's own place."""
     if place.own is None:
         return None
     entries = [e for e in range(len(steps.deviation)) if steps.varies(e) and e not in (place.own, *place.entries)]
-    left = [_unlike(steps, [place.own], [e]) for e in entries]
+    left = [unlike(steps, [place.own], [e]) for e in entries]
     return entries[int(np.argmin(left))] if left and min(left) <= LIKE else None
 
 
-def _unlike(steps: _Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray | None = None) -> float:
+def unlike(steps: Steps, places: Sequence[int], speeds: Sequence[int], where: np.ndarray | None = None) -> float:
     """By what share of their changes places are off what speeds predict, of all or `where` (W, N, k)."""
     return _off(steps, steps.change(places)[... if where is None else where].ravel(), speeds, where)
 
 
-def _off(steps: _Steps, change: np.ndarray, speeds: Sequence[int], where: np.ndarray | None = None) -> float:
+def _off(steps: Steps, change: np.ndarray, speeds: Sequence[int], where: np.ndarray | None = None) -> float:
     """By what share of changes (M,) they are off what speeds predict, in nine of ten steps; the seconds of a step are
     those that predict best."""
     if not change.size:
@@ -218,7 +220,7 @@ def _off(steps: _Steps, change: np.ndarray, speeds: Sequence[int], where: np.nda
     return min(found)
 
 
-def _still(steps: _Steps, places: Sequence[_Field], named: set[int]) -> Iterator[tuple[int, str]]:
+def _still(steps: Steps, places: Sequence[_Field], named: set[int]) -> Iterator[tuple[int, str]]:
     """Entries that change as one's own place does, with the opposite sign: where things are that stand still."""
     found = []
     for place in places:
@@ -232,7 +234,7 @@ def _still(steps: _Steps, places: Sequence[_Field], named: set[int]) -> Iterator
             yield entry, f"still_{letter}.d{axis}"
 
 
-def _heading(steps: _Steps, found: Mapping[int, str]) -> dict[int, str]:
+def _heading(steps: Steps, found: Mapping[int, str]) -> dict[int, str]:
     """Names of a direction in which a body moves that has one, as two entries or an angle: its velocity is along it, or
     the change of its place; in that case of its speed, too."""
     at = {name: entry for entry, name in found.items()}
@@ -248,7 +250,7 @@ def _heading(steps: _Steps, found: Mapping[int, str]) -> dict[int, str]:
     return {}
 
 
-def _direction(steps: _Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapping[int, str]) -> dict[int, str]:
+def _direction(steps: Steps, rows: np.ndarray, velocity: np.ndarray, found: Mapping[int, str]) -> dict[int, str]:
     """Names of the entries of `rows` (W, N, O) along which velocities (W N, 2) are."""
     speed = np.linalg.norm(velocity, axis=-1)
     moves = speed > np.median(speed)
@@ -272,7 +274,7 @@ def _direction(steps: _Steps, rows: np.ndarray, velocity: np.ndarray, found: Map
     return {}
 
 
-def _speed_ahead(steps: _Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:
+def _speed_ahead(steps: Steps, moved: np.ndarray, named: set[int]) -> dict[int, str]:
     """The name of the entry that says how far bodies with a direction move (W N, 2) in a step, where there is one."""
     length = np.linalg.norm(moved, axis=-1)
     free = [e for e in range(len(steps.deviation)) if e not in named and steps.varies(e)]
@@ -281,7 +283,7 @@ def _speed_ahead(steps: _Steps, moved: np.ndarray, named: set[int]) -> dict[int,
     return {} if best is None or off[best] > LIKE else {best: "own.v"}
 
 
-def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]:
+def _things(steps: Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]]:
     """Entries that tell where things are that move by themselves: places with a velocity that is relative to one's
     own."""
     at = {name: entry for entry, name in found.items()}
@@ -292,7 +294,7 @@ def _things(steps: _Steps, found: Mapping[int, str]) -> Iterator[tuple[int, str]
         free = [e for e in range(len(steps.deviation)) if e not in found and steps.varies(e)]
         pairs.append([])
         for speed in [e for e in free if _is_relative(steps, e, own)]:
-            off = {e: _unlike(steps, [e], [speed]) for e in free if e != speed}
+            off = {e: unlike(steps, [e], [speed]) for e in free if e != speed}
             place = min(off, key=off.__getitem__, default=speed)
             if place != speed and off[place] <= LIKE:
                 pairs[-1].append((place, speed))
@@ -336,7 +338,7 @@ def _common_words(names: Sequence[str]) -> str:
     return "".join(words) + numbers[0] if numbers else "_".join(words)
 
 
-def _is_relative(steps: _Steps, entry: int, own: int) -> bool:
+def _is_relative(steps: Steps, entry: int, own: int) -> bool:
     """Whether an entry changes against one's own velocity, and by little else."""
     change = steps.change([entry])[..., 0].ravel()
     left = change + steps.change([own])[..., 0].ravel()

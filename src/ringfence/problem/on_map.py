@@ -14,17 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ringfence.problem.inferred_names import inferred_names
+from ringfence.problem.inferred_names import EXACT, LIKE, SHARE, Steps, inferred_names, unlike
 
-ROWS = 2000  # that are compared
-FEWEST = 50  # below which nothing is said
-FIRST = 8  # of these, by which most entries are told apart
-MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
-EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
-SHARE = 0.9  # of the rows that have to agree
+FIRST = 8  # of the rows that are compared, by which most entries are told apart
 DISTINCT = 0.2  # of the rows: what takes fewer values is a flag or a count, and alike by chance
 LEAP = 0.5  # of the range: what changes by more in a step begins again, as angles do
-LIKE = 0.05  # of its change: what a velocity predicts is off by less
 ALIKE = 0.5  # correlation of what changes along with one's own place
 SPREAD = 0.1  # of the range of one's own place: by less nothing varies that is on the same map
 MINE = re.compile(r"(?:(?:own|ego|self|me|agent|robot|pos|position|p)[._]?)?([xyz])")
@@ -147,36 +141,12 @@ def relative(
 
 
 @dataclass(frozen=True, eq=False)
-class _Steps:
-    """Some logged steps, evenly spread."""
-
-    rows: np.ndarray  # (W,)
-    before: np.ndarray  # (W, N, O)
-    after: np.ndarray
-    deviation: np.ndarray  # (O,) the least of any agent
-
-    @classmethod
-    def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> _Steps | None:
-        """None where there are too few."""
-        many = min(ROWS, MOST // (observations[0].size or 1))
-        rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), many).astype(int))
-        if first_rows is not None:
-            rows = rows[~np.isin(rows + 1, first_rows)]
-        if len(rows) < FEWEST:
-            return None
-        before, after = (np.asarray(observations[some], np.float64) for some in (rows, rows + 1))
-        return cls(rows, before, after, before.std(0).min(0))
-
-    def varies(self, entry: int) -> bool:
-        return self.deviation[entry] > 0
-
-    def change(self, entry: int) -> np.ndarray:
-        """(W, N) of an entry in a step."""
-        return self.after[..., entry] - self.before[..., entry]
+class _Steps(Steps):
+    """Some logged steps, evenly spread, and what their entries look like."""
 
     def smooth(self, entry: int) -> bool:
         """Whether it takes many values and never leaps."""
-        leap = np.abs(self.change(entry)).max()
+        leap = np.abs(self.change([entry])).max()
         return self.is_continuous(entry) and bool(leap <= LEAP * np.ptp(self.before[..., entry]))
 
     def is_continuous(self, entry: int) -> bool:
@@ -261,7 +231,7 @@ def _of_things(steps: _Steps, free: Sequence[int], names: Sequence[str], own: di
         found |= {d: own[axis] for axis, d in places.items()}
         for axis, d in places.items():
             speed, mine = of.get((True, axis)), own.get(f"v{axis}")
-            if speed is not None and mine is not None and _is_rate(steps, d, speed):
+            if speed is not None and mine is not None and unlike(steps, [d], [speed]) <= LIKE:
                 found[speed] = mine
     return found
 
@@ -302,7 +272,7 @@ def _own_axes(steps: _Steps, free: Sequence[int], found: Sequence[str]) -> dict[
         if match := MINE.fullmatch(found[d].lower()):
             own.setdefault(match[1], d)
     for axis, d in dict(own).items():
-        fast = next((e for e in free if e != d and _is_rate(steps, d, e)), None)
+        fast = next((e for e in free if e != d and unlike(steps, [d], [e]) <= LIKE), None)
         if fast is not None:
             own[f"v{axis}"] = fast
     return own
@@ -313,20 +283,9 @@ def _is_fixed(steps: _Steps, entry: int, own: int) -> bool:
     relative to oneself all of that does, and of what is so in other units a share, but nothing else then."""
     if not steps.varies(own):
         return False
-    moved, change = steps.change(own).ravel(), steps.change(entry).ravel()
+    moved, change = steps.change([own]).ravel(), steps.change([entry]).ravel()
     both, size = (change * moved).sum(), (moved**2).sum()
     alike = both**2 > ALIKE**2 * size * (change**2).sum()
     least, most = (np.quantile(steps.before[..., [entry, own]], q, axis=(0, 1)) for q in (0.1, 0.9))
     on_one_map = least.max() < most.min() and (most - least).min() > SPREAD * (most - least).max()
     return bool(not alike and both > -0.5 * size and on_one_map)
-
-
-def _is_rate(steps: _Steps, place: int, speed: int) -> bool:
-    """Whether an entry is how fast another changes."""
-    change = steps.change(place).ravel()
-    for rows in (steps.after, steps.before):
-        fast = rows[..., speed].ravel()
-        dt = (change * fast).sum() / max((fast**2).sum(), 1e-12)
-        if dt > 0 and np.quantile(np.abs(change - dt * fast), SHARE) <= LIKE * np.quantile(np.abs(change), SHARE):
-            return True
-    return False
