@@ -7,7 +7,7 @@ from unittest import mock
 
 import gymnasium
 import numpy as np
-from _system import Carts, EpisodeStore, entries, length
+from _system import AmongPeople, Carts, EpisodeStore, entries, length
 
 
 class Mapped(Carts):
@@ -116,7 +116,7 @@ class Posts(Mapped):
         return bool(length(self.p[:, None] - self.posts[None]).min() < self.near)
 
 
-class Walkers(Mapped):
+class Walkers(AmongPeople, Mapped):
     """Carts among two people who walk to and fro: within 0.8 m of one."""
 
     names = entries(
@@ -124,19 +124,8 @@ class Walkers(Mapped):
     )
     away = (2, 4)
 
-    def begin(self, rng):
-        super().begin(rng)
-        around = rng.uniform(0, 2 * np.pi, 2)
-        self.walk = 0.5 * np.stack([np.cos(around), np.sin(around)], 1)
-        self.people = rng.uniform(-3, 3, (2, 2))
-
     def around(self):
         return np.repeat(np.concatenate([self.people, self.walk], 1).reshape(1, -1), self.n, 0)
-
-    def move(self, actions):
-        self.walk = np.where(np.abs(self.people + self.dt * self.walk) > 4, -self.walk, self.walk)
-        self.people = self.people + self.dt * self.walk
-        return super().move(actions)
 
     def danger(self):
         return bool(length(self.p[:, None] - self.people[None]).min() < self.near)

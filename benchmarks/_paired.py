@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import argparse
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
 from _rows import append, read
 from _system import System
+from readme import put
 
 import ringfence
 from ringfence.evaluation.statistics import upper_bound
@@ -26,6 +29,21 @@ class Pair:
     whole: str
     less: str
     lacking: Callable[[], AbstractContextManager[object]]
+
+    def main(self, doc: str, systems: Mapping[str, type[System]], seed: int, marks: tuple[str, str]) -> None:
+        """The command: rows of some systems or all; or what is dangerous, and all rows, between marks of a page."""
+        parser = argparse.ArgumentParser(description=doc.splitlines()[0])
+        parser.add_argument("systems", nargs="*", help=", ".join(systems))
+        parser.add_argument("--seed", type=int, default=seed, help="of the logs")
+        parser.add_argument("--table", action="store_true", help="make no rows")
+        given = parser.parse_args()
+        warnings.simplefilter("ignore")
+        if given.table:
+            for mark, text in zip(marks, (in_words(systems.values()), self.table(systems))):
+                put("docs/proving-ground.md", mark, text)
+            return
+        for name in given.systems or systems:
+            self.made(name, systems[name], given.seed)
 
     def made(self, name: str, system: type[System], seed: int) -> None:
         """The rows of a system, by logs of this seed, that are not there."""

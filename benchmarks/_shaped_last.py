@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 from _shaped_more import Pushed
-from _system import Carts, entries, length
+from _system import AmongPeople, entries, length
 
 
 class Downwash(Pushed):
@@ -46,7 +46,7 @@ class Downwash(Pushed):
         return action
 
 
-class Pickers(Carts):
+class Pickers(AmongPeople):
     """Carts among two people who walk to and fro: within 1.5 m of one of them nobody may drive faster than 0.4 m/s."""
 
     n, noise = 3, (0.9, 0.25)
@@ -55,22 +55,11 @@ class Pickers(Carts):
     push, fastest = 2.5, 1.6
     near, slow = 1.5, 0.4
 
-    def begin(self, rng):
-        super().begin(rng)
-        around = rng.uniform(0, 2 * np.pi, 2)
-        self.walk = 0.5 * np.stack([np.cos(around), np.sin(around)], 1)
-        self.people = rng.uniform(-3, 3, (2, 2))
-
     def seen(self):
         rows = super().seen()
         relative = [self.people[None] - self.p[:, None], self.walk[None] - self.v[:, None]]
         people = np.concatenate(relative, -1).reshape(self.n, -1)
         return np.concatenate([rows[:, :6], people, rows[:, 6:]], 1)
-
-    def move(self, actions):
-        self.walk = np.where(np.abs(self.people + self.dt * self.walk) > 4, -self.walk, self.walk)
-        self.people = self.people + self.dt * self.walk
-        return super().move(actions)
 
     def danger(self):
         near = length(self.people[None] - self.p[:, None]).min(1) < self.near

@@ -136,3 +136,18 @@ class Carts(System):
         far = length(gap)[:, None]
         wanted = gap / np.maximum(far, 1e-6) * np.minimum(fastest, np.sqrt(1.5 * far))
         return np.clip(0.5 * (wanted - seen[:, 2:4]) / (cls.dt * cls.push), -1, 1)
+
+
+class AmongPeople(Carts):
+    """Carts among two people who walk to and fro."""
+
+    def begin(self, rng):
+        super().begin(rng)
+        around = rng.uniform(0, 2 * np.pi, 2)
+        self.walk = 0.5 * np.stack([np.cos(around), np.sin(around)], 1)
+        self.people = rng.uniform(-3, 3, (2, 2))
+
+    def move(self, actions):
+        self.walk = np.where(np.abs(self.people + self.dt * self.walk) > 4, -self.walk, self.walk)
+        self.people = self.people + self.dt * self.walk
+        return super().move(actions)

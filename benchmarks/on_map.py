@@ -10,16 +10,13 @@ Rows that are in results/on_map.csv already are not made again.
 
 from __future__ import annotations
 
-import argparse
-import warnings
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from unittest import mock
 
 from _mapped import Alone, Listed, Mapped, Posts, Stated, Unnamed, Walkers
-from _paired import Pair, in_words
-from readme import put
+from _paired import Pair
 
 from ringfence.problem import on_map
 from ringfence.problem.inferred_names import inferred_names
@@ -44,20 +41,5 @@ def as_they_are():
 PAIR = Pair(OUT, "how far away", "places as they are", as_they_are)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("systems", nargs="*", help=", ".join(NAMED))
-    parser.add_argument("--seed", type=int, default=13, help="of the logs")
-    parser.add_argument("--table", action="store_true", help="make no rows")
-    given = parser.parse_args()
-    warnings.simplefilter("ignore")
-    if given.table:
-        put("docs/proving-ground.md", "mapped", in_words(SYSTEMS))
-        put("docs/proving-ground.md", "on-map", PAIR.table(NAMED))
-        return
-    for name in given.systems or NAMED:
-        PAIR.made(name, NAMED[name], given.seed)
-
-
 if __name__ == "__main__":
-    main()
+    PAIR.main(str(__doc__), NAMED, 13, ("mapped", "on-map"))

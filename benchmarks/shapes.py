@@ -11,18 +11,15 @@ Rows that are in results/shapes.csv already are not made again.
 
 from __future__ import annotations
 
-import argparse
-import warnings
 from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
-from _paired import Pair, in_words
+from _paired import Pair
 from _shaped import Docks, Meeting, Sector, Sprayers
 from _shaped_last import Downwash, Pickers, Swarm
 from _shaped_more import Bikes, Boats, Crowd, Depot, Junction, Persons, Rays
 from _system import System
-from readme import put
 
 from ringfence.world import cause_candidates, cause_search
 
@@ -45,20 +42,5 @@ def without_more_shapes():
 PAIR = Pair(OUT, "more shapes", "no more shapes", without_more_shapes)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("systems", nargs="*", help=", ".join(NAMED))
-    parser.add_argument("--seed", type=int, default=SEED, help="of the logs")
-    parser.add_argument("--table", action="store_true", help="make no rows")
-    given = parser.parse_args()
-    warnings.simplefilter("ignore")
-    if given.table:
-        put("docs/proving-ground.md", "shaped", in_words(SYSTEMS))
-        put("docs/proving-ground.md", "shapes", PAIR.table(NAMED))
-        return
-    for name in given.systems or NAMED:
-        PAIR.made(name, NAMED[name], given.seed)
-
-
 if __name__ == "__main__":
-    main()
+    PAIR.main(str(__doc__), NAMED, SEED, ("shaped", "shapes"))
