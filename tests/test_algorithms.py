@@ -137,9 +137,8 @@ def test_killed_and_resumed_equals_uninterrupted(small_store, trained, tmp_path)
 
 
 def test_no_weight_is_madiff(small_store, tmp_path):
-    """λ = 0: the planner's networks are MADIFF's, but for how two programs round."""
-    changes = {**TINY["icbf"], "condition": "return", "barrier_weight": 0.0}
-    zero = loop.train("icbf", small_store, out=tmp_path, **job_of("icbf") | {"changes": changes})[0]
+    """λ = 0, the default: the planner's networks are MADIFF's, but for how two programs round."""
+    zero = loop.train("icbf", small_store, out=tmp_path, **job_of("icbf"))[0]
     plain = loop.train("madiff", small_store, out=tmp_path, **job_of("madiff"))[0]
     from safetensors.numpy import load_file
 
@@ -182,12 +181,14 @@ def test_seeds_in_one_program_match_seeds_apart(small_store, tmp_path):
 def test_gradient_depths(small_store, small_world, gradient):
     """The barrier's share of the loss reaches the denoiser through the sampler, too."""
     task = registry.from_store(small_store)
-    job = make_job("icbf", task, None, {**TINY["icbf"], "gradient": gradient}, small_store, QUICK_WORLD)
+    job = make_job(
+        "icbf", task, None, {**TINY["icbf"], "gradient": gradient, "barrier_weight": 1.0}, small_store, QUICK_WORLD
+    )
     data = loop.windows_of(job, small_store, small_world)
     key = jax.random.key(0)
     state = job.algorithm.init(key, job.spec, job.config, data, job.feature_map, job.hazard, small_world)
     loss = icbf.make_loss(job.config, job.feature_map, job.hazard)
-    batch = draw(data.arrays, jax.random.key(1), 16, 4)
+    batch = draw(data.arrays, jax.random.key(1), 16, 4, job.config.window_history)
 
     @jax.jit
     def pull(denoiser):
@@ -269,14 +270,14 @@ def test_names_of_variants_follow_values(trained):
     """Neither the order nor the spelling of options makes another variant; those that results hold keep their names."""
     run = Run(trained["icbf"].path)
     for options, name in (
-        ({"guard": "select", "num_samples": 3}, "split+select-learned+num_samples3"),
-        ({"planner": "value_guided", "sampling_steps": 2}, "split+value_guided+sampling_steps2"),
-        ({"margin": 0, "horizon": "2", "guard": "shield"}, "split+shield-learned+horizon2+margin0.0"),
-        ({"value_guidance": "1e1"}, "split+value_guidance10.0"),
-        ({"guard": "adapt", "barrier": "analytic", "adapt": 0.2}, "split+adapt-analytic+adapt0.2"),
+        ({"guard": "select", "num_samples": 3}, "default+select-learned+num_samples3"),
+        ({"planner": "value_guided", "sampling_steps": 2}, "default+value_guided+sampling_steps2"),
+        ({"margin": 0, "horizon": "2", "guard": "shield"}, "default+shield-learned+horizon2+margin0.0"),
+        ({"value_guidance": "1e1"}, "default+value_guidance10.0"),
+        ({"guard": "adapt", "barrier": "analytic", "adapt": 0.2}, "default+adapt-analytic+adapt0.2"),
     ):
         assert resolve.resolve(PolicySpec.of(run, **options)).variant("test") == name
-    assert evaluate(run, episodes=1, sampling_steps="2")["variant"] == "split+sampling_steps2"
+    assert evaluate(run, episodes=1, sampling_steps="2")["variant"] == "default+sampling_steps2"
 
 
 @pytest.mark.parametrize(
@@ -365,7 +366,9 @@ def test_bad_input_is_refused(small_store, trained, tmp_path):
     with pytest.raises(UserError, match="another run .its data's content differs"):
         loop.train("icbf", more, out=run.path.parents[2], **job_of("icbf"))
     with pytest.raises(UserError, match="width=100 must be a multiple of 16"):
-        loop.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100})
+        loop.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "width": 100, "net": "attention"})
+    with pytest.raises(UserError, match="distinguish_agents is of the net attention; leave it out with net='residual'"):
+        loop.train("madiff", small_store, out=tmp_path, changes={**TINY["madiff"], "distinguish_agents": True})
     blank = {"card": small_store.card.updated(task="mine", hazard={"kind": "CostColumn"})}
     blank = dataclasses.replace(small_store, costs=0 * small_store.costs, **blank)
     for name in ("icbf", "fisor", "bc-safe", "ma-td3bc-lag"):

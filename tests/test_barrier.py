@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.algos import icbf, joint
+from ringfence.algos import icbf
+from ringfence.algos.algorithm1 import loss_of_agent
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData, at
@@ -64,44 +65,45 @@ def test_a_parked_agent_is_satisfied_from_the_fixed_point_on():
     cases = [(m, delta, scaled) for m, delta in ((0.0, 0.1), (0.9, 0.02), (0.5, 0.1)) for scaled in (True, False)]
 
     @jax.jit
-    def losses(levels):  # (cases, 3) constant barriers -> (cases, 3, 2)
+    def losses(levels):  # (cases, 3) constant barriers -> (cases, 3)
         def of(case, h):
             m, delta, scaled = case
             h = jnp.full((1, 5, 2), h)
-            got = joint.hinges(h, ~everywhere, everywhere, everywhere, cbf.Retention(m), 0.0, delta, scaled)
-            return jnp.stack([got.retention, got.safe])
+            one = jnp.ones((1, 1, 1))
+            return cbf.shaping(h, everywhere, cbf.Retention(m), 0.0, delta, scaled, one)
 
         return jnp.stack([jax.vmap(lambda h, c=case: of(c, h))(level) for case, level in zip(cases, levels)])
 
     points = np.array([delta if scaled else delta / (1 - m) for m, delta, scaled in cases])
-    levels = points[:, None] * [0.99, 1.01, 10.0]
-    met = np.asarray(losses(levels)) < 1e-7
-    np.testing.assert_array_equal(met[..., 0], [[False, True, True]] * len(cases))
-    np.testing.assert_array_equal(met[..., 1], levels >= np.array([delta for _, delta, _ in cases])[:, None])
+    met = np.asarray(losses(points[:, None] * [0.99, 1.01, 10.0])) < 1e-7
+    np.testing.assert_array_equal(met, [[False, True, True]] * len(cases))
 
 
 # ---------------------------------------------------------------------------------------------------------------------
 # hinges
 
 
-def test_hinges_are_means_over_their_sets():
-    h = np.array([0.5, 0.05, -0.3, 0.2], np.float32)[None, :, None]
-    safe = np.array([True, True, False, True])[None, :, None]
-    hinges = jax.jit(lambda valid: joint.hinges(h, ~safe, safe, valid, cbf.Retention(0.5), 0.0, 0.1, False))
-    got = hinges(np.ones((1, 4, 1), bool))
-    assert float(got.safe) == pytest.approx((0.1 - 0.05) / 3)
-    assert float(got.unsafe) == 0
-    # pairs that start in a safe state: (0.5, 0.05), (0.05, -0.3)
-    assert float(got.retention) == pytest.approx(((0.1 - 0.05 + 0.25) + (0.1 + 0.3 + 0.025)) / 2)
-    assert {k: round(float(v), 4) for k, v in got.metrics.items()} == {
+def test_the_printed_loss_is_a_sum_over_the_states_of_a_plan():
+    h = np.array([0.05, 0.5, -0.3, 0.2], np.float32)[None]
+    safe = np.array([True, True, False, True])[None]
+    of = jax.jit(lambda valid, first: loss_of_agent(h, ~safe, safe, valid, first, cbf.Retention(0.5), 0.0, 0.1))
+    everywhere = np.ones((1, 4), bool)
+    # pairs that start in a safe state: (0.05, 0.5), (0.5, -0.3)
+    pairs = 0.1 + 0.3 + 0.25
+    loss, metrics = of(everywhere, np.array([False]))
+    assert float(loss) == pytest.approx(pairs)
+    assert {k.removeprefix("barrier/made_"): round(float(v), 4) for k, v in metrics.items()} == {
         "accuracy_safe": 1.0,
         "accuracy_unsafe": 1.0,
-        "accuracy_retention": 0.0,
+        "accuracy_retention": 0.5,
         "share_unsafe": 0.25,
     }
-    shorter = hinges(np.array([True, True, False, False])[None, :, None])  # the last two rows are padding
-    assert float(shorter.retention) == pytest.approx(0.1 - 0.05 + 0.25)
-    assert float(shorter.metrics["share_unsafe"]) == 0
+    loss, _ = of(everywhere, np.array([True]))  # S_0: where an episode begins, and there alone
+    assert float(loss) == pytest.approx(pairs + 0.1 - 0.05)
+    loss, metrics = of(np.array([True, True, False, False])[None], np.array([True]))  # the last two rows are padding
+    assert float(loss) == pytest.approx(0.1 - 0.05) and float(metrics["barrier/made_share_unsafe"]) == 0
+    several = jax.jit(lambda h: loss_of_agent(h, h < 0, h >= 0, h < 9, h[:, 0] > -9, cbf.Retention(0.5), 0.0, 0.1)[0])
+    assert float(several(np.repeat(h, 3, 0))) == pytest.approx(float(several(h)))  # a mean over plans
 
 
 def test_shaping_only_ever_raises_h_and_never_blames_the_present():
@@ -140,21 +142,21 @@ def config(routing) -> icbf.Config:
 
 @pytest.fixture(scope="module")
 def losses(scene):
-    """losses(net, x, valid) -> value of L^C, its gradients to (net, x), metrics."""
-    _, batch, hazard, _, frozen = scene
+    """losses(net, x, valid) -> value of Σ_i L_i^C as printed, its gradients to (net, x)."""
+    _, _, hazard, _, frozen = scene
 
     @jax.jit
     def everything(net, x, valid):
-        one = jnp.ones((len(x), 1, 1))
-        made = icbf.Generated(x, valid, 0.1 * one, one)
-
         def of(net, x):
-            moved = made._replace(features=x)
-            c, norm = config("paper"), frozen["normaliser"]
-            return joint.joint_losses(net, norm, batch._replace(valid=valid), moved, icbf.retention(c), c, hazard)
+            unsafe, safe = hazard.labels(jax.lax.stop_gradient(x))
+            h = barrier_on(net, frozen["normaliser"], x)
+            begins = jnp.ones(len(x), bool)
+            return sum(
+                loss_of_agent(h[..., i], unsafe[..., i], safe[..., i], valid, begins, cbf.Retention(0.9), 0.1, 0.1)[0]
+                for i in range(3)
+            )
 
-        (value, metrics), pull = jax.value_and_grad(of, (0, 1), has_aux=True)(net, x)
-        return value, pull, metrics
+        return jax.value_and_grad(of, (0, 1))(net, x)
 
     return everything
 
@@ -190,7 +192,7 @@ def test_as_printed_the_dangerous_term_pays_the_generator_for_danger(scene, loss
     _, batch, hazard, net, frozen = scene
     x = batch.features.at[..., 10:14].set(0.1)  # the offsets of the others
     assert hazard.labels(x)[0].all()  # only the dangerous term is left
-    value, (to_net, to_x), _ = losses(net, x, batch.valid)
+    value, (to_net, to_x) = losses(net, x, batch.valid)
     assert value > 0 and moves(to_net) and moves(to_x)
     assert rise(net, frozen, x, -to_x) < 0  # deeper into danger
 
@@ -220,17 +222,15 @@ def test_empty_sets_are_finite(scene, losses, follow, case):
 
 
 def test_means_do_not_depend_on_the_number_of_agents():
-    """The same h for every agent gives the same losses and shares for 2 and for 6 of them."""
+    """The same h for every agent gives the same loss for 2 and for 6 of them."""
 
     def means(n):
         h = jnp.broadcast_to(jnp.linspace(-1, 1, 20).reshape(4, 5, 1), (4, 5, n))
         valid = jnp.ones((4, 5, 1), bool)
         shaped = cbf.shaping(h, valid, cbf.Retention(0.9), 0.0, 0.1, True, jnp.ones((4, 1, 1)))
-        terms = joint.hinges(h, h < 0, h >= 0, valid, cbf.Retention(0.9), 0.0, 0.1, True)
-        return [float(x) for x in (shaped, *terms[:3], terms.metrics["share_unsafe"])]
+        return float(shaped)
 
     assert means(2) == pytest.approx(means(6), rel=1e-5)
-    assert means(2)[-1] == pytest.approx(0.5)
 
 
 def test_paper_needs_a_formula():

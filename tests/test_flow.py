@@ -211,7 +211,7 @@ def test_plans_that_drivers_cannot_be_told_to_are_refused(two_drifts, tmp_path, 
 
 
 def test_agents_are_told_apart_where_asked(two_drifts, tmp_path):
-    changes = PLANS | {"num_updates": 4}
+    changes = PLANS | {"num_updates": 4, "net": "attention"}
     for apart in (False, True):
         asked = dict(changes=changes | {"distinguish_agents": apart}, out=tmp_path / str(apart), world=QUICK_WORLD)
         denoiser = load(loop.train("madiff", two_drifts, quiet=True, **asked)[0])[1].networks["denoiser"]
@@ -220,12 +220,13 @@ def test_agents_are_told_apart_where_asked(two_drifts, tmp_path):
 
 
 def test_runs_from_before_drivers_are_gone_on_with(two_drifts, tmp_path):
-    settings = dict(out=tmp_path, changes=PLANS | {"num_updates": 4}, world=QUICK_WORLD, quiet=True)
+    before = {"drivers": 0, "around": "nothing", "noisy_input": "unit", "guided": False}
+    settings = dict(out=tmp_path, changes=PLANS | before | {"num_updates": 4}, world=QUICK_WORLD, quiet=True)
     run = loop.train("madiff", two_drifts, **settings)[0]
     file = run.path / "config.json"
     about = json.loads(file.read_text())
-    assert about["config"].pop("drivers") == 0
-    assert not about["config"].pop("distinguish_agents")
+    for name, value in (before | {"distinguish_agents": False}).items():
+        assert about["config"].pop(name) == value
     file.write_text(json.dumps(about))
     assert loop.train("madiff", two_drifts, **settings)[0].path == run.path
     load(run)
@@ -236,6 +237,7 @@ class Line(eqx.Module):
 
     spec: Spec = eqx.field(static=True)
     ood_threshold: float = 1.0
+    edge: float = 0.5
 
     @property
     def dynamics(self):
@@ -249,10 +251,20 @@ class Line(eqx.Module):
         return x + action, jnp.zeros(x.shape[:-1])
 
     def apart(self, before, after):
-        return 0.5 - after
+        return self.edge - after
 
     def ahead_apart(self, x):
-        return 0.5 - x
+        return self.edge - x
+
+    def map(self, observations, state):
+        return observations
+
+
+def paid(store):
+    """The same logs with some costs."""
+    costs = np.zeros(store.rewards.shape[:1], np.float32)
+    costs[::7] = 1.0
+    return dataclasses.replace(store, costs=costs)
 
 
 def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
@@ -265,8 +277,8 @@ def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
     driver = jnp.zeros(4, jnp.int32)
 
     def drawn(share, present, steps=1):
-        options = PlanOptions(sampling_steps=steps, temperature=0.0, barrier_guidance=share)
-        asked = dataclasses.replace(policy, options=options).guided_by(Line(policy.spec))
+        options = PlanOptions(sampling_steps=steps, temperature=0.0)
+        asked = dataclasses.replace(policy, options=options).guided_by(Line(policy.spec), share)
         return np.asarray(eqx.filter_jit(asked.draw)(x, driver, jax.random.key(0), present))
 
     free = drawn(0.0, x)
@@ -280,14 +292,11 @@ def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
 def test_flow_learns_to_keep_the_margin(two_drifts, tmp_path, monkeypatch):
     """With λ the drivers' means end where danger keeps its margin, though half of the logs go beyond; a World is read
     while training alone."""
-    costs = np.zeros(two_drifts.rewards.shape[:1], np.float32)
-    costs[::7] = 1.0
-    paid = dataclasses.replace(two_drifts, costs=costs)
     line = Line(None)
     known = {"dynamics": line, "barrier": line, "ood_threshold": line.ood_threshold}
     monkeypatch.setattr(flow, "from_world", lambda world, config: known if flow.follows(config) else {})
     changes = SMALL | {"barrier_weight": 3.0, "num_updates": 200}
-    run = loop.train("flow", paid, out=tmp_path, changes=changes, world=QUICK_WORLD, quiet=True)[0]
+    run = loop.train("flow", paid(two_drifts), out=tmp_path, changes=changes, world=QUICK_WORLD, quiet=True)[0]
     policy = load(run, sampling_steps=1, temperature=0.0)[1]
     x = jnp.zeros((8, 2, 1))
     for driver in range(2):
@@ -307,11 +316,25 @@ def test_guidance_reads_the_world_that_is_given(two_drifts, run, tmp_path):
         load(flows, barrier_guidance=1.0, world=world)
     with pytest.raises(UserError, match="world is read by nothing"):
         load(flows, world=world)
-    plans = loop.train(
-        "madiff", two_drifts, out=tmp_path, changes=PLANS | {"num_updates": 4}, world=QUICK_WORLD, quiet=True
-    )
-    with pytest.raises(UserError, match="barrier_guidance=1.0 is of flow"):
-        load(plans[0], barrier_guidance=1.0)
+
+
+def test_plans_are_guided_to_the_margin(two_drifts, tmp_path, caplog):
+    """The first step of guided plans ends where danger keeps its margin; what keeps it is left as it is. A World that
+    is unfit guides nobody by itself."""
+    run = loop.train("icbf", paid(two_drifts), out=tmp_path, changes=PLANS, world=QUICK_WORLD, quiet=True)[0]
+    policy = load(run)[1]
+    assert policy.world is None and "unfit to guide by, so plans are drawn without it" in caplog.text
+    seen = jnp.zeros((16, 2, 1))
+
+    def ends(policy):
+        step = eqx.filter_jit(policy.act)(policy.initial_state(16), seen, None, jax.random.key(0))[1]
+        return np.asarray(step.action)[..., 0]
+
+    free = ends(policy)
+    guided = ends(dataclasses.replace(policy, world=Line(policy.spec), guidance=1.0))
+    assert free.max() > 0.3 and guided.max() < -0.3
+    far = Line(policy.spec, ood_threshold=1.0, edge=5.0)
+    np.testing.assert_allclose(ends(dataclasses.replace(policy, world=far, guidance=1.0)), free, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["madiff", "flow"])

@@ -9,14 +9,17 @@ later those that nobody needs are left with nothing. A generator that is given t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
 from ringfence.logs.windows import NOT_ARRIVED
-from ringfence.types import Array, Batch
+from ringfence.nets.residual import ResidualMLP
+from ringfence.problem.normalise import Normaliser
+from ringfence.proposals.drivers import driver_scores
+from ringfence.types import Array, Batch, Key, Metrics
 
 SINKHORN = 6  # rounds that balance the shares of a batch
 PRIOR_WIDTH = 64  # units of who drives, given a state
@@ -31,6 +34,65 @@ class Search:
     sigma_first: float = 0.5  # σ of the shares at the first update, in units of action
     sigma: float = 0.15  # and when `settled`
     settled: float = 0.3  # of training: σ falls until then, and drivers are used equally
+
+
+class Driven(NamedTuple):
+    """Whose the windows of a batch are."""
+
+    driver: Array  # (B,) drawn by its shares
+    loss: Array  # () L^E + L^Q
+    metrics: Metrics
+
+
+def networks(key: Key, drivers: int, seen: int, acts: int, width: int, depth: int) -> dict[str, ResidualMLP]:
+    """Joint clones of every driver, and who drives: of `seen` entries of a team, whose joint action has `acts`."""
+    kc, kq = jax.random.split(key)
+    return {
+        "clones": ResidualMLP(kc, seen, drivers * acts, width, depth),
+        "prior": ResidualMLP(kq, seen + 2, drivers, PRIOR_WIDTH, 2, 0.1),
+    }
+
+
+def driven(search: Search, params: Any, norm: Normaliser, batch: Batch, keep: Array, step: Array, key: Key) -> Driven:
+    """Whose the windows of `batch` are, by its steps (T); `keep` (B,) which of them tell the prior their score."""
+    windows, steps = batch.actions.shape[:2]
+    there = steps_there(batch)
+    seen = norm.state(batch.features[:, :-1]).reshape(windows * steps, -1)
+    actions = batch.actions.reshape(windows * steps, -1)
+    clones = params["clones"](seen).reshape(windows, steps, search.drivers, -1)
+    shares, clone_loss = cloned(search, clones, actions.reshape(windows, steps, -1), there, step)
+    driver = jax.random.categorical(key, jnp.log(shares + 1e-9))
+    guess = driver_scores(params["prior"], seen, jnp.repeat(batch.score, steps), jnp.repeat(keep, steps))
+    prior_loss = surprise(guess, shares, there)
+    metrics = {"loss/clones": clone_loss, "loss/prior": prior_loss}
+    metrics["drivers/sure"] = shares.max(-1).mean()
+    pays = worth(clones, actions.reshape(windows, steps, -1), there, shares)
+    metrics |= {"drivers/worth": pays, "drivers/found": jnp.where(pays > 0, told_apart(shares), 1.0)}
+    return Driven(driver, clone_loss + prior_loss, metrics)
+
+
+def told_apart(shares: Array) -> Array:
+    """() how many drivers shares (B, C) tell apart: exp of what a window tells of its driver, in nats."""
+    mean = shares.mean(0)
+    return jnp.exp(_entropy(mean) - _entropy(shares).mean())
+
+
+def worth(clones: Array, actions: Array, there: Array, shares: Array) -> Array:
+    """() share of the squared error in the second half of windows that is saved by following the clone that explains
+    their first half best, and not the mean of all. 0 or less where one driver made the logs: then clones differ by
+    chance, and their mean errs least. `clones` (B, T, C, N·A), `actions` (B, T, N·A), `there` (B, T), `shares`
+    (B, C)."""
+    half = actions.shape[1] // 2
+    errors = ((clones - actions[:, :, None]) ** 2).sum(-1) * there[..., None]
+    best = errors[:, :half].sum(1).argmin(-1)
+    followed = jnp.take_along_axis(errors[:, half:].sum(1), best[:, None], 1).sum()
+    mean = jnp.einsum("btca,c->bta", clones[:, half:], shares.mean(0))
+    shared = (((mean - actions[:, half:]) ** 2).sum(-1) * there[:, half:]).sum()
+    return 1.0 - followed / jnp.maximum(shared, 1e-9)
+
+
+def _entropy(shares: Array) -> Array:
+    return -(shares * jnp.log(shares + 1e-9)).sum(-1)
 
 
 def check(drivers: int, batch: int) -> None:
@@ -67,12 +129,10 @@ def spread(search: Search, step: Array) -> Array:
     return search.sigma_first * (search.sigma / search.sigma_first) ** settled
 
 
-def cloned(search: Search, net: Any, seen: Array, actions: Array, there: Array, step: Array) -> tuple[Array, Array]:
-    """Shares (B, C) of windows in drivers, which carry no gradient, and L^E of the clones `net`. `seen` (B·T, N·D)
-    standardised, `actions` (B·T, N·A), `there` (B, T) which steps count."""
-    windows, steps = there.shape
-    clones = net(seen).reshape(windows * steps, search.drivers, -1)
-    errors = ((clones - actions[:, None]) ** 2).sum(-1).reshape(windows, steps, -1) * there[..., None]
+def cloned(search: Search, clones: Array, actions: Array, there: Array, step: Array) -> tuple[Array, Array]:
+    """Shares (B, C) of windows in drivers, which carry no gradient, and L^E of what their clones do (B, T, C, N·A) for
+    `actions` (B, T, N·A); `there` (B, T) which steps count."""
+    errors = ((clones - actions[:, :, None]) ** 2).sum(-1) * there[..., None]
     explained = -errors.sum(1) / (2 * spread(search, step) ** 2)
     shares = shares_of(search, jax.lax.stop_gradient(explained), step)
     return shares, (shares[:, None] * errors).sum() / jnp.maximum(there.sum(), 1)

@@ -37,8 +37,8 @@ from ringfence.nets.residual import ResidualMLP
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions
-from ringfence.proposals.drivers import driver_scores
-from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action, short_of_margin
+from ringfence.proposals.flow import WAVES, FlowPolicy, clean_action
+from ringfence.proposals.guidance import short_of_margin
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import (
     AtLeastOne,
@@ -150,26 +150,21 @@ def make_loss(config: Config):
     def loss(params: PyTree, normaliser, batch: Batch, step: Array, key: Key, world: PyTree) -> tuple[Array, Metrics]:
         k_driver, k_noise, k_time, k_keep = jax.random.split(key, 4)
         windows, steps = batch.actions.shape[:2]
+        kept = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,)) & (config.condition != "none")
+        whose = drivers.driven(search(config), params, normaliser, batch, kept, step, k_driver)
         there = drivers.steps_there(batch)
         seen = normaliser.state(batch.features[:, :-1]).reshape(windows * steps, -1)
         actions = batch.actions.reshape(windows * steps, -1)
-        shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
-
-        driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
-        which = jnp.repeat(jax.nn.one_hot(driver, config.drivers), steps, 0)
+        which = jnp.repeat(jax.nn.one_hot(whose.driver, config.drivers), steps, 0)
         score = jnp.repeat(batch.score, steps)
-        kept = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,)) & (config.condition != "none")
         noise = jax.random.normal(k_noise, actions.shape)
         tau = jax.random.uniform(k_time, (windows * steps,))
         noised = (1.0 - tau)[:, None] * noise + tau[:, None] * actions
         clean = clean_action(params["flow"], seen, noised, tau, which, score, jnp.repeat(kept, steps))
         flow_loss = (((clean - actions) ** 2).sum(-1) * there.reshape(-1)).sum() / jnp.maximum(there.sum(), 1)
 
-        guess = driver_scores(params["prior"], seen, score, jnp.repeat(kept, steps))
-        prior_loss = drivers.surprise(guess, shares, there)
-        metrics = {"loss/clones": clone_loss, "loss/flow": flow_loss, "loss/prior": prior_loss}
-        metrics["drivers/sure"] = shares.max(-1).mean()
-        total = clone_loss + flow_loss + prior_loss
+        metrics = {**whose.metrics, "loss/flow": flow_loss}
+        total = whose.loss + flow_loss
         if follows(config):
             present = batch.features[:, :-1].reshape(windows * steps, *batch.features.shape[2:])
             taken = clean.reshape(windows * steps, *batch.actions.shape[2:])

@@ -2,40 +2,40 @@
 
 Losses, each with the paper's symbol:
     L^D  denoising of joint plans, conditioned on return, dropped with probability p          (paper, eq. 6)
-    L^C  the generator follows the World's barrier (`split`), or both learn as printed (`paper`, algos/joint.py; eq. 8)
+    L^M  the mean plan that noise is diffused around                                          (nets/mean_plan.py)
+    L^C  the generator follows the World's barrier by λ (`split`), or as printed (algos/algorithm1.py)      (eq. 8)
     L^P  inverse dynamics per agent: the action between two successive states                 (paper, eq. 10)
-    L^E, L^Q  who drives, where the log holds many drivers and `drivers` says so; a plan is of one  (algos/drivers.py)
+    L^E, L^Q  who drives; a plan is of one driver                                             (algos/drivers.py)
 
-With `barrier = False` nothing of L^C is built and the method is MADIFF (Zhu et al. 2024); with `barrier_weight` = 0
-the planner is MADIFF's.
+By default λ = 0, and the barrier guides the sampling instead (proposals/guidance.py). With `barrier = False` there is
+no barrier at all, and the method is MADIFF (Zhu et al. 2024).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ringfence.algos import drivers
-from ringfence.algos.joint import joint_losses
+from ringfence.algos.algorithm1 import make_printed_update
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData, at
 from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import infer_action
+from ringfence.nets.mean_plan import MeanPlan
 from ringfence.nets.optim import Optimiser, average, fresh
-from ringfence.nets.residual import ResidualMLP
 from ringfence.nets.team import planning_as
 from ringfence.problem import features, normalise
 from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals import conditions, diffusion
 from ringfence.proposals import retention as cbf
-from ringfence.proposals.drivers import driver_scores
+from ringfence.proposals.generator import Generator, generator
 from ringfence.proposals.planner import Planner
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
 from ringfence.utils.config import BatchSize, Count, Depth, Natural, NonNegative, Positive, Rows, Share, Width
@@ -53,29 +53,33 @@ class Config:
     history: Natural = 0  # rows of the past that are in-painted, too
     carry: Literal["own", "all"] = "own"  # entries of s̃_i that are diffused; own: the rest follows from everybody's own
     coordinates: normalise.Coordinates = "displacement"  # of plans: displacement from the present, or state
-    condition: conditions.Condition = "advantage"  # y: the window's advantage, or the return-to-go, ranked or raw
+    condition: conditions.Condition = "return"  # y: the return-to-go or the window's advantage, ranked; or raw return
     discount: Share = 0.9  # of the value that plans are conditioned on and ranked by
     observe: Literal["all", "single", "mixed"] = "all"  # agents whose present is in-painted; single: decentralised
 
     # --- denoiser ---
-    net: Literal["attention", "residual", "unet"] = "attention"  # of agents, of the whole team, MADIFF's temporal U-Net
-    width: Width = 128  # channels
+    net: Literal["residual", "attention", "unet"] = "residual"  # of the whole team, of agents, MADIFF's temporal U-Net
+    width: Width = 384  # units
     depth: Depth = 3  # blocks (attention), hidden layers (residual) or resolutions (unet)
     distinguish_agents: bool = False  # attention learns a vector of each agent; of limbs of one body it does anyway
-    drivers: Natural = 0  # that a log of many is searched for; a plan is of one of them. 0: nobody is searched for
+    drivers: Natural | None = None  # that the logs are searched for; a plan is of one of them. 0: for nobody; None: 8,
+    # or 0 where a plan is not of the whole team, or its net cannot be told
+    around: Literal["mean", "nothing"] = "mean"  # what noise is diffused around: a learned mean plan, or the origin
+    noisy_input: Literal["signal", "unit"] = "signal"  # the network is shown noisy entries × √ᾱ_k, or as they are
     diffusion_steps: Width = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
-    snr_floor: NonNegative = 0.5  # x0-prediction: least weight of a noise level
-    snr_ceiling: NonNegative = 5.0  # x0-prediction: largest weight of a noise level
+    snr_floor: NonNegative = 1.0  # x0-prediction: least weight of a noise level
+    snr_ceiling: NonNegative = 1.0  # x0-prediction: largest weight of a noise level
     clip: Positive = 5.0  # bound on clean estimates, in standard deviations
     condition_dropout: Share = 0.25  # p, share of plans that do not see the return
 
     # --- barrier ---
-    barrier: bool = True  # L^C at all
-    barrier_weight: NonNegative = 3.0  # λ of the generator's share of L^C
+    barrier: bool = True  # L^C and guidance at all
+    guided: bool = True  # a World's barrier guides the sampling, unless it is played otherwise; of `split`
+    barrier_weight: NonNegative = 0.0  # λ of the generator's share of L^C
     barrier_start: Share = 0.3  # share of training at which λ starts to rise from 0
     barrier_full: Share = 0.5  # share of training at which λ is reached
-    routing: Literal["split", "paper"] = "split"  # who gets which gradient
+    routing: Literal["split", "paper"] = "split"  # the World's barrier pulls the generator, or Algorithm 1 as printed
     delta: NonNegative = 1.0  # δ, margin of the hinges; of the World's barrier in calibrated margins
     retention: Share = 0.9  # m, largest share of h that must be kept from step to step
     relaxation: cbf.Relaxation = "signal"  # how retention is relaxed at noisy levels
@@ -93,7 +97,7 @@ class Config:
     inverse_noise: NonNegative = 0.05  # noise on the standardised step that inverse dynamics reads, as plans have some
 
     # --- optimisation ---
-    num_updates: Count = 1500  # updates
+    num_updates: Count = 2500  # updates
     batch: BatchSize = 128  # windows per update
     lr: Positive = 2e-3  # Adam, after warm-up, before cosine decay to a tenth
     warmup: Natural = 100  # updates
@@ -101,60 +105,78 @@ class Config:
     ema: Share = 0.995  # of all parameters; the policy uses the averages
 
     @property
+    def searched(self) -> int:
+        """How many drivers the logs are searched for."""
+        if self.drivers is not None:
+            return self.drivers
+        return DRIVERS if self.net != "unet" and self.observe == "all" else 0
+
+    @property
+    def guides(self) -> bool:
+        """Whether a World's barrier guides the sampling where nothing else is asked for."""
+        return self.guided and self.barrier and self.routing == "split"
+
+    @property
     def window_history(self) -> int:
         """Rows of the past that training draws: those of a plan, and before them those that tell who drives."""
-        return self.history + (DRIVER_HISTORY if self.drivers else 0)
+        return self.history + (DRIVER_HISTORY if self.searched else 0)
 
 
+DRIVERS = 8  # that are searched for: more than there are cost little, fewer mix some
 DRIVER_HISTORY = 8  # rows before a plan's own that tell whose it is; seven steps alone tell too little
 INVERSE_STEPS = 3  # steps of every window that inverse dynamics learns from
-CLONES = (384, 3)  # units and hidden layers of the joint clones that share a log of many drivers
+CLONES = (192, 2)  # units and hidden layers of the joint clones that share a log of many drivers
 
 
-_PAPER = {
-    "condition": "return",
+# Algorithm 1 as printed: noise is predicted, s̃^θ is drawn by ancestral steps with gradients, and (8) is as it stands.
+_PRINTED = {
     "routing": "paper",
-    "barrier_weight": 0.1,
+    "prediction": "epsilon",
+    "noisy_input": "unit",
+    "gradient": "chain:5",
+    "barrier_weight": 1.0,
     "barrier_start": 0.0,
     "barrier_full": 0.0,
+    "barrier_batch": 32,
     "delta": 0.02,
     "two_sided": False,
     "scaled_margin": False,
     "weigh_by_signal": False,
+    "inverse_noise": 0.0,
 }
-# A thousand steps forgive no outlier, so robots need a denoiser that is fitted well; and where nearly all data is fast,
-# a strong barrier leaves nothing to imitate. The return-to-go tells the policies of a mixed log apart; a window's
-# advantage does not, and the average of plans of a poor one and a good one stands still.
-_MUJOCO = {
-    "num_updates": 6000,
-    "width": 192,
-    "condition": "return",
-    "barrier_weight": 0.3,
-    "barrier_batch": 32,
+# A thousand steps forgive no outlier, so robots need a denoiser that is fitted well.
+_MUJOCO = {"num_updates": 6000}
+# Several policies of a level need more passes than one.
+_POOLED = {"num_updates": 4000}
+# MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU.
+_UNET = {
+    "net": "unet",
+    "width": 128,
+    "depth": 3,
+    "around": "nothing",
+    "noisy_input": "unit",
+    "horizon": 24,
+    "coordinates": "state",
+    "prediction": "epsilon",
+    "clip": 3.0,
+    "condition": "raw",
+    "discount": 0.99,
+    "batch": 64,
+    "lr": 2e-4,
+    "num_updates": 1_000_000,
 }
 PRESETS: dict[str, dict] = {
-    "split": {},
-    "split-0": {"barrier_weight": 0.0},  # the ablation of `split` that follows no barrier
-    "long": {"num_updates": 6000},  # sharp data needs it: a policy that never hesitates is imitated last
+    "default": {},
+    "pooled": _POOLED,
     "mujoco": _MUJOCO,
-    "paper": _PAPER,
-    **{f"paper-{weight}": _PAPER | {"barrier_weight": float(weight)} for weight in (1, 3, 10)},
-    "mujoco-paper": _MUJOCO | _PAPER,
-    # MADIFF's published sizes: 64 M parameters; days, not minutes, on a CPU
-    "madiff-unet": {
-        "net": "unet",
-        "width": 128,
-        "depth": 3,
-        "horizon": 24,
-        "coordinates": "state",
-        "prediction": "epsilon",
-        "clip": 3.0,
-        "condition": "raw",
-        "discount": 0.99,
-        "batch": 64,
-        "lr": 2e-4,
-        "num_updates": 1_000_000,
-    },
+    "long": {"num_updates": 12_000},
+    "shaped": {"barrier_weight": 1.0},  # the barrier pulls the generator in training, too
+    "algorithm1": _PRINTED,
+    "algorithm1-0.1": _PRINTED | {"barrier_weight": 0.1},  # the paper gives no λ
+    "algorithm1-10": _PRINTED | {"barrier_weight": 10.0},
+    "algorithm1-pooled": _PRINTED | _POOLED,
+    "algorithm1-mujoco": _PRINTED | _MUJOCO,
+    "madiff-unet": _UNET,
 }
 
 
@@ -186,9 +208,9 @@ def init(
     carried = tuple(int(i) for i in np.flatnonzero(carried_entries(config, feature_map)))
 
     def networks() -> dict:
-        params = {
-            "denoiser": build_denoiser(
-                kd,
+        def denoiser(key: Key) -> Any:
+            return build_denoiser(
+                key,
                 config.net,
                 rows,
                 d,
@@ -197,18 +219,21 @@ def init(
                 carried,
                 agents=n if feature_map.joint or config.distinguish_agents else 0,
                 team=n,
-                drivers=config.drivers,
-            ),
+                drivers=config.searched,
+            )
+
+        params = {
+            "denoiser": denoiser(kd),
             "inverse": MLP(ki, (2 * d, *[config.inverse_width] * 2, spec.action_dim), groups=n, linear=True, acts=spec),
         }
+        if config.around == "mean":
+            params["mean"] = MeanPlan(denoiser(jax.random.fold_in(kd, 1)), jnp.zeros((rows, 1, d)))
         if config.barrier and config.routing == "paper":
             groups = n if config.scope == "individual" else 1
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
-        if config.drivers:
-            kc, kq = jax.random.split(jax.random.fold_in(key, 1))
+        if config.searched:
             acts = n * spec.action_dim
-            params["clones"] = ResidualMLP(kc, seen, config.drivers * acts, *CLONES)
-            params["prior"] = ResidualMLP(kq, seen + 2, config.drivers, drivers.PRIOR_WIDTH, 2, 0.1)
+            params |= drivers.networks(jax.random.fold_in(key, 1), config.searched, seen, acts, *CLONES)
         return fresh(optimiser(config), params, "ema")
 
     if data is None:
@@ -253,10 +278,10 @@ def check(config: Config, hazard: BoundHazard) -> None:
         raise UserError(f"width={config.width} must be a multiple of {4 * HEADS}, for {HEADS} heads of equal width.")
     if config.net == "unet":
         unet.check_sizes(config.history + config.horizon, config.width, config.depth)
-    if config.distinguish_agents and config.net == "unet":
-        raise UserError("distinguish_agents is of the net attention; leave it out with net='unet'.")
-    if config.drivers:
-        drivers.check(config.drivers, config.batch)
+    if config.distinguish_agents and config.net != "attention":
+        raise UserError(f"distinguish_agents is of the net attention; leave it out with net='{config.net}'.")
+    if config.searched:
+        drivers.check(config.searched, config.batch)
         if config.net == "unet" or config.observe != "all":
             raise UserError(
                 f"drivers={config.drivers} are given to a plan of the whole team by the nets attention and residual; "
@@ -330,50 +355,49 @@ def carried_entries(config: Config, feature_map: features.FeatureMap) -> np.ndar
 
 
 def search(config: Config) -> drivers.Search:
-    return drivers.Search(config.drivers, config.num_updates)
+    return drivers.Search(config.searched, config.num_updates)
 
 
-def driving(
-    params: PyTree, batch: Batch, norm: normalise.Normaliser, step: Array, key: Key, config: Config
-) -> tuple[Array, Array, Metrics]:
-    """(L^E + L^Q, driver (B,) of every window, drawn by its shares, metrics); algos/drivers.py."""
-    k_driver, k_keep = jax.random.split(key)
-    windows, steps = batch.actions.shape[:2]
-    seen = norm.state(batch.features[:, :-1]).reshape(windows * steps, -1)
-    actions = batch.actions.reshape(windows * steps, -1)
-    there = drivers.steps_there(batch)
-    shares, clone_loss = drivers.cloned(search(config), params["clones"], seen, actions, there, step)
-    driver = jax.random.categorical(k_driver, jnp.log(shares + 1e-9))
-    keep = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (windows,))
-    guess = driver_scores(params["prior"], seen, jnp.repeat(batch.score, steps), jnp.repeat(keep, steps))
-    prior_loss = drivers.surprise(guess, shares, there)
-    metrics = {"loss/clones": clone_loss, "loss/prior": prior_loss, "drivers/sure": shares.max(-1).mean()}
-    return clone_loss + prior_loss, driver, metrics
+class Denoised(NamedTuple):
+    """What a denoiser makes of noised plans."""
+
+    losses: Metrics  # L^D, and L^M where there is a mean plan
+    clean: Array  # (B, H, N, D) the clean estimate x̂0, the known entries in-painted
+    noised: diffusion.Noised
+    mask: Array  # (B, H, N, 1) the known entries
 
 
 def denoising(
     params: PyTree,
     batch: Batch,
     plan: Array,
+    keep: Array,
     key: Key,
     config: Config,
     alpha_bar: np.ndarray,
     carried: np.ndarray,
     driver: Array | None = None,
-) -> tuple[Array, tuple[Array, diffusion.Noised, Array]]:
-    """L^D and the clean estimate x̂0 (B, H, N, D), the known entries in-painted, of plans of drivers (B,)."""
-    k1, k2, k3 = jax.random.split(key, 3)
-    mask = diffusion.known_entries(
-        visible_agents(config, k3, (plan.shape[0], plan.shape[2])), config.history, plan.shape[1]
-    )
-    noised = diffusion.add_noise(plan, mask, alpha_bar, k1)
-    keep = jax.random.bernoulli(k2, 1.0 - config.condition_dropout, (plan.shape[0],))
-    output = planning_as(params["denoiser"], driver)(noised.x, noised.k, batch.score, keep)
+) -> Denoised:
+    """L^D of plans (B, H, N, D) of drivers (B,), given the condition where `keep` (B,) says so."""
+    k1, k2 = jax.random.split(key)
+    visible = visible_agents(config, k2, (plan.shape[0], plan.shape[2]))
+    mask = diffusion.known_entries(visible, config.history, plan.shape[1])
     weight = (~mask & batch.valid[..., None, None] & carried[:, None]).astype(jnp.float32)
+    losses = {}
+    centre = None
+    x0 = plan
+    if config.around == "mean":
+        centre = params["mean"](plan, mask, batch.score, keep, driver)
+        losses["loss/mean"], losses["loss/left"] = centre.surprise(plan, weight)
+        x0 = jax.lax.stop_gradient(centre).rest(plan, mask)
+    noised = diffusion.add_noise(x0, mask, alpha_bar, k1)
+    seen = diffusion.dimmed(noised.x, noised.signal, mask if config.noisy_input == "signal" else None)
+    output = planning_as(params["denoiser"], driver)(seen, noised.k, batch.score, keep)
     clip = (config.snr_floor, config.snr_ceiling)
-    loss = diffusion.denoising_loss(output, plan, noised, weight, config.prediction, clip)
+    losses["loss/denoising"] = diffusion.denoising_loss(output, x0, noised, weight, config.prediction, clip)
     clean = diffusion.to_clean(output, noised.x, noised.signal, noised.noise, config.prediction, config.clip)
-    return loss, (jnp.where(mask, plan, clean), noised, mask)
+    clean = clean if centre is None else centre.plan(clean)
+    return Denoised(losses, jnp.where(mask, plan, clean), noised, mask)
 
 
 def inverse_dynamics(params: PyTree, batch: Batch, norm: normalise.Normaliser, key: Key, config: Config) -> Array:
@@ -401,9 +425,7 @@ def generated(
     params: PyTree,
     norm: normalise.Normaliser,
     batch: Batch,
-    clean: Array,
-    noised: diffusion.Noised,
-    mask: Array,
+    made: Denoised,
     key: Key,
     config: Config,
     alpha_bar: np.ndarray,
@@ -416,35 +438,33 @@ def generated(
     etas = jnp.asarray(ret.eta(bar), jnp.float32)
     if kind == "x0":
         m = config.barrier_batch
-        weight = noised.signal[:m, ..., 0] ** 2
+        weight = made.noised.signal[:m, ..., 0] ** 2
         weight = weight if config.weigh_by_signal else jnp.ones_like(weight)
-        return Generated(norm.invert(clean[:m]), batch.valid[:m], etas[noised.k[:m]][:, None, None], weight)
-    b = min(config.gradient_batch, clean.shape[0])
-    mask = mask[:b]
+        eta = etas[made.noised.k[:m]][:, None, None]
+        return Generated(norm.invert(made.clean[:m]), batch.valid[:m], eta, weight)
+    b = min(config.gradient_batch, made.clean.shape[0])
     known = norm.apply(batch.features)[:b]
     valid = batch.valid[:b]
     one = jnp.ones((b, 1, 1))
     zero = jnp.zeros((b, 1, 1))
-
-    def inpaint(x: Array) -> Array:
-        return jnp.where(mask, known, x)
-
-    net = planning_as(params["denoiser"], None if driver is None else driver[:b])
-    predict = diffusion.guided(net, alpha_bar, batch.score[:b], 1.0, config.prediction, config.clip)
+    whose = None if driver is None else driver[:b]
+    how = (bar, config.prediction, config.clip, config.noisy_input == "signal")
+    draws = generator(params, known, made.mask[:b], batch.score[:b], whose, *how)
     if kind == "ddim":
-        x = diffusion.sample(predict, inpaint, known.shape, bar, key, n, "ddim", remat=True)
-        return Generated(norm.invert(x), valid, zero, one)
+        z = diffusion.sample(draws.predict, draws.inpaint, known.shape, bar, key, n, "ddim", remat=True)
+        return Generated(norm.invert(draws.plan(z)), valid, zero, one)
     bars = jnp.asarray(bar, jnp.float32)
-    x, top = _chained(predict, inpaint, known, bars, key, n)
+    z, top = _chained(draws, known, bars, key, n)
     weight = bars[top - n] * one if config.weigh_by_signal else one
-    return Generated(norm.invert(x), valid, etas[top - n] * one, weight)
+    return Generated(norm.invert(draws.plan(z)), valid, etas[top - n] * one, weight)
 
 
-def _chained(
-    predict: diffusion.Predict, inpaint: Callable[[Array], Array], known: Array, bars: Array, key: Key, n: int
-) -> tuple[Array, Array]:
-    """One noise level for all of `known` (B, H, N, D): n ancestral steps down from it, then the clean plan that is
+def _chained(draws: Generator, plans: Array, bars: Array, key: Key, n: int) -> tuple[Array, Array]:
+    """One noise level for all of `plans` (B, H, N, D): n ancestral steps down from it, then the clean z that is
     estimated there; and that level."""
+    predict = draws.predict
+    inpaint = draws.inpaint
+    known = jax.lax.stop_gradient(draws.rest(plans))
     k1, k2, k3 = jax.random.split(key, 3)
     top = jax.random.randint(k1, (), n, len(bars))
     x = jnp.sqrt(bars[top]) * known + jnp.sqrt(1 - bars[top]) * jax.random.normal(k2, known.shape)
@@ -487,40 +507,71 @@ def barrier_share(config: Config, step: Array) -> Array:
     return config.barrier_weight * jnp.clip((progress - config.barrier_start) / width, 0.0, 1.0)
 
 
-def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
-    """loss(params, frozen, batch, step, key) -> (scalar, metrics), all terms with the routing of the config."""
+class Plans(NamedTuple):
+    """The parts of every loss."""
+
+    loss: Array  # () L^D + L^M + L^E + L^Q
+    metrics: Metrics
+    batch: Batch  # without the rows that only tell who drives
+    made: Denoised
+    driver: Array | None  # (B,)
+
+
+def make_planning(config: Config, feature_map: features.FeatureMap):
+    """planning(params, norm, batch, step, key) -> Plans: what MADIFF learns, of one driver each."""
     alpha_bar = schedule(config)
     carried = carried_entries(config, feature_map)
 
-    def loss(params, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
-        kd, kp, _, kg = jax.random.split(key, 4)
-        norm = frozen["normaliser"]
+    def planning(params: PyTree, norm: normalise.Normaliser, batch: Batch, step: Array, key: Key) -> Plans:
+        k_keep, k_driver, k_noise = jax.random.split(key, 3)
+        keep = jax.random.bernoulli(k_keep, 1.0 - config.condition_dropout, (batch.score.shape[0],))
         driver = None
-        found = 0.0
+        found = jnp.zeros(())
         metrics = {}
-        if config.drivers:
-            found, driver, metrics = driving(params, batch, norm, step, jax.random.fold_in(key, 1), config)
+        if config.searched:
+            whose = drivers.driven(search(config), params, norm, batch, keep, step, k_driver)
+            driver = whose.driver
+            found = whose.loss
+            metrics = whose.metrics
             batch = batch.rows_from(DRIVER_HISTORY)
-        denoise, (clean, noised, mask) = denoising(
-            params, batch, norm.apply(batch.features), kd, config, alpha_bar, carried, driver
-        )
-        inverse = inverse_dynamics(params, batch, norm, kp, config)
-        metrics |= {"loss/denoising": denoise, "loss/inverse": inverse}
-        total = parts[0] * denoise + inverse + found
-        if config.barrier:
-            made = generated(params, norm, batch, clean, noised, mask, kg, config, alpha_bar, driver)
-            if carries_own(config, feature_map):
-                # Where others will be is what *they* plan: a gradient must move bodies, not one's image of them.
-                made = made._replace(features=feature_map.agreed(made.features, config.history))
-            if config.barrier_weight == 0:  # h is learned, θ must not hear of it
-                made = jax.lax.stop_gradient(made)
+        plan = norm.apply(batch.features)
+        made = denoising(params, batch, plan, keep, k_noise, config, alpha_bar, carried, driver)
+        return Plans(found + sum(made.losses.values()), metrics | made.losses, batch, made, driver)
+
+    return planning
+
+
+def make_drawing(config: Config, feature_map: features.FeatureMap):
+    """drawing(params, norm, plans, key) -> Generated: s̃^θ, in which all agents agree where the view knows how."""
+    alpha_bar = schedule(config)
+
+    def drawing(params: PyTree, norm: normalise.Normaliser, plans: Plans, key: Key) -> Generated:
+        made = generated(params, norm, plans.batch, plans.made, key, config, alpha_bar, plans.driver)
+        if not carries_own(config, feature_map):
+            return made
+        # Where others will be is what *they* plan: a gradient must move bodies, not one's image of them.
+        return made._replace(features=feature_map.agreed(made.features, config.history))
+
+    return drawing
+
+
+def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
+    """loss(params, frozen, batch, step, key) -> (scalar, metrics), all terms of `split`."""
+    planning = make_planning(config, feature_map)
+    drawing = make_drawing(config, feature_map)
+
+    def loss(params, frozen, batch: Batch, step, key: Key, parts: tuple[float, float] = (1.0, 1.0)):
+        kd, kp, kg = jax.random.split(key, 3)
+        norm = frozen["normaliser"]
+        plans = planning(params, norm, batch, step, kd)
+        inverse = inverse_dynamics(params, plans.batch, norm, kp, config)
+        metrics = plans.metrics | {"loss/inverse": inverse}
+        total = parts[0] * plans.loss + inverse
+        if config.barrier and config.barrier_weight > 0:
+            made = drawing(params, norm, plans, kg)
             share = barrier_share(config, step)
-            if config.routing == "paper":
-                theta, more = joint_losses(params["barrier"], norm, batch, made, retention(config), config, hazard)
-                total = total + (theta if config.barrier_weight == 0 else parts[1] * share * theta)
-            else:
-                theta, more = followed(frozen["barrier"], made, config)
-                total = total + parts[1] * share * theta
+            theta, more = followed(frozen["barrier"], made, config)
+            total = total + parts[1] * share * theta
             metrics |= more | {"barrier/weight": share}
         return total, metrics
 
@@ -528,7 +579,18 @@ def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHaz
 
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
-    """update(state, batch, key) -> state, metrics; pure, one Adam step on every network."""
+    """update(state, batch, key) -> state, metrics; pure, one Adam step on every network, or the steps of Algorithm 1 as
+    printed."""
+    if config.routing == "paper":
+        return make_printed_update(
+            config,
+            spec,
+            hazard,
+            make_planning(config, feature_map),
+            make_drawing(config, feature_map),
+            inverse_dynamics,
+            optimiser(config),
+        )
     loss = make_loss(config, feature_map, hazard)
     opt = optimiser(config)
 
@@ -549,7 +611,7 @@ def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, 
     loss = make_loss(config, feature_map, hazard)
 
     def diagnose(state: PyTree, batch: Batch, key: Key) -> Metrics:
-        if not config.barrier or config.barrier_weight == 0:
+        if not config.barrier or config.barrier_weight == 0 or config.routing == "paper":
             return {}
 
         def pull(parts):
@@ -589,10 +651,11 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
         horizon=config.horizon,
         history=config.history,
         prediction=config.prediction,
+        dim=config.noisy_input == "signal",
         clip=config.clip,
         discount=config.discount,
         observe=config.observe,
-        drivers=config.drivers,
+        drivers=config.searched,
         carries_own=carries_own(config, feature_map),
         spec=spec,
         feature_map=feature_map,
@@ -600,9 +663,7 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
     )
 
 
-# 1: the scale of the critic that ranks plans missed some agents' views of states, or some moments. 2: forward dynamics
-# was trained with the planner, on fewer rows. 3: critic and forward dynamics were fitted with one seed for all, `split`
-# trained a barrier of its own.
+# Before 5 plans were drawn by attention from noise around the origin.
 ICBF = Algorithm(
     "icbf",
     Config,
@@ -616,20 +677,33 @@ ICBF = Algorithm(
     make_windows=make_windows,
     world_settings=world_settings,
     from_world=from_world,
-    revision=4,
+    revision=5,
 )
-_PLAIN = {"barrier": False, "barrier_weight": 0.0}
+_PLAIN = {"barrier": False}
 MADIFF = dataclasses.replace(
     ICBF,
     name="madiff",
     presets={
-        "default": {**_PLAIN, "condition": "return"},
-        "long": {**_PLAIN, "condition": "return", "num_updates": 6000},
+        "default": _PLAIN,
+        "pooled": _PLAIN | _POOLED,
+        "mujoco": _PLAIN | _MUJOCO,
+        "long": _PLAIN | PRESETS["long"],
+        # the network, weights and noise of before the mean plan
+        "attention": {
+            **_PLAIN,
+            "net": "attention",
+            "width": 128,
+            "drivers": 0,
+            "around": "nothing",
+            "noisy_input": "unit",
+            "snr_floor": 0.5,
+            "snr_ceiling": 5.0,
+            "batch": 128,
+        },
         # MADIFF's condition and rows, at a size for CPUs; play it with the planner `published`
         "raw-return": {**_PLAIN, "condition": "raw", "discount": 0.99, "horizon": 24, "num_updates": 6000},
         # MADIFF-D: everybody plans for all from its own observation
-        "own": {**_PLAIN, "condition": "return", "view": "decentralized", "observe": "single"},
-        "mujoco": {**_MUJOCO, **_PLAIN},
-        "published": {**_PLAIN, **PRESETS["madiff-unet"]},
+        "own": {**_PLAIN, "view": "decentralized", "observe": "single"},
+        "published": {**_PLAIN, **_UNET},
     },
 )

@@ -96,6 +96,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
         "provenance": run.config["data"]["provenance"],
         "planner": spec.planner,
         "options": {} if options is None else dataclasses.asdict(options),
+        "guided": float(getattr(resolved.proposal, "guidance", 0.0)),
         "guard": "none" if guard is None else spec.guard,
         "barrier": "none" if guard is None else spec.barrier,
         "execution": worlds.execution_of(resolved.job.task, spec.execution),

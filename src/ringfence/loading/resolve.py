@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,24 +13,27 @@ from ringfence import algos
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError, unknown
-from ringfence.guards import Guard, Guarded
+from ringfence.guards import Guard, Guarded, options_of
 from ringfence.guards.policy import build
 from ringfence.loading import oracle, run_worlds
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
 from ringfence.problem.origins import Origins
-from ringfence.proposals.flow import FlowPolicy
+from ringfence.proposals.guidance import WHOLE, TakesGuidance
 from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
 from ringfence.types import Policy, PyTree, Spec
-from ringfence.utils.config import build_config
+from ringfence.utils.config import build_config, fields_of
 from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import policy_of_before, renamed
+from ringfence.utils.stored import LATER_CONFIG
 from ringfence.world import World
-from ringfence.world.verdict import require
+from ringfence.world.verdict import judge, require
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +107,7 @@ def resolve(spec: PolicySpec) -> Resolved:
     plans = isinstance(policy, TakesPlanOptions)
     if not plans:
         _refuse_target(job, dict(spec.plan_options))
-    if isinstance(policy, FlowPolicy) and policy.options.barrier_guidance:
+    if isinstance(policy, TakesGuidance):
         policy = _guided(policy, run, job, world, spec)
     if spec.guarded and spec.barrier == oracle.ORACLE:
         team = team_policy(policy, job.team, job.task.homogeneous)
@@ -137,18 +141,36 @@ def _refuse_target(job: Job, options: dict[str, Any]) -> None:
         )
 
 
-def _guided(policy: FlowPolicy, run: Run, job: Job, read: World | None, spec: PolicySpec) -> FlowPolicy:
-    """A flow whose sampling is guided by the World that would guard it."""
-    if spec.guarded:
+def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpec) -> Any:
+    """A policy whose sampling is guided by the World that its training read, or else would guard it: as asked for, and
+    where a method follows a barrier by itself, if that World is fit to."""
+    asked = policy.options.barrier_guidance
+    corrected = spec.guarded and options_of(spec.guard, spec.barrier, {}, **dict(spec.guard_options)).get(
+        "correction_steps", 0
+    )
+    if asked and corrected:
         raise UserError(
             "barrier_guidance is for actions that are followed as they are drawn, and a guard corrects them anyway; "
             "give one of the two."
         )
-    execution = worlds.execution_of(job.task, None)
-    world = run_worlds.for_guard(run, execution, spec.world, read=read, quiet=False)
+    alone = policy.options.execution == "decentralized"  # a World sees the whole team
+    by_itself = asked is None and getattr(job.config, "guides", False) and not corrected and not alone
+    if not asked and not by_itself:
+        return policy
+    world = read
+    if read is None or spec.world is not None:
+        world = run_worlds.for_guard(run, worlds.execution_of(job.task, None), spec.world, read=read, quiet=False)
+    assert world is not None, "either read in training or made for guards"
     _check_width(job, world.map, "The World")
-    require(world.card, spec.anyway)
-    return policy.guided_by(world)
+    if asked:
+        require(world.card, spec.anyway)
+    elif (world.card.verdict or judge(world.card)).word == "unfit" and not spec.anyway:
+        _log.warning(
+            f"The World of '{run.path}' is unfit to guide by, so plans are drawn without it; insist with anyway=True, "
+            "or set barrier_guidance=0."
+        )
+        return policy
+    return policy.guided_by(world, WHOLE if asked is None else asked)
 
 
 def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple[int, Policy]:
@@ -171,7 +193,8 @@ def load_job(run: Run, agents: int | None = None) -> Job:
     stored = run.config
     _refuse_lacking(run, stored)
     algorithm = algos.get(stored["algorithm"])
-    config = build_config(algorithm.Config, stored["config"], algorithm.name)
+    later = {k: v for k, v in LATER_CONFIG.items() if k in fields_of(algorithm.Config)}
+    config = build_config(algorithm.Config, {**later, **stored["config"]}, algorithm.name)
     spec = Spec.of(stored["spec"])
     hazard = constraints.from_dict(stored["hazard"])
     if stored["feature_map"] is None:

@@ -89,18 +89,32 @@ def denoising_loss(
     return (error * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 
 
+def dimmed(x: Array, signal: Array, mask: Array | None) -> Array:
+    """What a network is shown of x_k: its noisy entries × √ᾱ_k, which are pure noise where nothing is left of the
+    plan; those of `mask` are clean. Without one all is shown as it is."""
+    return x if mask is None else jnp.where(mask, x, signal * x)
+
+
 def guided(
-    net: Callable, alpha_bar: Array | np.ndarray, y: Array, guidance: float, prediction: Prediction, clip: float
+    net: Callable,
+    alpha_bar: Array | np.ndarray,
+    y: Array,
+    guidance: float,
+    prediction: Prediction,
+    clip: float,
+    mask: Array | None = None,
 ) -> Predict:
-    """Classifier-free guidance as one batched call: out(∅) + ω (out(y) − out(∅)); ω = 1 skips the second half."""
+    """Classifier-free guidance as one batched call: out(∅) + ω (out(y) − out(∅)); ω = 1 skips the second half. With a
+    `mask` of known entries (B, ...) the others are shown dimmed."""
 
     def predict(x: Array, k: Array) -> Array:
         signal, noise = _levels(alpha_bar, k, x.ndim)
         keep = jnp.ones(x.shape[0], bool)
+        seen = dimmed(x, signal, mask)
         if isinstance(guidance, (int, float)) and guidance == 1.0:
-            output = net(x, k, y, keep)
+            output = net(seen, k, y, keep)
         else:
-            both = net(jnp.concatenate([x, x]), jnp.tile(k, 2), jnp.tile(y, 2), jnp.concatenate([keep, ~keep]))
+            both = net(jnp.concatenate([seen, seen]), jnp.tile(k, 2), jnp.tile(y, 2), jnp.concatenate([keep, ~keep]))
             conditional, free = jnp.split(both, 2)
             output = free + guidance * (conditional - free)
         return to_clean(output, x, signal, noise, prediction, clip)

@@ -3,8 +3,7 @@
 noise ε (N·A) ──┐
 state, driver ──┼─► clean action â(a_τ, τ)   a_τ+Δ = a_τ + Δ (â − a_τ)/(1 − τ)    τ = 0 .. 1 in 1 to 4 steps
 
-With `barrier_guidance` w, every step moves â by w of Polyak's step to where a World's danger keeps its margin:
-f(â) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins, ŝ' = f_φ(s, â), â ← â − w f ∇f / ‖∇f‖².
+With `barrier_guidance` w, every step moves â by w of a step to where a World's danger keeps its margin (guidance.py).
 """
 
 from __future__ import annotations
@@ -20,20 +19,16 @@ import jax
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
-from ringfence.problem.constraints import lowest
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import from_unit, in_bounds_of, rolled
 from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_scores
+from ringfence.proposals.guidance import cleared, knows_danger, short_of_margin
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
-from ringfence.world.barrier import Barrier, MinBarrier
-from ringfence.world.dynamics import Dynamics
 
 WAVES = 4  # sines and cosines of τ
-MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
-LEAST_SLOPE = 1e-6  # no step is longer than by this
 UNREAD = ("sampler", "value_guidance", "persist", "reconcile", "replan", "execution")  # options of plans of states
 
 
@@ -49,17 +44,6 @@ def clean_action(net: Any, seen: Array, action: Array, tau: Array, driver: Array
     return net(jnp.concatenate([seen, action, time_entries(tau), driver, asked(seen, score, keep)], -1))
 
 
-def short_of_margin(
-    dynamics: Dynamics, barrier: Barrier | MinBarrier, ood_threshold: Array, present: Array, action: Array
-) -> Array:
-    """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. As guards do, it
-    trusts less where the ensemble disagrees."""
-    after, spread = dynamics.step(present, action)
-    score = jnp.minimum(barrier.apart(present, after), barrier.ahead_apart(after))
-    doubt = jnp.maximum(spread / ood_threshold - 1.0, 0.0)
-    return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
-
-
 class FlowPolicy(eqx.Module):
     """Follows one of the drivers that the logs were found to hold; which one is drawn when an episode begins."""
 
@@ -71,6 +55,7 @@ class FlowPolicy(eqx.Module):
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
     world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
+    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
 
     def __check_init__(self):
         usual = PlanOptions()
@@ -116,11 +101,9 @@ class FlowPolicy(eqx.Module):
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
-    def guided_by(self, world: World) -> FlowPolicy:
+    def guided_by(self, world: World, share: float) -> FlowPolicy:
         """The same, its sampling guided by the danger that this World has learned."""
-        if world.barrier is None:
-            raise UserError("barrier_guidance needs a World that knows danger; fit one on logs with costs.")
-        return dataclasses.replace(self, world=in_bounds_of(self.spec, world))
+        return dataclasses.replace(self, world=knows_danger(in_bounds_of(self.spec, world)), guidance=share)
 
     def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None) -> Array:
         """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,); guided from `present` (B, N, D'), the
@@ -151,10 +134,7 @@ class FlowPolicy(eqx.Module):
         def missing(action: Array) -> Array:
             return self._missing(present, s.own(jnp.clip(action, -1.0, 1.0).reshape(-1, s.n_agents, s.action_dim)))
 
-        short, back = jax.vjp(missing, action)
-        slope = back(jnp.ones_like(short))[0]
-        size = jnp.maximum((slope**2).sum(-1), LEAST_SLOPE)
-        return action - self.options.barrier_guidance * (short / size)[:, None] * slope
+        return cleared(missing, action, self.guidance)
 
     def _missing(self, present: Array, action: Array) -> Array:
         """(B,) what the next states lack of the margin, in all: 0 or negative."""

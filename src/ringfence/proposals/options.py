@@ -22,7 +22,9 @@ class PlanOptions:
     value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
-    barrier_guidance: NonNegative = 0.0  # share of a step to the World's margin, in every sampling step; 0: none
+    # share of a step to the World's margin, in every sampling step; 0: none; None: as the method has it (icbf: 1), and
+    # none under a guard that corrects actions anyway
+    barrier_guidance: NonNegative | None = None
     replan: AtLeastOne = 1  # steps that a plan is followed for
     execution: Literal["centralized", "decentralized"] = "centralized"  # decentralized: each agent plans for itself
 

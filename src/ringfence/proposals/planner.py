@@ -11,6 +11,8 @@ What becomes of several plans, and of what they would do, is a guard's (guard/).
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from functools import partial
 from typing import Any
 
@@ -21,18 +23,20 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.nets.heads import infer_action
-from ringfence.nets.team import planning_as
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
-from ringfence.proposals.base import from_unit
+from ringfence.proposals.base import from_unit, in_bounds_of
 from ringfence.proposals.drivers import classifier_free, drawn, driver_scores
+from ringfence.proposals.generator import Generator, generator
+from ringfence.proposals.guidance import cleared, knows_danger, short_of_margin
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.values import Critic, plan_value
 
+ROUNDS = 2  # of guidance in every sampling step: one leaves a tenth of a collision an episode, three do no better
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
@@ -46,6 +50,7 @@ class Planner(HadStart, eqx.Module):
     horizon: int = eqx.field(static=True)
     history: int = eqx.field(static=True)
     prediction: diffusion.Prediction = eqx.field(static=True)
+    dim: bool = eqx.field(static=True)  # the denoiser is shown noisy entries × √ᾱ_k
     clip: float = eqx.field(static=True)
     discount: float = eqx.field(static=True)
     observe: str = eqx.field(static=True)  # whose present was known in training
@@ -54,6 +59,12 @@ class Planner(HadStart, eqx.Module):
     spec: Spec = eqx.field(static=True)
     feature_map: FeatureMap = eqx.field(static=True)
     options: PlanOptions = eqx.field(static=True)
+    world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
+    guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
+
+    def guided_by(self, world: World, share: float) -> Planner:
+        """The same, its sampling guided by the danger that this World has learned."""
+        return dataclasses.replace(self, world=knows_danger(in_bounds_of(self.spec, world)), guidance=share)
 
     @property
     def rows_planned(self) -> int:
@@ -66,13 +77,13 @@ class Planner(HadStart, eqx.Module):
             raise UserError(
                 f"replan={o.replan} outlives a plan of {self.horizon} rows; use at most {self.rows_planned}."
             )
-        if o.barrier_guidance:
-            raise UserError(
-                f"barrier_guidance={o.barrier_guidance} is of flow, which draws actions; a diffusion planner follows a "
-                "barrier by training (icbf)."
-            )
         if self.carries_own and not o.reconcile:
             raise UserError("reconcile=False needs a model that diffuses whole states; train with carry='all'.")
+        if o.barrier_guidance and o.execution == "decentralized":
+            raise UserError(
+                f"barrier_guidance={o.barrier_guidance} asks a World that sees the whole team, which "
+                "execution='decentralized' does not; leave one of them out."
+            )
         if o.execution == "decentralized" and self.observe == "all":
             raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
         if o.execution == "centralized" and self.observe == "single":
@@ -94,12 +105,14 @@ class Planner(HadStart, eqx.Module):
         o, (past, present) = self.options, self._context(carry, observations, state)
         carry = self._with_driver(carry, present, key)
         driver = carry["driver"] if self.drivers else None
+        judged = self._judged(observations, state)
         if o.replan == 1:
-            plan = self.plans(past, present, key, 1, driver)[:, 0]
+            plan = self.plans(past, present, key, 1, driver, judged)[:, 0]
             ahead = plan[:, self.history + 1]
         else:
             fresh = carry["age"] % o.replan == 0
-            plan = jax.lax.cond(fresh, lambda: self.plans(past, present, key, 1, driver)[:, 0], lambda: carry["plan"])
+            drawn = lambda: self.plans(past, present, key, 1, driver, judged)[:, 0]  # noqa: E731
+            plan = jax.lax.cond(fresh, drawn, lambda: carry["plan"])
             ahead = jnp.take(plan, self.history + 1 + carry["age"] % o.replan, axis=1)
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
@@ -119,7 +132,8 @@ class Planner(HadStart, eqx.Module):
             )
         past, present = self._context(carry, observations, state)
         carry = self._with_driver(carry, present, key)
-        plans = self.plans(past, present, key, count, self._several(carry, present, key, count))
+        several = self._several(carry, present, key, count)
+        plans = self.plans(past, present, key, count, several, self._judged(observations, state))
         flat = plans.reshape(-1, *plans.shape[2:])
         x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
         for row in range(self.history + 1, self.history + 1 + rows):
@@ -135,6 +149,10 @@ class Planner(HadStart, eqx.Module):
         if self.history:
             past = jnp.where(carry["age"] == 0, jnp.repeat(present[:, None], self.history, 1), past)
         return past, present
+
+    def _judged(self, observations: Array, state: Array | None) -> Array | None:
+        """The present (B, N, D') as the World sees it that guides, where one does."""
+        return None if self.world is None else self.world.map(observations, state)
 
     def _kept(self, carry: PyTree, past: Array, present: Array, plan: Array) -> PyTree:
         if self.history:
@@ -159,14 +177,23 @@ class Planner(HadStart, eqx.Module):
     def _drawn(self, present: Array, key: Key) -> Array:
         """(B,) who drives at states (B, N, D), drawn, for the return that is asked for."""
         batch = present.shape[0]
-        seen = self.normaliser.state(present).reshape(batch, -1)
+        seen = self.normaliser.state(present).reshape(batch, math.prod(present.shape[1:]))  # the batch may be empty
         answer = partial(driver_scores, self.networks["prior"], seen)
         logits = classifier_free(answer, jnp.full(batch, self.options.target_return), self.options.cfg_scale)
         return drawn(logits, jax.random.normal(key, logits.shape))
 
-    def plans(self, past: Array, present: Array, key: Key, count: int, driver: Array | None = None) -> Array:
-        """(B, count, rows, N, D) plans from the present (B, N, D), of drivers (B · count,) where there are some.
-        Decentralised, every agent imagines the whole team, n times the work, and keeps its own part."""
+    def plans(
+        self,
+        past: Array,
+        present: Array,
+        key: Key,
+        count: int,
+        driver: Array | None = None,
+        judged: Array | None = None,
+    ) -> Array:
+        """(B, count, rows, N, D) plans from the present (B, N, D), of drivers (B · count,) where there are some, guided
+        from the present as a World sees it (B, N, D') where one is given. Decentralised, every agent imagines the whole
+        team, n times the work, and keeps its own part."""
         (b, n, d), rows = present.shape, self.history + self.horizon
         context = jnp.concatenate([past, present[:, None]], 1)
         local = self.options.execution == "decentralized"
@@ -174,40 +201,54 @@ class Planner(HadStart, eqx.Module):
         visible = jnp.ones((b, copies, n), bool)
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
-        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, driver)
+        judged = None if judged is None else jnp.repeat(judged, copies, 0)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, driver, judged)
         if not local:
             return x.reshape(b, count, rows, n, d)
         own = x.reshape(b, n, count, rows, n, d)
         return jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)
 
-    def sample(self, context: Array, visible: Array, key: Key, driver: Array | None = None) -> Array:
-        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), of drivers (B,)."""
+    def sample(
+        self, context: Array, visible: Array, key: Key, driver: Array | None = None, judged: Array | None = None
+    ) -> Array:
+        """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), of drivers (B,), guided
+        from the present as a World sees it (B, N, D')."""
         o, (b, _, n, d) = self.options, context.shape
         rows = self.history + self.horizon
-        known = self.normaliser.state(context)
         mask = diffusion.known_entries(visible, self.history, rows)
+        known = self.normaliser.state(context)
         known = jnp.concatenate([known, jnp.zeros((b, self.horizon - 1, n, d))], 1)
         bar = np.asarray(self.alpha_bar)
         target = jnp.full(b, o.target_return)
-        net = planning_as(self.networks["denoiser"], driver)
-        predict = diffusion.guided(net, bar, target, o.cfg_scale, self.prediction, self.clip)
+        trained = (bar, self.prediction, self.clip, self.dim)
+        made = generator(self.networks, known, mask, target, driver, *trained, o.cfg_scale)
 
-        def inpaint(x: Array) -> Array:
-            return jnp.where(mask, known, x)
-
-        def steered(x: Array, k: Array) -> Array:
-            clean = inpaint(predict(x, k))
+        def steered(z: Array, k: Array) -> Array:
+            clean = made.plan(made.predict(z, k))
             if o.value_guidance > 0:
-                slope = jax.grad(lambda c: self.merit(inpaint(c)).sum())(clean)
+                slope = jax.grad(lambda c: self.merit(made.inpaint(c)).sum())(clean)
                 size = jnp.sqrt((slope**2).sum((1, 2, 3), keepdims=True))
                 slope = slope * jnp.minimum(1.0, MAX_SLOPE / jnp.maximum(size, 1e-9))
                 level = (1.0 - jnp.asarray(bar, jnp.float32)[k]) ** o.persist
-                clean = jnp.clip(inpaint(clean + level[:, None, None, None] * slope), -self.clip, self.clip)
-            return self.normaliser.apply(self.agreed(self.normaliser.invert(clean))) if o.reconcile else clean
+                clean = jnp.clip(made.inpaint(clean + level[:, None, None, None] * slope), -self.clip, self.clip)
+            if judged is not None:
+                short = partial(self._short_of_margin, made, context[:, -1], judged)
+                clean = cleared(short, clean, self.guidance, ROUNDS)
+            if o.reconcile:
+                clean = self.normaliser.apply(self.agreed(self.normaliser.invert(clean)))
+            return made.rest(clean)
 
-        shape = (b, rows, n, d)
-        x = diffusion.sample(steered, inpaint, shape, bar, key, o.sampling_steps, o.sampler, o.temperature)
-        return self.agreed(self.normaliser.invert(x))
+        how = (o.sampling_steps, o.sampler, o.temperature)
+        z = diffusion.sample(steered, made.inpaint, (b, rows, n, d), bar, key, *how)
+        return self.agreed(self.normaliser.invert(made.plan(z)))
+
+    def _short_of_margin(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
+        """(B,) what the World says that the first step of plans (B, rows, N, D) lacks of the margin."""
+        world = self.world
+        assert world is not None and world.barrier is not None, "checked by guided_by"
+        ahead = self.agreed(self.normaliser.invert(made.inpaint(clean)))[:, self.history + 1]
+        action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
+        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, judged, action)
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""

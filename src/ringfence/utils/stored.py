@@ -43,7 +43,14 @@ GUARD_OPTIONS = {
 }
 OPTIONS = GUARD_OPTIONS | PLANNER_OPTIONS  # of those who play
 CONFIG = {"steps": "num_updates", "target": "target_return"}  # of algorithms
-LATER_CONFIG = {"drivers": 0, "distinguish_agents": False}  # fields that configs got later, at what was meant before
+# Fields that configs got later, at what was meant before.
+LATER_CONFIG = {
+    "drivers": 0,
+    "distinguish_agents": False,
+    "around": "nothing",
+    "noisy_input": "unit",
+    "guided": False,
+}
 WORLD_SETTINGS = {
     "sight": "execution",
     "members": "num_ensemble",

@@ -1,0 +1,62 @@
+"""Guidance inside sampling: what is drawn is moved to where a World's danger keeps its margin.
+
+f(a) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins,  ŝ' = f_φ(s, a)
+x ← x − w f ∇f / ‖∇f‖²      Polyak's step, of what the action a is read from
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+
+from ringfence.errors import UserError
+from ringfence.problem.constraints import lowest
+from ringfence.types import Array
+from ringfence.world import World
+from ringfence.world.barrier import Barrier, MinBarrier
+from ringfence.world.dynamics import Dynamics
+
+WHOLE = 1.0  # share of a step by which a method that follows a barrier is guided by default
+MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
+LEAST_SLOPE = 1e-6  # no step is longer than by this
+
+
+def short_of_margin(
+    dynamics: Dynamics, barrier: Barrier | MinBarrier, ood_threshold: Array, present: Array, action: Array
+) -> Array:
+    """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. As guards do, it
+    trusts less where the ensemble disagrees."""
+    after, spread = dynamics.step(present, action)
+    score = jnp.minimum(barrier.apart(present, after), barrier.ahead_apart(after))
+    doubt = jnp.maximum(spread / ood_threshold - 1.0, 0.0)
+    return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
+
+
+@runtime_checkable
+class TakesGuidance(Protocol):
+    """A policy that draws plans or actions, and can be guided by danger while it does."""
+
+    guidance: float
+
+    def guided_by(self, world: World, share: float) -> Any: ...
+
+
+def knows_danger(world: World) -> World:
+    """The World, if it can guide."""
+    if world.barrier is None:
+        raise UserError("barrier_guidance needs a World that knows danger; fit one on logs with costs.")
+    return world
+
+
+def cleared(short_of: Callable[[Array], Array], x: Array, share: float, rounds: int = 1) -> Array:
+    """x (B, ...) after `rounds` of `share` of Polyak's step to where `short_of` (B,), 0 or negative, is 0."""
+    axes = tuple(range(1, x.ndim))
+    for _ in range(rounds):
+        short, back = jax.vjp(short_of, x)
+        slope = back(jnp.ones_like(short))[0]
+        size = jnp.maximum((slope**2).sum(axes), LEAST_SLOPE)
+        x = x - share * (short / size).reshape(-1, *[1] * len(axes)) * slope
+    return x
