@@ -134,9 +134,6 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **{f"{k} steps of climbing": Way({"refine": k}) for k in (5, 10, 40)},
         "no shield after it": Way({"correction_steps": 0, "adapt": 0.0}),
     },
-    ("simple_spread-expert", "icbf:split", "select"): {
-        f"{k} plan{'s' * (k > 1)} to select from": Way({"plans": k}) for k in (1, 4, 16)
-    },
     ("crossing-hasty", "bc", "shield"): {
         **{k: v for k, v in ROWS.items() if k != "5 rows foreseen"},
         "by ℓ alone": Way({"terminal_value": False}),

@@ -25,15 +25,10 @@ PROPOSALS: dict[str, Row] = {
     "MA-TD3+BC": ("ma-td3bc", "default"),
     "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "default"),
     "OMAR": ("omar", "default"),
-    "our MADIFF": ("madiff", "default"),
-    "our MADIFF, four times the updates": ("madiff", "long"),
-    "ICBF, ours, λ = 3": ("icbf", "split"),
 }
 # The same under other guards.
 OTHERS: dict[str, Row] = {
-    "ICBF, ours, `select`": ("icbf", "split+select-learned"),
     "BC, `full`": ("bc", "default+full-learned"),
-    "ICBF, ours, `full`": ("icbf", "split+full-learned"),
     "MPC from a zero proposal (`mpc`), `full`": ("mpc", "default+full-learned"),
 }
 
@@ -61,78 +56,15 @@ QUESTIONS = (
     ),
     Question("`full`, not the shield alone", ("bc", f"default{FULL}"), ("bc", f"default{SHIELD}")),
     Question("BC under `full`, not MPC from a zero proposal", ("bc", f"default{FULL}"), ("mpc", f"default{FULL}")),
-    Question("ICBF under `full`, not BC", ("icbf", f"split{FULL}"), ("bc", f"default{FULL}")),
-    Question("ICBF under a shield, not BC", ("icbf", f"split{SHIELD}"), ("bc", f"default{SHIELD}")),
-    Question(
-        "the barrier in training (λ = 3, not 0), plans as they are", ("icbf", "split"), ("icbf", "split-0"), suite=ALONE
-    ),
-    Question("the barrier in training, under a shield", ("icbf", f"split{SHIELD}"), ("icbf", f"split-0{SHIELD}")),
-    Question(
-        "the printed losses, λ = 0.1, not MADIFF", ("icbf", "paper"), ("madiff", "default"), suite="simple_spread"
-    ),
-    Question(
-        "diffusion (λ = 0), not return-conditioned BC, under a shield",
-        ("icbf", f"split-0{SHIELD}"),
-        ("bc-return", f"advantage{SHIELD}"),
-    ),
-    Question(
-        "diffusion (MADIFF), not return-conditioned BC, under a shield",
-        ("madiff", f"default{SHIELD}"),
-        ("bc-return", f"default{SHIELD}"),
-        shown=False,
-    ),
-    Question("four times MADIFF's updates", ("madiff", "long"), ("madiff", "default"), shown=False, suite=ALONE),
-    Question(
-        "four times MADIFF's updates, under a shield", ("madiff", f"long{SHIELD}"), ("madiff", f"default{SHIELD}")
-    ),
-    Question(
-        "diffusion of four times the updates, not return-conditioned BC, under a shield",
-        ("madiff", f"long{SHIELD}"),
-        ("bc-return", f"default{SHIELD}"),
-    ),
-    Question("selection among eight plans", ("icbf", "split+select-learned"), ("icbf", "split")),
-    Question(
-        "centralized, not decentralized MADIFF, one plan for all",
-        ("madiff", "default"),
-        ("madiff", "own"),
-        shown=False,
-        suite=ALONE,
-    ),
-    Question(
-        "centralized, not decentralized MADIFF, one plan for all, under a shield",
-        ("madiff", f"default{SHIELD}"),
-        ("madiff", f"own{SHIELD}"),
-    ),
 )
 
-ADAPT, STEADY = "+adapt-learned", "+low_temperature+adapt-learned"
+ADAPT = "+adapt-learned"
 OF_ROBOTS = (
     Question("a guard (`adapt`), under BC", ("bc", f"default{ADAPT}"), ("bc", "default"), ROBOT_KEYS),
     Question(
         "danger learned, not the formula", ("bc", f"default{ADAPT}"), ("bc", "default+adapt-analytic"), ROBOT_KEYS
     ),
     Question("`full`, not `adapt`", ("bc", f"default{FULL}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
-    Question("ICBF, not BC", ("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), ROBOT_KEYS),
-    Question(
-        "ICBF, not return-conditioned BC", ("icbf", f"default{STEADY}"), ("bc-return", f"default{ADAPT}"), ROBOT_KEYS
-    ),
-    Question(
-        "ICBF under `full`, not BC", ("icbf", f"default+low_temperature{FULL}"), ("bc", f"default{FULL}"), ROBOT_KEYS
-    ),
-    Question(
-        "the barrier in training (ICBF, not MADIFF)",
-        ("icbf", f"default{STEADY}"),
-        ("madiff", f"default{STEADY}"),
-        ROBOT_KEYS,
-        shown=False,
-    ),
-    Question(
-        "diffusion (MADIFF), not return-conditioned BC",
-        ("madiff", f"default{STEADY}"),
-        ("bc-return", f"default{ADAPT}"),
-        ROBOT_KEYS,
-        shown=False,
-    ),
     Question(
         "return-conditioned BC, not BC",
         ("bc-return", f"default{ADAPT}"),
@@ -202,7 +134,6 @@ def _usual(counts: list[int]) -> int:
 ROBOTS: dict[str, Row] = {
     "BC": ("bc", f"default{ADAPT}"),
     "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
-    "ICBF": ("icbf", f"default{STEADY}"),
     "MPC, `full`": ("mpc", f"default{FULL}"),
     "MPC, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
 }

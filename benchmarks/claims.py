@@ -19,7 +19,7 @@ import numpy as np
 import pooled
 from _proven import proven
 from ablations import adjusted
-from attribution import ADAPT, FULL, OF_ROBOTS, QUESTIONS, SHIELD, STEADY, Question, answers
+from attribution import FULL, OF_ROBOTS, QUESTIONS, SHIELD, Question, answers
 from evidence import LEVEL, difference, evaluations, mean, of, tasks_of, variant
 from readme import put
 from scipy.stats import fisher_exact, spearmanr
@@ -31,7 +31,6 @@ from ringfence.utils import stored
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
 SPREAD = "results/guards/table.csv"
-ALONE = "results/guards-before/table.csv"  # more seeds, and nobody is guarded in what is read of it
 POOL = "results/pooled/simple_spread-expert-pooled.json"
 MEDIUM_POOL = "results/pooled/simple_spread-medium-pooled.json"
 RANDOM_POOL = "results/pooled/simple_spread-random-pooled.json"
@@ -274,15 +273,6 @@ def of_full_pools() -> tuple[bool, str]:
     return least > 1.2 and most < 0.34, f"full {least:.2f} at least, alone {most:.2f} at most"
 
 
-def of_planners_on_a_pool() -> tuple[bool, str]:
-    """Planners that diffuse states, on the pool of experts, beside `flow` and the drivers."""
-    found = json.loads((ROOT / POOL).read_text())
-    told = {name: found["rows"][name]["return_norm"] for name in ("madiff", "icbf", "flow")}
-    learned = told["flow"] > max(found["data"]["of_drivers"])
-    text = ", ".join(f"{name} {value:.2f}" for name, value in told.items())
-    return learned and max(told["madiff"], told["icbf"]) < 0.2, text
-
-
 def of_robot_pools() -> tuple[bool, str]:
     """What `flow` earns more than a clone on HalfCheetah's tiers, on the same resets."""
     more = {}
@@ -334,13 +324,6 @@ def of_selection() -> tuple[bool, str]:
     return all(one + 0.1 < eight < many for one, eight, many in told.values()), f"1 / 8 / 64: {text}"
 
 
-def of_madiff_asked() -> tuple[bool, str]:
-    """MADIFF asked as published, and as here, with every step between them."""
-    rows = json.loads((ROOT / "results/pooled/simple_spread-medium.json").read_text())["rows"]
-    told = {name: r["return_norm"] for name, r in rows.items() if name.startswith("madiff")}
-    return max(told, key=told.get) == "madiff, long", f"{min(told.values()):.2f} to {max(told.values()):.2f}"
-
-
 def of_rebounds() -> tuple[bool, str]:
     """Guards of a system whose bodies bounce off what they touch, and the same by states as they were logged."""
     now, before = (
@@ -382,18 +365,12 @@ def of_filters() -> tuple[bool, str]:
     return (len(fewer), sorted(more)) == (8, ["arms", "bench", "train"]), f"fewer on {len(fewer)}, more on {more}"
 
 
-PLANNER = on_robots(("icbf", f"default{STEADY}"), ("bc", f"default{ADAPT}"), 3, 1)
-UNDER_FULL = on_robots(("icbf", f"default+low_temperature{FULL}"), ("bc", f"default{FULL}"), 0, 3)
 PRIOR = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}"), 6, 1)
 ANYWHERE = on_robots(("bc", f"default{FULL}"), ("mpc", f"default{FULL}+trust_radius2.0"), 8, 0)
 
 
 def chance(found: list) -> bool:
     return not any(d.holds for d in found)
-
-
-def no_gain(found: list) -> bool:
-    return not any(d.holds and d.mean > 0 for d in found)
 
 
 def lower(found: list) -> bool:
@@ -587,14 +564,6 @@ def guards_price() -> tuple[bool, str]:
     return all(share > 0.99 and cost <= 0.005 for share, cost in shares.values()), text
 
 
-def diffusion_on_crossing() -> tuple[bool, str]:
-    """MADIFF less the actor that is told the same return: more alone, and by chance under the shield."""
-    suite, task, key = "crossing-guards", "crossing-hasty", "default+shield-learned"
-    both = [difference(suite, task, ("madiff", v), ("bc-return", v), "return") for v in ("default", key)]
-    text = ", ".join(f"{d.mean:+.3f} ({d.low:+.3f} to {d.high:+.3f})" for d in both)
-    return both[0].low > 0 > both[1].low, f"alone and under the shield {text}"
-
-
 def undelayed_logs_leave_little() -> tuple[bool, str]:
     """Episodes with contact and return under shields by Worlds of late logs, as they are and undelayed."""
     rows = {(int(r["late"]), r["world"][:12], r["delay"]): r for r in rows_of("late_logs.csv")}
@@ -709,18 +678,6 @@ CLAIMS = (
     Claim("README.md", "The safety comes from the guard", SPREAD, shielded_all),
     Claim("docs/tables.md", "learned danger does what the formula does", f"guards, {ROBOTS}", same_safety),
     Claim(
-        "README.md",
-        "Climbing learned values from its plans earns no more, beyond chance, than from cloned actions",
-        SPREAD,
-        tested(("icbf", f"split{FULL}"), ("bc", f"default{FULL}"), "return", no_gain),
-    ),
-    Claim(
-        "docs/tables.md",
-        "losses as printed (λ = 0.1) do not lower its cost",
-        "results/simple_spread/table.csv",
-        tested(("icbf", "paper"), ("madiff", "default"), "cost_safe_start", chance),
-    ),
-    Claim(
         "docs/tables.md",
         "two robot limits of 18 are not kept",
         ROBOT_ROWS,
@@ -801,22 +758,9 @@ CLAIMS = (
     Claim("docs/export.md", "which is no slower", "results/export.csv", exported_in_time),
     Claim("docs/ope.md", "Danger is ranked well", "results/judging.csv", ranks_like("played_danger", "true_cost", 0.8)),
     Claim(
-        "docs/attribution.md",
-        "On Crossing diffusion earns more alone, and under a shield no more beyond chance",
-        "results/crossing-guards/table.csv",
-        diffusion_on_crossing,
-    ),
-    Claim(
         "docs/tables.md", "climbing from nothing earns less on six of nine data sets and more on one", ROBOT_ROWS, PRIOR
     ),
     Claim("docs/attribution.md", "On Simple Spread a shield takes the cost from every proposal", SPREAD, shielded_all),
-    Claim(
-        "docs/attribution.md",
-        "earns more than cloning under the same guard on three of nine data sets and less on one",
-        ROBOT_ROWS,
-        PLANNER,
-    ),
-    Claim("docs/attribution.md", "under `full` more on none and less on three", ROBOT_ROWS, UNDER_FULL),
     Claim(
         "docs/attribution.md",
         "earns less than from cloned actions on six of nine data sets and more on one",
@@ -832,17 +776,6 @@ CLAIMS = (
     ),
     Claim(
         "docs/attribution.md",
-        "less on one. A zero proposal",
-        SPREAD,
-        tested(
-            ("icbf", f"split{FULL}"),
-            ("bc", f"default{FULL}"),
-            "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 1,
-        ),
-    ),
-    Claim(
-        "docs/attribution.md",
         "A zero proposal (`mpc`) earns less on three",
         SPREAD,
         tested(
@@ -850,56 +783,6 @@ CLAIMS = (
             ("mpc", f"default{FULL}"),
             "return",
             lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 3 and not any(d.holds and d.mean < 0 for d in ds),
-        ),
-    ),
-    Claim(
-        "docs/attribution.md",
-        "After 6000 it earns more on three and less on none",
-        SPREAD,
-        tested(
-            ("madiff", f"long{SHIELD}"),
-            ("bc-return", f"default{SHIELD}"),
-            "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 3 and not any(d.holds and d.mean > 0 for d in ds),
-        ),
-    ),
-    Claim(
-        "docs/attribution.md",
-        "One plan for all earns more than a plan of each agent's own",
-        SPREAD,
-        tested(
-            ("madiff", f"default{SHIELD}"),
-            ("madiff", f"own{SHIELD}"),
-            "return",
-            lambda ds: sum(d.holds and d.mean > 0 for d in ds) == 2 and not any(d.holds and d.mean < 0 for d in ds),
-        ),
-    ),
-    Claim(
-        "docs/attribution.md",
-        "The barrier in training lowers the cost of plans that are followed as they are",
-        ALONE,
-        tested(("icbf", "split"), ("icbf", "split-0"), "cost_safe_start", lower),
-    ),
-    Claim(
-        "docs/attribution.md",
-        "Under a shield it earns a little less on two tiers",
-        SPREAD,
-        tested(
-            ("icbf", f"split{SHIELD}"),
-            ("icbf", f"split-0{SHIELD}"),
-            "return",
-            lambda ds: sum(d.holds and d.mean < 0 for d in ds) == 2 and not any(d.holds and d.mean > 0 for d in ds),
-        ),
-    ),
-    Claim(
-        "docs/attribution.md",
-        "An actor with the same condition earns more than the diffusion model",
-        SPREAD,
-        tested(
-            ("icbf", f"split-0{SHIELD}"),
-            ("bc-return", f"advantage{SHIELD}"),
-            "return",
-            lambda ds: all(d.mean < 0 for d in ds) and sum(d.holds for d in ds) >= 3,
         ),
     ),
     Claim(
@@ -931,12 +814,6 @@ CLAIMS = (
     ),
     Claim(
         "docs/drivers-results.md",
-        "earns no more on `simple_spread-medium` than asked as we do, nor does any part of that",
-        "pooled/simple_spread-medium.json",
-        of_madiff_asked,
-    ),
-    Claim(
-        "docs/drivers-results.md",
         "earns more than a clone under the same guard on eight of nine data sets and less on none",
         "results/pooled",
         of_robots_asked(pooled.BEST, 8),
@@ -958,14 +835,6 @@ CLAIMS = (
         "On medium and random alone none earns more than 0.33; under `full` all earn 1.2 or more",
         "pooled/simple_spread-{medium,random}-pooled.json",
         of_full_pools,
-    ),
-    *(
-        Claim(page, text, POOL, of_planners_on_a_pool)
-        for page, text in (
-            ("README.md", "It does not learn logs of several drivers pooled, where a flow-matching policy does"),
-            ("docs/attribution.md", "Logs of several drivers it does not learn"),
-            ("docs/drivers-results.md", "Diffusion planners do not learn a pool"),
-        )
     ),
     Claim(
         "docs/drivers-results.md",

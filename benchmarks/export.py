@@ -38,8 +38,8 @@ POLICIES = (
     ("BC, `adapt`, learned", "bc", {"guard": "adapt"}),
     ("BC, `full`, learned", "bc", {"guard": "full"}),
     ("`madiff`", "madiff", {}),
-    ("`icbf`", "icbf-split", {}),
-    ("`icbf`, `shield`, learned", "icbf-split", {"guard": "shield"}),
+    ("`icbf`", "icbf", {}),
+    ("`icbf`, `shield`, learned", "icbf", {"guard": "shield"}),
 )
 FORMATS = {"stablehlo": "StableHLO", "onnx": "ONNX"}
 

@@ -59,8 +59,6 @@ PROPOSALS = {
     "ma-td3bc default": "MA-TD3+BC",
     "ma-td3bc-lag default": "MA-TD3+BC, Lagrange",
     "omar default": "OMAR",
-    "madiff default": "our MADIFF",
-    "icbf split": "`icbf`",
 }
 TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
 TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}

@@ -69,7 +69,12 @@ ABLATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
         "",
         {"around": "nothing", "noisy_input": "unit", "prediction": "v"},
     ),
-    "noise is predicted": ("madiff", "", {"noisy_input": "unit", "prediction": "epsilon"}),
+    "the network outputs ε": ("madiff", "", {"noisy_input": "unit", "prediction": "epsilon"}),
+    "the network outputs v, the error is of ε": (
+        "madiff",
+        "",
+        {"noisy_input": "unit", "prediction": "v", "error": "noise"},
+    ),
     "level weights 0.5 to 5": ("madiff", "", {"snr_floor": 0.5, "snr_ceiling": 5.0}),
     "attention of 128": ("madiff", "", _BEFORE),
     "attention of 128, agents told apart": ("madiff", "", _BEFORE | {"distinguish_agents": True}),
@@ -78,8 +83,7 @@ ABLATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "16 rows": ("madiff", "", {"horizon": 16}),
     "the window's advantage, not the return": ("icbf", "", {"condition": "advantage"}),
     "nobody is searched for": ("madiff", "", {"drivers": 0}),
-    "four times the updates": ("madiff", "", {"num_updates": 10_000}),
-    "four times the updates, nobody is searched for": ("madiff", "", {"num_updates": 10_000, "drivers": 0}),
+    "nobody is searched for, 10,000 updates": ("madiff", "", {"num_updates": 10_000, "drivers": 0}),
     "before (attention of 128, weights 0.5 to 5, around the origin, nobody is searched for)": OLD,
 }
 SHAPED = {f"λ = {w:g}": ("icbf", "", {"barrier_weight": w}) for w in (0.1, 0.3, 1.0, 3.0)}
@@ -98,11 +102,7 @@ GROUPS: dict[str, dict[str, Any]] = {
     },
     "algorithm1": {
         "tasks": LEARNED,
-        "rows": {
-            "λ = 1": ("icbf", "algorithm1", {}),
-            "λ = 0.1": ("icbf", "algorithm1-0.1", {}),
-            "λ = 10": ("icbf", "algorithm1-10", {}),
-        },
+        "rows": {f"λ = {w:g}": ("icbf", "algorithm1", {"barrier_weight": w}) for w in (1.0, 0.1, 10.0, 0.0)},
         "plays": ("as it is",),
     },
     "guards": {
@@ -132,7 +132,9 @@ def row(
 ) -> tuple[dict[str, Any], Any]:
     """(what is said of a run, the run)."""
     algorithm, preset, changes = what
-    chosen = preset or algos.get(algorithm).preset_for(task.presets)
+    known = algos.get(algorithm)
+    wanted = [f"{preset}-{of_task}" if preset else of_task for of_task in task.presets]
+    chosen = next((name for name in wanted if name in known.presets), preset or next(iter(known.presets)))
     named = "-".join([chosen, *(f"{k}-{v}" for k, v in changes.items())])
     folder = runs / task.name / algorithm / named / f"seed-{seed}"
     run = ringfence.train(

@@ -66,17 +66,6 @@ ROWS = {
     "omar": ("omar", "expert", {}, {}),
     "ma-td3bc": ("ma-td3bc", "default", {}, {}),
     "ma-td3bc-lag": ("ma-td3bc-lag", "default", {}, {}),
-    "madiff": ("madiff", "default", {}, {}),
-    "icbf": ("icbf", "split", {}, {}),
-    # MADIFF at inference, one step at a time: a raw return-to-go, how much of it, less noise, 24 rows.
-    "madiff, long": ("madiff", "long", {}, {}),
-    "madiff, long, 2.5 asked": ("madiff", "long", {}, {"target_return": 2.5}),
-    "madiff, long, 5 asked": ("madiff", "long", {}, {"target_return": 5.0}),
-    "madiff, long, temperature 0.5": ("madiff", "long", {}, {"temperature": 0.5}),
-    "madiff, long, 24 rows": ("madiff", "long", {"horizon": 24}, {}),
-    **{f"madiff, long, raw, {t} asked": ("madiff", "long", RAW, {"target_return": t}) for t in (0.5, 0.9, 1.5)},
-    "madiff, long, raw, 0.9 asked, temperature 0.5": ("madiff", "long", RAW, {"planner": "published"}),
-    "madiff, as published at inference": ("madiff", "raw-return", {}, {"planner": "published"}),
     **{f"flow, told raw, {t} asked": ("flow", "return", FLOW | RAW, {"target_return": t}) for t in (0.5, 0.9, 1.5)},
     "bc-return, raw, 0.9 asked": ("bc-return", "default", RAW | {"target_return": 0.9}, {}),
 }
@@ -89,8 +78,6 @@ _GUARDED = (
     "omar",
     "ma-td3bc",
     "ma-td3bc-lag",
-    "madiff",
-    "icbf",
     "flow",
     "flow, told the return",
 )
@@ -111,8 +98,7 @@ ROWS[BEST] = ("flow", "return", FLOW, {"guard": "adapt", "num_samples": 8, "sele
 # Rows that say no more than others, and are not in the table.
 UNTOLD = {
     "flow, one driver, its mean",
-    *(f"{who}, {t} asked" for who in ("flow, told raw", "madiff, long, raw") for t in (0.5, 1.5)),
-    "madiff, long, 2.5 asked",
+    *(f"flow, told raw, {t} asked" for t in (0.5, 1.5)),
     *(f"flow, {n} steps" for n in (2, 8)),
 }
 # Rows that are compared with another of the same runs, on the same resets.
@@ -268,15 +254,14 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
 
 def kept(robots: bool) -> list[dict]:
     """What the files hold, of robots' data or of the others'."""
-    files = sorted(set(RESULTS.glob("*.json")) - {RESULTS / "collapse.json"})
+    files = sorted(RESULTS.glob("*.json"))
     return [json.loads(file.read_text()) for file in files if of_robot(TASKS[file.stem]) == robots]
 
 
 def printed(task: str) -> str:
     """What others printed on the public files, which pool five learners, too."""
-    public = task.removesuffix("-pooled")
-    values = {p.name.split(" ")[0]: p.values[public] / 100 for p in PUBLISHED if public in p.values}
-    told = ", ".join(f"{name} {values[name]:.3f}" for name in ("OMAR", "MADiff-D", "MADiff-C", "CoFlow-C"))
+    values = {p.name.split(" ")[0]: p.values[task] / 100 for p in PUBLISHED if task in p.values}
+    told = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
     return f"| *as printed, on the public files: {told}* | | | | |"
 
 

@@ -37,11 +37,6 @@ ROWS = (
     ("omar", ANY, "OMAR"),
     ("ma-td3bc-lag", ANY, "MA-TD3+BC, Lagrange"),
     ("fisor", ANY, "FISOR per agent"),
-    ("madiff", "default", "MADIFF (no barrier)"),
-    ("icbf", "paper", "ICBF-Diffuser `paper`"),
-    ("icbf", "split", "ICBF-Diffuser `split`"),
-    ("madiff", "default+guarded", "MADIFF, guarded planner"),
-    ("icbf", "split+guarded", "**`split`, guarded planner**"),
 )
 ROBOTS = ("halfcheetah_2x3", "ant_2x4", "ant_4x2")
 LEVELS = ("good", "medium", "poor")
@@ -51,8 +46,6 @@ SHORT = (
     ("behaviour data", "reference", "data"),
     ("bc", "mujoco", "BC"),
     ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
-    ("madiff", "mujoco+adaptive", "MADIFF, adaptive"),
-    ("icbf", "mujoco+adaptive", "**`split`, adaptive**"),
 )
 # Pan et al. 2022, means as tabulated in MADIFF's repository; on the public files.
 PUBLISHED = {
@@ -209,12 +202,6 @@ SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
         ("simple_spread", "ma-td3bc-lag", ""),
         ("mujoco", "ma-td3bc-lag", ""),
         ("crossing-guards", "ma-td3bc-lag", "default"),
-    ),
-    "our MADIFF, 6000 updates": (("guards-before", "madiff", "long"), ("mujoco", "madiff", ""), None),
-    "ICBF-Diffuser, losses as printed, 1500 (robots 6000)": (
-        ("simple_spread", "icbf", "paper"),
-        ("mujoco", "icbf", "mujoco-paper"),
-        None,
     ),
     "BC + guard, *analytic*": (
         ("guards", "bc", "default+shield-analytic"),

@@ -25,8 +25,6 @@ METHODS = {
     "MA-TD3+BC": ("ma-td3bc", "default", "default", "o", "#D55E00"),
     "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "default", "default", "^", "#D55E00"),
     "OMAR": ("omar", "default", "default", "s", "#E69F00"),
-    "our MADIFF": ("madiff", "long", "default", "D", "#CC79A7"),
-    "ICBF-Diffuser": ("icbf", "split", "split", "D", "#009E73"),
 }
 GUARDS = {"": "alone", "+shield-learned": "under a shield", "+full-learned": "under full"}
 LEAST = 0.01  # steps: the scale is linear below

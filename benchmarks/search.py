@@ -93,7 +93,7 @@ STUDIES = {
                 {"logit_penalty": 0.0, "lr": 3e-3},
             ],
             ("madiff", "default"): [{"lr": 1e-3}, {"discount": 0.95}, {"diffusion_steps": 50}],
-            ("icbf", "split"): [{"lr": 1e-3}, {"discount": 0.95}, {"barrier_weight": 10.0}],
+            ("icbf", "default"): [{"lr": 1e-3}, {"discount": 0.95}, {"barrier_weight": 10.0}],
         },
         "learner.csv",
         learner=3,
@@ -151,17 +151,11 @@ STUDIES = {
 _WINNERS = {
     ("ma-td3bc", ""): [{"alpha": 5.0}],
     ("ma-td3bc-lag", ""): [{"multiplier_max": 3.0}],
-    ("icbf", "split"): [{"lr": 1e-3}],
 }
 STUDIES |= {
     tier: replace(STUDIES["simple_spread"], task=f"simple_spread-{tier}-pooled", settings=_WINNERS)
     for tier in ("expert", "random")
 }
-# What won over the three, on all logs of a tier.
-_ICBF = ("icbf", "split")
-STUDIES["whole"] = replace(
-    STUDIES["simple_spread"], task="simple_spread-expert", learner=None, settings={_ICBF: _WINNERS[_ICBF]}
-)
 
 
 def one(job: tuple) -> dict:

@@ -26,11 +26,11 @@ from ringfence.utils.files import whole
 OUT = Path(__file__).resolve().parent.parent / "results" / "zoo.csv"
 CELLS = {
     "simple_spread-expert/bc": "bc",
-    "simple_spread-expert/icbf": "icbf-split",
+    "simple_spread-expert/icbf": "icbf",
     "halfcheetah_2x3-good/bc": "bc-mujoco",
     "halfcheetah_2x3-good/icbf": "icbf-mujoco",
     "crossing-hasty/bc": "bc",
-    "crossing-hasty/icbf": "icbf-split",
+    "crossing-hasty/icbf": "icbf",
 }
 READERS = [name for name in CELLS if name.endswith("/icbf")]  # whose training read a World
 EPISODES = {"simple_spread-expert": 200, "halfcheetah_2x3-good": 20, "crossing-hasty": 200}

@@ -92,9 +92,9 @@ def test_cells_are_addressed_by_what_training_depends_on(made):
 
 def test_ids_of_cells_do_not_follow_the_names_of_settings():
     """Those of committed results, whose settings had other names, and had none that are younger."""
-    assert grid.Cell("simple_spread-expert", "icbf", "split", 0).id == "8f346dc462"
-    told = grid.Cell("simple_spread-expert", "icbf", "split", 0, changes=(("drivers", 2),))
-    assert told.id != "8f346dc462"
+    assert grid.Cell("simple_spread-expert", "madiff", "attention", 0).id == "9da3a6ef4d"
+    told = grid.Cell("simple_spread-expert", "madiff", "attention", 0, changes=(("drivers", 2),))
+    assert told.id != "9da3a6ef4d"
     assert grid.Cell("crossing-hasty", "bc", "default", 0).id == "c6a6824abb"
     assert grid.Cell("simple_spread-expert", "bc-return", "default", 0).id == "7e05f0949f"
 
@@ -177,11 +177,11 @@ def test_entries_are_chosen_by_algorithm_or_preset(tmp_path):
         g = make_grid("mujoco", tmp_path, seeds=1, only_tasks=[task], only=only)
         return [(c.algorithm, c.preset) for c in g.cells]
 
-    assert presets("ant_2x4-good", ["icbf"]) == [("icbf", "mujoco-paper"), ("icbf", "mujoco")]
+    assert presets("ant_2x4-good", ["icbf"]) == [("icbf", "algorithm1-mujoco"), ("icbf", "mujoco")]
     assert presets("ant_2x4-good", ["icbf:mujoco", "bc"]) == [("bc", "mujoco"), ("icbf", "mujoco")]
     assert presets("ant_2x4-good-quantile", ["icbf", "bc"]) == [
         ("bc", "mujoco"),
-        ("icbf", "mujoco-paper"),
+        ("icbf", "algorithm1-mujoco"),
         ("icbf", "mujoco"),
     ]
 
@@ -191,7 +191,7 @@ def test_the_papers_grids_are_refused_or_made_as_a_whole(tmp_path, capsys):
     both = paper.grids(tmp_path, **few)
     assert [g.suite for g in both] == ["simple_spread", "mujoco"]
     assert {c.algorithm for g in both for c in g.cells} == set(paper.METHODS)
-    for name, suite in (("icbf:split", "simple_spread"), ("icbf:mujoco", "mujoco")):
+    for name, suite in (("icbf:default", "simple_spread"), ("icbf:mujoco", "mujoco")):
         (only,) = paper.grids(tmp_path, only=[name], **few)
         assert only.suite == suite
     with pytest.raises(UserError, match="did you mean 'icbf'"):
@@ -641,8 +641,8 @@ def test_unpacking_overwrites_nothing_and_brings_back_nothing(made, tmp_path):
 def test_a_collection_is_its_suites(tmp_path):
     grids = make_grids(collected("attribution"), tmp_path, seeds=1)
     assert [g.out.name for g in grids] == list(suites.COLLECTIONS["attribution"])
-    (one,) = make_grids(collected("attribution", ["simple_spread-expert"]), tmp_path, ["icbf:split-0"], seeds=2)
-    assert [(c.task, c.preset, c.seed) for c in one.cells] == [("simple_spread-expert", "split-0", s) for s in (0, 1)]
+    (one,) = make_grids(collected("attribution", ["simple_spread-expert"]), tmp_path, ["icbf:shaped"], seeds=2)
+    assert [(c.task, c.preset, c.seed) for c in one.cells] == [("simple_spread-expert", "shaped", s) for s in (0, 1)]
     with pytest.raises(UserError, match="did you mean 'ant_2x4-good'"):
         collected("attribution", ["ant_2x4-goodd"])
 

@@ -76,9 +76,9 @@ def folder(tmp_path) -> Path:
     cell(root, {"default": summary([300, 300, 300, 300], [3, 3, 3, 3])})
     cell(root, {"default": summary([320, 320, 320, 320], [0, 4, 4, 0], unsafe=(0, 1, 0, 0))}, seed=1)
     guarded = summary([400, 420, 410, 410], [0, 0, 0, 1], plan_ms_p50=7.25, parameters=5678)
-    results = {"split": summary([200] * 4, [2, 2, 2, 2]), "split+guarded": guarded}
-    cell(root, results, "icbf", "split")
-    failed = cell(root, None, "icbf", "split", seed=1)
+    results = {"default": summary([200] * 4, [2, 2, 2, 2]), "default+guarded": guarded}
+    cell(root, results, "icbf", "default")
+    failed = cell(root, None, "icbf", "default", seed=1)
     write(failed / "status.json", {"state": "failed", "error": "Traceback ...\nMemoryError: no memory"})
     for seed in (0, 1):
         cell(root, {"default": summary([250] * 4, [0, 0, 0, 0], MEDIUM)}, seed=seed, task=MEDIUM)
@@ -100,22 +100,22 @@ def test_rows_are_read_with_their_folders(folder):
     assert (board.suite, board.episodes, board.split, board.protocol) == ("simple_spread", 4, "test", 1)
     assert board.tasks == [EXPERT, MEDIUM] and board.seeds == (0, 1)
     assert len(board.entries) == 6  # BC 2 + 2, ICBF two variants
-    guarded = next(e for e in board.entries if e.variant == "split+guarded")
+    guarded = next(e for e in board.entries if e.variant == "default+guarded")
     assert (guarded.task, guarded.algorithm, guarded.seed) == (EXPERT, "icbf", 0)
-    assert guarded.path == folder / "cells" / EXPERT / "icbf-split" / "seed-0-a1"
+    assert guarded.path == folder / "cells" / EXPERT / "icbf" / "seed-0-a1"
     assert guarded.summary["return_mean"] == 410.0
 
 
 def test_cells_without_results_are_named_with_the_reason(folder):
     assert [(m.task, m.job, m.seed, m.why) for m in read(folder).missing] == [
-        (EXPERT, "icbf-split", 1, "failed: MemoryError: no memory"),
-        (MEDIUM, "icbf-split", 0, "not started"),
-        (MEDIUM, "icbf-split", 1, "not started"),
+        (EXPERT, "icbf", 1, "failed: MemoryError: no memory"),
+        (MEDIUM, "icbf", 0, "not started"),
+        (MEDIUM, "icbf", 1, "not started"),
     ]
 
 
 def test_a_cell_done_under_another_mark_is_not_missing(folder):
-    cell(folder, {"split": summary([1] * 4, [0] * 4)}, "icbf", "split", seed=1, mark="b2")
+    cell(folder, {"default": summary([1] * 4, [0] * 4)}, "icbf", "default", seed=1, mark="b2")
     assert not [m for m in read(folder).missing if m.task == EXPERT]
 
 
@@ -127,14 +127,14 @@ def test_cells_that_the_suite_leaves_out_are_not_missing_and_entries_without_cel
     missing = {(m.task, m.seed) for m in board.missing if m.job == "icbf-long" and m.why == "not started"}
     assert missing == {(EXPERT, 1), (MEDIUM, 0), (MEDIUM, 1)}
     assert board.untouched == ["simple_spread-random"]
-    assert "omar" in board.unstarted and not {"bc", "icbf:split", "icbf:long"} & set(board.unstarted)
+    assert "omar" in board.unstarted and not {"bc", "icbf:default", "icbf:long"} & set(board.unstarted)
 
 
 def test_a_cell_that_failed_after_an_evaluation_keeps_its_row_and_is_named(folder):
-    path = folder / "cells" / EXPERT / "icbf-split" / "seed-0-a1"
+    path = folder / "cells" / EXPERT / "icbf" / "seed-0-a1"
     write(path / "status.json", {"state": "failed", "error": "KeyError: 'x'"})
     board = read(folder)
-    assert ("icbf-split", 0, "not every evaluation is there, one failed: KeyError: 'x'") in {
+    assert ("icbf", 0, "not every evaluation is there, one failed: KeyError: 'x'") in {
         (m.job, m.seed, m.why) for m in board.missing
     }
     assert len(board.entries) == 6
@@ -284,7 +284,7 @@ def test_numbers_of_a_row_by_hand(folder):
     assert bc.cost_safe_start == pytest.approx((12 + 4) / 7)  # without the unsafe start of seed 1
     assert (bc.violations, bc.episodes, bc.seeds) == (6, 8, (0, 1)) and not bc.safe
     assert (bc.train_seconds, bc.parameters, bc.plan_ms) == (10.0, 1234, None)
-    guarded = row(folder, "ICBF-Diffuser split+guarded")
+    guarded = row(folder, "ICBF-Diffuser default+guarded")
     assert guarded.returns_sd is None and guarded.plan_ms == 7.25 and guarded.violations == 1
     # 1 of 4: the bound p solves P(at most 1 of 4) = (1 - p)^4 + 4 p (1 - p)^3 = 0.05
     p = guarded.violation_upper
@@ -295,13 +295,13 @@ def test_ranks_are_lexicographic(folder):
     rows = standings(read(folder))[EXPERT]
     # guarded alone is within the limit; plain costs 2 and BC 2.5, although BC earns more
     assert [(r.label, r.rank, r.safe, r.best) for r in rows] == [
-        ("ICBF-Diffuser split+guarded", 1, True, True),
-        ("ICBF-Diffuser split", 2, False, False),
+        ("ICBF-Diffuser default+guarded", 1, True, True),
+        ("ICBF-Diffuser default", 2, False, False),
         ("BC", 3, False, False),
     ]
     cell(folder, {"default": summary([405] * 4, [0] * 4)}, "omar")
     rows = standings(read(folder))[EXPERT]
-    assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser split+guarded", 1), ("OMAR", 2)]
+    assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser default+guarded", 1), ("OMAR", 2)]
 
 
 def test_equal_methods_share_a_place(folder):
@@ -309,8 +309,8 @@ def test_equal_methods_share_a_place(folder):
     rows = standings(read(folder))[EXPERT]
     assert [(r.label, r.rank, r.best) for r in rows] == [
         ("OMAR", 1, True),
-        ("ICBF-Diffuser split+guarded", 1, True),
-        ("ICBF-Diffuser split", 3, False),
+        ("ICBF-Diffuser default+guarded", 1, True),
+        ("ICBF-Diffuser default", 3, False),
         ("BC", 4, False),
     ]
 
@@ -358,8 +358,8 @@ def test_falls_are_shown(folder, tmp_path):
 
 
 def test_nobody_within_the_limit_means_no_best(folder):
-    path = folder / "cells" / EXPERT / "icbf-split" / "seed-0-a1" / "results.json"
-    write(path, {"split": summary([900] * 4, [2] * 4)})
+    path = folder / "cells" / EXPERT / "icbf" / "seed-0-a1" / "results.json"
+    write(path, {"default": summary([900] * 4, [2] * 4)})
     assert not any(r.best for r in standings(read(folder))[EXPERT])
     assert (
         "★"
@@ -381,8 +381,8 @@ def test_aggregate_takes_methods_with_every_task(folder):
     bc = Method("bc", "default", "default")
     assert found.methods == [bc] and found.seeds == {bc: (0, 1)}
     assert {m.label: t for m, t in found.left_out.items()} == {
-        "ICBF-Diffuser split": [MEDIUM],
-        "ICBF-Diffuser split+guarded": [MEDIUM],
+        "ICBF-Diffuser default": [MEDIUM],
+        "ICBF-Diffuser default+guarded": [MEDIUM],
     }
     scores = np.array([[300, 250], [320, 250]])
     assert found.returns[bc] == pytest.approx((scores - LOW) / (HIGH - LOW))
@@ -402,7 +402,7 @@ def test_aggregate_takes_methods_with_every_task(folder):
 
 def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
     against = {c.other.label: c for c in contests(standings(read(folder))[EXPERT])}
-    assert list(against) == ["ICBF-Diffuser split", "BC"]  # the first is ICBF-Diffuser split+guarded
+    assert list(against) == ["ICBF-Diffuser default", "BC"]  # the first is ICBF-Diffuser default+guarded
     assert against["BC"].returns == 100.0 and against["BC"].cost == 0.25 - 2.5
     assert against["BC"].cost_interval[0] <= -2.25 <= against["BC"].cost_interval[1]
     # 400 420 410 410 against 310 each: four differences of one sign have p = 2/2^4 or, with ties, nearly so; the
@@ -487,7 +487,7 @@ def test_page_parses_links_resolve_and_nothing_is_loaded(folder, tmp_path):
 def test_page_shows_the_numbers(folder, tmp_path):
     expert = text_of(section_of(build_board(folder, tmp_path).read_text(), EXPERT))
     assert (tmp_path / "report.html").is_file()
-    assert "ICBF-Diffuser split+guarded ★ best within the limit 1 410.0" in expert
+    assert "ICBF-Diffuser default+guarded ★ best within the limit 1 410.0" in expert
     assert "BC 3 310.0 ± 14.1" in expert and "2.500 ± 0.707" in expert
     assert "6 of 8" in expert and "1 of 2" in expert  # unsafe episodes of BC; seeds of ICBF
     assert "For reference behaviour data – 530.0" in expert
@@ -498,18 +498,18 @@ def test_page_shows_the_numbers(folder, tmp_path):
 def test_page_does_not_hide_what_is_missing(folder, tmp_path):
     html = build_board(folder, tmp_path).read_text()
     medium = text_of(section_of(html, MEDIUM))
-    assert "ICBF-Diffuser split not measured on this task" in medium
+    assert "ICBF-Diffuser default not measured on this task" in medium
     assert "3 of the grid's cells have no result" in text_of(html)
     assert "2 of the suite's 4 tasks were not begun" in text_of(html)
     made = text_of(section_of(html, "How it was made"))
-    assert "simple_spread-expert, icbf-split, seed 1: failed: MemoryError: no memory" in made
-    assert "simple_spread-medium, icbf-split, seeds 0, 1: not started" in made
-    assert "ICBF-Diffuser split is left out of this section: it has no result on medium" in text_of(html)
+    assert "simple_spread-expert, icbf, seed 1: failed: MemoryError: no memory" in made
+    assert "simple_spread-medium, icbf, seeds 0, 1: not started" in made
+    assert "ICBF-Diffuser default is left out of this section: it has no result on medium" in text_of(html)
 
 
 def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
     text = text_of(section_of(build_board(folder, tmp_path).read_text(), "Ranking"))
-    assert text.index("BC 1.00") < text.index("ICBF-Diffuser split+guarded –")
+    assert text.index("BC 1.00") < text.index("ICBF-Diffuser default+guarded –")
     # the only method with every task: the mean of its ranks among such methods is 1, whatever the others did on one
     assert "BC 1.00 1 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit" in text
     assert "1 ★ 0.70, cost 0.25 within limit 1 of 2 seeds" in text
@@ -565,7 +565,7 @@ def test_csv_by_hand(folder):
     )
     assert (bc["rank"], bc["within_limit"], bc["best"], bc["seeds"], bc["plan_ms_p50"]) == ("3", "0", "0", "2", "")
     assert float(bc["return_norm"]) == pytest.approx((310 - LOW) / (HIGH - LOW), rel=1e-5)
-    absent = next(r for r in lines if r["task"] == MEDIUM and r["variant"] == "split+guarded")
+    absent = next(r for r in lines if r["task"] == MEDIUM and r["variant"] == "default+guarded")
     assert absent["seeds"] == "0" and absent["return_mean"] == "" and absent["rank"] == ""
     assert [r["method"] for r in lines if r["variant"] == "reference"] == ["behaviour data", "do nothing"]
 
@@ -578,9 +578,9 @@ def test_latex_by_hand(folder):
         r"BC & $310.0 \pm 14.1$ & $0.42 \pm 0.04$ & $2.50 \pm 0.71^{\dagger}$ & $2.286$ & $75.0\;(100.0)$ & 2 \\"
         in text
     )
-    assert r"\textbf{ICBF-Diffuser split+guarded} & $\mathbf{410.0}$" in text and text.count(r"\textbf") == 2
+    assert r"\textbf{ICBF-Diffuser default+guarded} & $\mathbf{410.0}$" in text and text.count(r"\textbf") == 2
     assert r"my\_method & $1.0$" in text
-    assert r"ICBF-Diffuser split+guarded & -- & -- & -- & -- & -- & 0 \\" in text
+    assert r"ICBF-Diffuser default+guarded & -- & -- & -- & -- & -- & 0 \\" in text
     body = [x for x in text.splitlines() if x.endswith(r"\\")]
     assert {x.count("&") for x in body} == {6}
 
@@ -596,11 +596,11 @@ def test_markdown_whole_and_short(folder):
     whole = board_markdown(board)
     assert r"**simple\_spread-expert**, cost limit 1, normalised with 159.8 → 516.8" in whole
     assert "| BC | 3 | 310.0 ± 14.1 | 0.421 ± 0.040 | 2.500 ± 0.707 † | 2.286 (" in whole
-    assert "| ICBF-Diffuser split+guarded | 1 | **410.0** | 0.701 | 0.250 |" in whole
-    assert "| ICBF-Diffuser split | – | not measured |" in whole and "0 of 2" in whole
+    assert "| ICBF-Diffuser default+guarded | 1 | **410.0** | 0.701 | 0.250 |" in whole
+    assert "| ICBF-Diffuser default | – | not measured |" in whole and "0 of 2" in whole
     short = board_markdown_short(board)
     assert "| BC | 0.42 (2.286) † | **0.25 (0.000)** | 1.00 |" in short
-    assert "| ICBF-Diffuser split+guarded | **0.70 (0.250) [1]** | not measured | – |" in short
+    assert "| ICBF-Diffuser default+guarded | **0.70 (0.250) [1]** | not measured | – |" in short
     assert "| do nothing | 0.06 (0.000) | not measured | – |" in short
     for text in (whole, short):
         for block in re.findall(r"(?:^\|.*\n)+", text, re.M):

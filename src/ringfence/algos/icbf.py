@@ -68,6 +68,7 @@ class Config:
     noisy_input: Literal["signal", "unit"] = "signal"  # the network is shown noisy entries × √ᾱ_k, or as they are
     diffusion_steps: Width = 200  # K, cosine schedule
     prediction: diffusion.Prediction = "x0"  # what the network outputs: x0, epsilon, v
+    error: Literal["output", "noise"] = "output"  # L^D's: of what the network outputs, or of the noise that follows (6)
     snr_floor: NonNegative = 1.0  # x0-prediction: least weight of a noise level
     snr_ceiling: NonNegative = 1.0  # x0-prediction: largest weight of a noise level
     clip: Positive = 5.0  # bound on clean estimates, in standard deviations
@@ -131,7 +132,8 @@ CLONES = (192, 2)  # units and hidden layers of the joint clones that share a lo
 # Algorithm 1 as printed: noise is predicted, s̃^θ is drawn by ancestral steps with gradients, and (8) is as it stands.
 _PRINTED = {
     "routing": "paper",
-    "prediction": "epsilon",
+    "prediction": "v",
+    "error": "noise",
     "noisy_input": "unit",
     "gradient": "chain:5",
     "barrier_weight": 1.0,
@@ -171,9 +173,7 @@ PRESETS: dict[str, dict] = {
     "mujoco": _MUJOCO,
     "long": {"num_updates": 12_000},
     "shaped": {"barrier_weight": 1.0},  # the barrier pulls the generator in training, too
-    "algorithm1": _PRINTED,
-    "algorithm1-0.1": _PRINTED | {"barrier_weight": 0.1},  # the paper gives no λ
-    "algorithm1-10": _PRINTED | {"barrier_weight": 10.0},
+    "algorithm1": _PRINTED,  # the paper gives no λ
     "algorithm1-pooled": _PRINTED | _POOLED,
     "algorithm1-mujoco": _PRINTED | _MUJOCO,
     "madiff-unet": _UNET,
@@ -394,7 +394,8 @@ def denoising(
     seen = diffusion.dimmed(noised.x, noised.signal, mask if config.noisy_input == "signal" else None)
     output = planning_as(params["denoiser"], driver)(seen, noised.k, batch.score, keep)
     clip = (config.snr_floor, config.snr_ceiling)
-    losses["loss/denoising"] = diffusion.denoising_loss(output, x0, noised, weight, config.prediction, clip)
+    of_noise = config.error == "noise"
+    losses["loss/denoising"] = diffusion.denoising_loss(output, x0, noised, weight, config.prediction, clip, of_noise)
     clean = diffusion.to_clean(output, noised.x, noised.signal, noised.noise, config.prediction, config.clip)
     clean = clean if centre is None else centre.plan(clean)
     return Denoised(losses, jnp.where(mask, plan, clean), noised, mask)
@@ -679,7 +680,7 @@ ICBF = Algorithm(
     from_world=from_world,
     revision=5,
 )
-_PLAIN = {"barrier": False}
+_PLAIN = {"barrier": False, "guided": False}
 MADIFF = dataclasses.replace(
     ICBF,
     name="madiff",
@@ -698,7 +699,7 @@ MADIFF = dataclasses.replace(
             "noisy_input": "unit",
             "snr_floor": 0.5,
             "snr_ceiling": 5.0,
-            "batch": 128,
+            "num_updates": 1500,
         },
         # MADIFF's condition and rows, at a size for CPUs; play it with the planner `published`
         "raw-return": {**_PLAIN, "condition": "raw", "discount": 0.99, "horizon": 24, "num_updates": 6000},

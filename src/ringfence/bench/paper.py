@@ -67,7 +67,7 @@ PRINTED: dict[str, tuple[str, tuple[tuple[float, float, float, float], ...]]] = 
 OURS = {
     "MA-TD3+BC": ("ma-td3bc", ("",)),
     "OMAR": ("omar", ("",)),
-    "ICBF": ("icbf", ("+guarded", "+shielded", "")),
+    "ICBF": ("icbf", ("",)),
 }
 
 
@@ -108,7 +108,7 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
             found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
     table = []
     for task, (_, values) in PRINTED.items():
-        presets = ("split", *registry.get(task).presets, "default")  # of rows that may stand there
+        presets = (*registry.get(task).presets, "default")  # of rows that may stand there
         for (method, (algorithm, endings)), printed in zip(OURS.items(), values):
             wanted = [preset + ending for ending in endings for preset in presets]
             variant = next((v for v in wanted if (task, algorithm, v) in found), "")

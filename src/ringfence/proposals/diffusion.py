@@ -71,20 +71,27 @@ def to_clean(output: Array, x: Array, signal: Array, noise: Array, prediction: P
 
 
 def denoising_loss(
-    output: Array, x0: Array, noised: Noised, weight: Array, prediction: Prediction, snr_clip: tuple[float, float]
+    output: Array,
+    x0: Array,
+    noised: Noised,
+    weight: Array,
+    prediction: Prediction,
+    snr_clip: tuple[float, float],
+    of_noise: bool = False,
 ) -> Array:
     """L^D: masked mean of the squared error; `weight` (broadcastable) is 0 where nothing is learned.
 
-    x0-prediction: ‖x̂0 − x0‖² weighted by clip(SNR, ·, ·), so that the high-noise levels, where the mode is chosen,
-    keep weight. ε- and v-prediction: unweighted (Ho et al. 2020; Salimans & Ho 2022).
+    x0-prediction: ‖x̂0 − x0‖² weighted by clip(SNR, ·, ·). ε- and v-prediction: unweighted (Ho et al. 2020; Salimans &
+    Ho 2022). `of_noise`: the error of the noise that follows from any of them, ‖ε̂ − ε‖² as Ho et al. have it.
     """
+    snr = (noised.signal / noised.noise) ** 2
     if prediction == "x0":
-        snr = (noised.signal / noised.noise) ** 2
-        error = jnp.clip(snr, *snr_clip) * (output - x0) ** 2
+        error = (snr if of_noise else jnp.clip(snr, *snr_clip)) * (output - x0) ** 2
     elif prediction == "epsilon":
         error = (output - noised.epsilon) ** 2
     else:
         error = (output - (noised.signal * noised.epsilon - noised.noise * x0)) ** 2
+        error = noised.signal**2 * error if of_noise else error
     weight = jnp.broadcast_to(weight, error.shape)
     return (error * weight).sum() / jnp.maximum(weight.sum(), 1.0)
 

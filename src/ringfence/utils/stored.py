@@ -50,6 +50,7 @@ LATER_CONFIG = {
     "around": "nothing",
     "noisy_input": "unit",
     "guided": False,
+    "error": "output",
 }
 WORLD_SETTINGS = {
     "sight": "execution",
