@@ -142,7 +142,7 @@ ROBOTS: dict[str, Row] = {
 def robots(suite: str) -> str:
     """A line per proposal, a column per data set under the limit that proposals were played with: return / steps above
     it."""
-    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ROBOTS["ICBF"]))]
+    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ROBOTS["return-conditioned BC"]))]
     out = ["| | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
     for words, row in ROBOTS.items():
         made = [cell(suite, task, row, ("return_mean", "cost_mean"), (0, 1)) for task in names]

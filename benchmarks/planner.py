@@ -78,6 +78,7 @@ ABLATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "level weights 0.5 to 5": ("madiff", "", {"snr_floor": 0.5, "snr_ceiling": 5.0}),
     "attention of 128": ("madiff", "", _BEFORE),
     "attention of 128, agents told apart": ("madiff", "", _BEFORE | {"distinguish_agents": True}),
+    "attention of 384, agents told apart": ("madiff", "", {"net": "attention", "distinguish_agents": True}),
     "half the units": ("madiff", "", {"width": 192}),
     "4 rows": ("madiff", "", {"horizon": 4}),
     "16 rows": ("madiff", "", {"horizon": 16}),
