@@ -20,6 +20,7 @@ from pooled import milliseconds
 
 import ringfence
 from ringfence import algos
+from ringfence.algos import drivers
 from ringfence.datasets.make import make
 from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
@@ -159,7 +160,7 @@ def row(
         "windows": windows,
         "passes": round(windows / store.steps, 3),
         "seconds": round(sum(m["seconds"] for m in run.metrics), 1),
-        "found": round(run.metrics[-1].get("drivers/found", 0.0), 2),
+        "found": drivers.found(run.metrics[-1]) if "drivers/worth" in run.metrics[-1] else 0,
         "worth": round(run.metrics[-1].get("drivers/worth", 0.0), 3),
         "plays": {},
         "machine": machine(),

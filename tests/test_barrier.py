@@ -9,14 +9,18 @@ import pytest
 
 from ringfence.algos import icbf
 from ringfence.algos.algorithm1 import loss_of_agent
+from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
-from ringfence.logs.windows import WindowData, at
+from ringfence.logs.windows import WindowData, at, draw
 from ringfence.nets import MLP
 from ringfence.nets.heads import barrier_on
 from ringfence.problem import constraints, normalise
 from ringfence.proposals import retention as cbf
 from ringfence.proposals.diffusion import cosine_schedule
+from ringfence.training import loop
+from ringfence.training.job import make_job
+from tests.quick import QUICK_WORLD
 
 BAR = cosine_schedule(200)
 RELAXATIONS = ("signal", "linear", "none")
@@ -243,3 +247,25 @@ def test_the_share_of_the_barrier_rises_on_schedule():
     c = icbf.Config(num_updates=100, barrier_weight=0.4, barrier_start=0.2, barrier_full=0.6)
     shares = [float(icbf.barrier_share(c, step)) for step in (0, 20, 30, 40, 60, 100)]
     assert shares == pytest.approx([0, 0, 0.1, 0.2, 0.4, 0.4], abs=1e-6)
+
+
+def test_algorithm_1_takes_steps_of_its_own(small_store, small_world):
+    """θ takes a step for L^D and one for every agent; with λ = 0 those teach it nothing, and φ learns the same."""
+    task = registry.from_store(small_store)
+    tiny = dict(num_updates=12, batch=16, width=16, depth=1, barrier_width=8, horizon=4, diffusion_steps=20)
+    kept = {}
+    for weight in (0.0, 1.0):
+        changes = tiny | {"inverse_width": 16, "gradient": "chain:2", "barrier_weight": weight}
+        job = make_job("icbf", task, "algorithm1", changes, small_store, QUICK_WORLD)
+        data = loop.windows_of(job, small_store, small_world)
+        about = (data, job.feature_map, job.hazard, small_world)
+        state = job.algorithm.init(jax.random.key(0), job.spec, job.config, *about)
+        update = jax.jit(job.algorithm.make_update(job.config, job.spec, job.feature_map, job.hazard))
+        batch = draw(data.arrays, jax.random.key(1), 16, 4, job.config.window_history)
+        kept[weight], metrics = update(state, batch, jax.random.key(2))
+    counts = {w: int(kept[w]["opt"]["denoiser"][1][0].count) for w in kept}
+    assert counts == {0.0: 1, 1.0: 4}
+    assert metrics["loss/shaping"] > 0
+    for name in ("inverse", "denoiser"):
+        moved = moves(jax.tree.map(lambda a, b: a - b, *(kept[w]["params"][name] for w in kept)))
+        assert moved == (name == "denoiser"), name

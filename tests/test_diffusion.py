@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ringfence.errors import UserError
+from ringfence.nets.mean_plan import Centre
 from ringfence.proposals import diffusion
 
 BAR = diffusion.cosine_schedule(200)
@@ -174,3 +175,41 @@ def test_impossible_steps_are_refused(steps):
 def test_unknown_samplers_are_refused():
     with pytest.raises(UserError, match="Unknown sampler 'euler'; choose"):
         diffusion.sample(lambda x, k: x, free, (1, 1), BAR, jax.random.key(0), 3, "euler")
+
+
+def test_the_mean_plan_and_what_is_left_make_the_plan():
+    """z and back; the mean's error teaches the mean alone, its surprise the scale alone, which settles at the error's
+    size."""
+    plan = jax.random.normal(jax.random.key(0), (256, 4, 2, 3))
+    mask = jnp.arange(4)[None, :, None, None] < 1
+    centre = Centre(0.5 * plan, jnp.full((4, 1, 3), -1.0))
+    z = centre.rest(plan, mask)
+    np.testing.assert_allclose(jnp.where(mask, plan, centre.plan(z)), plan, atol=1e-5)
+    np.testing.assert_array_equal(z[:, 0], plan[:, 0])
+    weight = jnp.broadcast_to(~mask, plan.shape).astype(jnp.float32)
+
+    def parts(mean, log_scale):
+        return jnp.stack(Centre(mean, log_scale).surprise(plan, weight))
+
+    to_mean, to_scale = jax.jacrev(parts, (0, 1))(centre.mean, centre.log_scale)
+    assert jnp.abs(to_mean[0]).max() > 0 and not to_mean[1].any() and not to_scale[0].any()
+    settled = jnp.log((0.5 * plan).std(0).mean(1, keepdims=True))
+    assert jnp.abs(jax.grad(lambda s: parts(centre.mean, s)[1])(settled)).max() < 0.05
+
+
+def test_what_is_known_is_not_dimmed():
+    x = jnp.ones((2, 3, 1, 1))
+    mask = jnp.arange(3)[None, :, None, None] < 1
+    np.testing.assert_array_equal(diffusion.dimmed(x, 0.5, mask)[0, :, 0, 0], [1.0, 0.5, 0.5])
+    assert diffusion.dimmed(x, 0.5, None) is x
+
+
+@pytest.mark.parametrize("prediction", ["x0", "epsilon", "v"])
+def test_the_error_of_the_noise_is_the_same_whatever_the_network_outputs(prediction):
+    x0 = jax.random.normal(jax.random.key(2), (64, 4, 2, 3))
+    guess = x0 + 0.1 * jax.random.normal(jax.random.key(3), x0.shape)
+    noised = add_noise(x0, np.zeros((64, 4, 2, 1), bool), BAR[5:150], jax.random.key(1))
+    epsilon = (noised.x - noised.signal * guess) / noised.noise
+    output = {"x0": guess, "epsilon": epsilon, "v": noised.signal * epsilon - noised.noise * guess}[prediction]
+    loss = diffusion.denoising_loss(output, x0, noised, jnp.ones_like(x0), prediction, (1.0, 1.0), of_noise=True)
+    assert float(loss) == pytest.approx(float(((epsilon - noised.epsilon) ** 2).mean()), rel=1e-3)

@@ -161,7 +161,9 @@ def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_
     options = {"sampling_steps": 2, "sampler": "ddpm"}
     steps = played(planner, small_store, noisy=True, **options)
     call, told = of_stablehlo(exporting.export(planner, tmp_path / "p", "stablehlo", **options))
-    assert sum(x["name"].startswith("noise.") for x in told["inputs"]) == 4  # the driver's, the first of the plan, and one for every step
+    assert (
+        sum(x["name"].startswith("noise.") for x in told["inputs"]) == 4
+    )  # the driver's, the first of the plan, and one for every step
     assert apart(call, told, steps) <= 1e-5
     pytest.importorskip("jax2onnx")
     assert apart(*of_onnx(exporting.export(planner, tmp_path / "p.onnx", **options)), steps) <= 1e-5

@@ -69,7 +69,7 @@ def test_an_episode_is_played_as_one_driver(run):
 
 
 def test_drivers_are_found_without_labels(run, two_drivers):
-    assert run.metrics[-1]["drivers/sure"] > 0.95
+    assert run.metrics[-1]["drivers/sure"] > 0.95 and drivers.found(run.metrics[-1]) == 2
     store = two_drivers
     policy = load(run, cfg_scale=1.0, target_return=0.0)[1]
     first = np.asarray(eqx.filter_jit(policy.draw)(jnp.zeros((2, 2, 3)), jnp.arange(2), jax.random.key(0)))[:, 0, 0]
@@ -83,6 +83,23 @@ def test_steps_outside_an_episode_are_left_out(two_drivers):
     there = np.asarray(drivers.steps_there(batch))
     np.testing.assert_array_equal(there.sum(1), [4, 8, 5, 4])
     assert not there[0, :4].any() and there[0, 4:].all() and there[2, :5].all() and not there[2, 5:].any()
+
+
+def test_one_driver_is_found_where_there_is_one():
+    """Following one of clones that differ by chance saves nothing; of clones of two drivers, nearly all there is."""
+    key = jax.random.key(0)
+    there = jnp.ones((64, 12), bool)
+    noise = 0.1 * jax.random.normal(key, (64, 12, 1))
+    alike = jnp.zeros((64, 12, 2, 1)) + 0.01 * jax.random.normal(key, (1, 1, 2, 1))
+    even = jnp.full((64, 2), 0.5)
+    assert drivers.worth(alike, noise, there, even) < 0.01
+    which = jnp.arange(64) % 2
+    apart = jnp.broadcast_to(jnp.array([-0.7, 0.7])[:, None], (64, 12, 2, 1))
+    sure = jax.nn.one_hot(which, 2)
+    pays = drivers.worth(apart, noise + jnp.array([-0.7, 0.7])[which][:, None, None], there, sure)
+    assert pays > 0.9
+    told = {"drivers/worth": float(pays), "drivers/distinguished": float(drivers.distinguished(sure))}
+    assert drivers.found(told) == 2 and drivers.found(told | {"drivers/worth": -0.1}) == 1
 
 
 def test_shares_are_balanced():

@@ -8,6 +8,7 @@ later those that nobody needs are left with nothing. A generator that is given t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -67,12 +68,17 @@ def driven(search: Search, params: Any, norm: Normaliser, batch: Batch, keep: Ar
     metrics = {"loss/clones": clone_loss, "loss/prior": prior_loss}
     metrics["drivers/sure"] = shares.max(-1).mean()
     pays = worth(clones, actions.reshape(windows, steps, -1), there, shares)
-    metrics |= {"drivers/worth": pays, "drivers/found": jnp.where(pays > 0, told_apart(shares), 1.0)}
+    metrics |= {"drivers/worth": pays, "drivers/distinguished": distinguished(shares)}
     return Driven(driver, clone_loss + prior_loss, metrics)
 
 
-def told_apart(shares: Array) -> Array:
-    """() how many drivers shares (B, C) tell apart: exp of what a window tells of its driver, in nats."""
+def found(metrics: Mapping[str, float]) -> int:
+    """How many drivers made the logs, by a line of a run's metrics: one where following one saves nothing."""
+    return round(metrics["drivers/distinguished"]) if metrics["drivers/worth"] > 0 else 1
+
+
+def distinguished(shares: Array) -> Array:
+    """() how many drivers shares (B, C) distinguish: exp of what a window tells of its driver, in nats."""
     mean = shares.mean(0)
     return jnp.exp(_entropy(mean) - _entropy(shares).mean())
 
