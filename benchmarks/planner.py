@@ -115,7 +115,7 @@ GROUPS: dict[str, dict[str, Any]] = {
     "robots": {
         "tasks": ROBOTS,
         "rows": {"icbf": ("icbf", "", {}), "bc": ("bc", "", {})},
-        "plays": ("under adapt", "best of 8"),
+        "plays": ("cool", "cool, under adapt"),
     },
     "crossing": {
         "tasks": ("crossing-hasty",),

@@ -122,7 +122,7 @@ class Drivers:
 
 def drivers_of(run: Run, store: EpisodeStore, episodes: int = 2000) -> Drivers | None:
     """None of a run that looks for no drivers, or of a log that does not say whose its episodes are."""
-    if not run.config["config"].get("drivers") or store.card.extra.get("driver_of_episode") != TURNS:
+    if run.config["config"].get("drivers", 0) == 0 or store.card.extra.get("driver_of_episode") != TURNS:
         return None
     job = load_job(run)
     a = job.algorithm

@@ -187,7 +187,7 @@ def test_gradient_depths(small_store, small_world, gradient):
     data = loop.windows_of(job, small_store, small_world)
     key = jax.random.key(0)
     state = job.algorithm.init(key, job.spec, job.config, data, job.feature_map, job.hazard, small_world)
-    loss = icbf.make_loss(job.config, job.feature_map, job.hazard)
+    loss = icbf.make_loss(job.config, job.feature_map)
     batch = draw(data.arrays, jax.random.key(1), 16, 4, job.config.window_history)
 
     @jax.jit

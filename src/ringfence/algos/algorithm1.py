@@ -9,8 +9,8 @@
     L_i^C = Σ_{S0} [δ − h]₊ + Σ_{Sd} [δ + h]₊ + Σ_{Ss} [δ − h(s̃(t+1)) + α h(s̃(t))]₊     on s̃^θ
 
 Two of the three terms send θ the wrong way (docs/method.md), and they stand here as they are printed. λ, which the
-paper does not have, weighs θ's gradient of L_i^C. Networks of agents share no weights, so one step of Adam on all
-of ω, and one on all of φ, are the steps of each; θ takes N + 1.
+paper does not have, weighs θ's gradient of L_i^C. Networks of agents share no weights unless `scope=shared`, so one
+step of Adam on all of ω, and one on all of φ, are the steps of each; θ takes N + 1.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from ringfence.problem.constraints import BoundHazard
 from ringfence.proposals.retention import Retention
 from ringfence.types import Array, Batch, Key, Metrics, PyTree, Spec
 
-THETA = ("denoiser", "mean", "clones", "prior")  # networks that L^D teaches, and whom plans are of
+THETA = ("denoiser", "mean")  # what draws plans
+DRIVERS = ("clones", "prior")  # whom they are of
 
 
 def loss_of_agent(
@@ -81,8 +82,9 @@ def make_printed_update(
     """update(state, batch, key) -> state, metrics."""
     retention = Retention(config.retention, config.relaxation, config.two_sided)
     agents = spec.n_agents
-    # θ takes a step for L^D and one for every agent, along the same schedule.
-    of_theta = replace(optimiser, steps=(agents + 1) * optimiser.steps, warmup=(agents + 1) * optimiser.warmup)
+    # θ takes a step for L^D and, where λ is not 0, one for every agent, along the same schedule.
+    turns = agents + 1 if config.barrier_weight > 0 else 1
+    of_theta = replace(optimiser, steps=turns * optimiser.steps, warmup=turns * optimiser.warmup)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         kd, kp, kg = jax.random.split(key, 3)
@@ -90,7 +92,7 @@ def make_printed_update(
         params = dict(state["params"])
         moments = dict(state["opt"])
         theta = [name for name in THETA if name in params]
-        drawn_by = [name for name in ("denoiser", "mean") if name in params]
+        drivers = [name for name in DRIVERS if name in params]
 
         def of_plans(learned: PyTree) -> tuple[Array, Any]:
             plans = planning(params | learned, norm, batch, state["step"], kd)
@@ -102,8 +104,10 @@ def make_printed_update(
             moments.update(kept)
             return norms
 
-        grads, plans = jax.grad(of_plans, has_aux=True)({name: params[name] for name in theta})
-        metrics = plans.metrics | step(theta, grads, of_theta)
+        grads, plans = jax.grad(of_plans, has_aux=True)({name: params[name] for name in theta + drivers})
+        metrics = plans.metrics | {"barrier/weight": jnp.asarray(config.barrier_weight)}
+        for names, how in ((theta, of_theta), (drivers, optimiser)):
+            metrics |= step(names, {name: grads[name] for name in names}, how)
         initial = plans.batch.costs[:, config.history] == NOT_ARRIVED
 
         teaches: list[PyTree] = []
@@ -114,9 +118,8 @@ def make_printed_update(
                 x = made.features[:, config.history :]
                 unsafe, safe = hazard.labels(jax.lax.stop_gradient(x))
                 h = barrier_on(omega, norm, x)
-                own = min(agent, h.shape[-1] - 1)
                 return loss_of_agent(
-                    h[..., own],
+                    h[..., agent],
                     unsafe[..., agent],
                     safe[..., agent],
                     made.valid[:, config.history :],
@@ -126,12 +129,12 @@ def make_printed_update(
                     config.delta,
                 )
 
-            learned = {name: params[name] for name in drawn_by}
+            learned = {name: params[name] for name in theta}
             (loss, more), (pull, omega) = jax.value_and_grad(of_agent, (0, 1), has_aux=True)(learned, params["barrier"])
             teaches.append(omega)
             metrics = metrics | more | {"loss/shaping": metrics.get("loss/shaping", 0.0) + loss}
             if config.barrier_weight > 0:
-                step(drawn_by, jax.tree.map(lambda g: config.barrier_weight * g, pull), of_theta)
+                step(theta, jax.tree.map(lambda g: config.barrier_weight * g, pull), of_theta)
         omega = jax.tree.map(lambda *g: sum(g), *teaches)
         metrics |= step(["barrier"], {"barrier": omega}, optimiser)
 

@@ -64,6 +64,8 @@ class Config:
     distinguish_agents: bool = False  # attention learns a vector of each agent; of limbs of one body it does anyway
     drivers: Natural | None = None  # that the logs are searched for; a plan is of one of them. 0: for nobody; None: 8,
     # or 0 where a plan is not of the whole team, or its net cannot be told
+    clone_width: Width = 192  # units of the joint clones that share the logs
+    clone_depth: Depth = 2  # their hidden layers
     around: Literal["mean", "nothing"] = "mean"  # what noise is diffused around: a learned mean plan, or the origin
     noisy_input: Literal["signal", "unit"] = "signal"  # the network is shown noisy entries × √ᾱ_k, or as they are
     diffusion_steps: Width = 200  # K, cosine schedule
@@ -126,10 +128,10 @@ class Config:
 DRIVERS = 8  # that are searched for: more than there are cost little, fewer mix some
 DRIVER_HISTORY = 8  # rows before a plan's own that tell whose it is; seven steps alone tell too little
 INVERSE_STEPS = 3  # steps of every window that inverse dynamics learns from
-CLONES = (192, 2)  # units and hidden layers of the joint clones that share a log of many drivers
 
 
-# Algorithm 1 as printed: noise is predicted, s̃^θ is drawn by ancestral steps with gradients, and (8) is as it stands.
+# Algorithm 1 as printed: the error is of the noise, s̃^θ is drawn by ancestral steps with gradients, and (8) as it
+# stands.
 _PRINTED = {
     "routing": "paper",
     "prediction": "v",
@@ -137,13 +139,8 @@ _PRINTED = {
     "noisy_input": "unit",
     "gradient": "chain:5",
     "barrier_weight": 1.0,
-    "barrier_start": 0.0,
-    "barrier_full": 0.0,
-    "barrier_batch": 32,
     "delta": 0.02,
     "two_sided": False,
-    "scaled_margin": False,
-    "weigh_by_signal": False,
     "inverse_noise": 0.0,
 }
 # A thousand steps forgive no outlier, so robots need a denoiser that is fitted well.
@@ -233,7 +230,9 @@ def init(
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
         if config.searched:
             acts = n * spec.action_dim
-            params |= drivers.networks(jax.random.fold_in(key, 1), config.searched, seen, acts, *CLONES)
+            params |= drivers.networks(
+                jax.random.fold_in(key, 1), config.searched, seen, acts, config.clone_width, config.clone_depth
+            )
         return fresh(optimiser(config), params, "ema")
 
     if data is None:
@@ -269,11 +268,16 @@ def check(config: Config, hazard: BoundHazard) -> None:
     """Refuse settings that cannot work, before anything is computed."""
     retention(config)
     schedule(config)
-    _, depth = gradient_depth(config.gradient)
+    kind, depth = gradient_depth(config.gradient)
     if depth >= config.diffusion_steps:
         raise UserError(f"gradient='{config.gradient}' goes deeper than the {config.diffusion_steps} diffusion steps.")
     if config.barrier and config.routing == "paper" and not hazard.has_formula:
         raise UserError("routing='paper' labels generated states, which CostColumn cannot; give a hazard formula.")
+    if config.routing == "paper" and (kind == "x0" or not config.barrier):
+        raise UserError(
+            "routing='paper' draws plans with gradients for barriers of its own; leave barrier=True, and set gradient "
+            f"to chain:n or ddim:n, e.g. chain:5 (barrier={config.barrier}, gradient='{config.gradient}')."
+        )
     if config.net == "attention" and config.width % (4 * HEADS):
         raise UserError(f"width={config.width} must be a multiple of {4 * HEADS}, for {HEADS} heads of equal width.")
     if config.net == "unet":
@@ -556,7 +560,7 @@ def make_drawing(config: Config, feature_map: features.FeatureMap):
     return drawing
 
 
-def make_loss(config: Config, feature_map: features.FeatureMap, hazard: BoundHazard):
+def make_loss(config: Config, feature_map: features.FeatureMap):
     """loss(params, frozen, batch, step, key) -> (scalar, metrics), all terms of `split`."""
     planning = make_planning(config, feature_map)
     drawing = make_drawing(config, feature_map)
@@ -592,7 +596,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             inverse_dynamics,
             optimiser(config),
         )
-    loss = make_loss(config, feature_map, hazard)
+    loss = make_loss(config, feature_map)
     opt = optimiser(config)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
@@ -609,27 +613,20 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
 def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """diagnose(state, batch, key) -> metrics that are too dear for every update: who pulls θ how hard."""
-    loss = make_loss(config, feature_map, hazard)
+    loss = make_loss(config, feature_map)
 
     def diagnose(state: PyTree, batch: Batch, key: Key) -> Metrics:
         if not config.barrier or config.barrier_weight == 0 or config.routing == "paper":
             return {}
 
+        drawn_by = {name: net for name, net in state["params"].items() if name in ("denoiser", "mean")}
+
         def pull(parts):
-            fixed = {k: v for k, v in state["params"].items() if k != "denoiser"}
+            def of(learned):
+                read = state["frozen"] | state["world"]
+                return loss(state["params"] | learned, read, batch, state["step"], key, parts)[0]
 
-            def of(denoiser):
-                return loss(
-                    {**fixed, "denoiser": denoiser},
-                    state["frozen"] | state["world"],
-                    batch,
-                    state["step"],
-                    key,
-                    parts,
-                )[0]
-
-            grads = jax.grad(of)(state["params"]["denoiser"])
-            return jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(grads)))
+            return jnp.sqrt(sum((g**2).sum() for g in jax.tree.leaves(jax.grad(of)(drawn_by))))
 
         denoise = pull((1.0, 0.0))
         shaping = pull((0.0, 1.0))
@@ -645,7 +642,7 @@ def make_diagnose(config: Config, spec: Spec, feature_map: features.FeatureMap, 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options):
     """Receding-horizon planner on the averaged parameters; `options` are the evaluation-time choices."""
     return Planner(
-        networks=state["ema"],
+        networks={name: net for name, net in state["ema"].items() if name != "clones"},
         normaliser=state["frozen"]["normaliser"],
         critic=state["world"]["critic"],
         alpha_bar=tuple(schedule(config).tolist()),
@@ -699,6 +696,8 @@ MADIFF = dataclasses.replace(
             "noisy_input": "unit",
             "snr_floor": 0.5,
             "snr_ceiling": 5.0,
+            "clone_width": 384,
+            "clone_depth": 3,
             "num_updates": 1500,
         },
         # MADIFF's condition and rows, at a size for CPUs; play it with the planner `published`

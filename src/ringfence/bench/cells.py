@@ -160,8 +160,11 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     plan = PlanOptions(**{**defaults, **PLANNERS[spec.planner], **dict(spec.plan_options)})
     usual = dataclasses.asdict(PlanOptions())
     wanted = dataclasses.asdict(plan)
-    if stored["options"] and {**usual, **stored["options"]} != wanted:
-        return False
+    if stored["options"]:
+        played = {**usual, **stored["options"]}
+        either = {"barrier_guidance": wanted["barrier_guidance"] or 0.0}  # 0 before it could be the method's own
+        if played | {"barrier_guidance": played["barrier_guidance"] or 0.0} != wanted | either:
+            return False
     guard = stored.get("guard_options") or {}
     if not spec.guarded:
         return not guard

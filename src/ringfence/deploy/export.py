@@ -293,6 +293,7 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "seed": config["seed"],
         "provenance": data["provenance"],
         "planner_options": dataclasses.asdict(plan_options) if plan_options else {},
+        "guided": float(getattr(resolved.proposal, "guidance", 0.0)),
         "guard_options": dataclasses.asdict(guard.options) if guard else {},
         "barrier": spec.barrier if guard else "none",
         "execution": worlds.execution_of(job.task, "decentralized" if guard and guard.world.alone else None),

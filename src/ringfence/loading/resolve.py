@@ -154,13 +154,15 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
             "give one of the two."
         )
     alone = policy.options.execution == "decentralized"  # a World sees the whole team
-    by_itself = asked is None and getattr(job.config, "guides", False) and not corrected and not alone
+    follows = policy.options.replan > 1  # and so steps that nothing guided
+    by_itself = asked is None and getattr(job.config, "guides", False) and not (corrected or alone or follows)
     if not asked and not by_itself:
         return policy
     world = read
-    if read is None or spec.world is not None:
+    if asked and (read is None or spec.world is not None):
         world = run_worlds.for_guard(run, worlds.execution_of(job.task, None), spec.world, read=read, quiet=False)
-    assert world is not None, "either read in training or made for guards"
+    if world is None or (world.barrier is None and not asked):
+        return policy
     _check_width(job, world.map, "The World")
     if asked:
         require(world.card, spec.anyway)

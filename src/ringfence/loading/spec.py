@@ -95,8 +95,8 @@ class PolicySpec:
             agents=agents,
             anyway=anyway,
         )
-        if not spec.guarded and not options.get("barrier_guidance"):
-            _refuse_unread(barrier=barrier, world=world)
+        if not spec.guarded:
+            _refuse_unread(barrier=barrier, world=None if options.get("barrier_guidance") else world)
         return spec
 
     @classmethod

@@ -1,8 +1,7 @@
-"""The default denoiser: one token per agent holds its whole window, attention runs across agents.
+"""A denoiser of agents: one token per agent holds its whole window, attention runs across agents.
 
-Flattening the window into the token turns the work into a few wide matrix products, which is what a CPU is good at;
-`benchmarks/denoisers.py` puts it beside MADIFF's temporal U-Net. The number of agents appears in no weight unless
-they are distinguished.
+The number of agents appears in no weight unless they are distinguished. It learns joint policies more slowly than one
+network of the team (docs/planner-results.md), which homogeneous agents, who are teams of one each, need no more either.
 """
 
 from __future__ import annotations

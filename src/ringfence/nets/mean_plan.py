@@ -1,7 +1,8 @@
 """A mean plan, and how far logged plans lie from it: noise is diffused around it, in units of what is left.
 
 At high noise a denoiser has to answer with the mean of all plans from here, whatever noise it is shown. A network that
-is shown none learns that mean much faster, and where it is good, little is left for the denoiser (docs/ablations.md).
+is shown none learns that mean much faster, and where it is good, little is left for the denoiser
+(docs/planner-results.md).
 Where plans from one state differ widely, much is left, and the denoiser does what it always did.
 """
 

@@ -94,10 +94,12 @@ class FlowPolicy(eqx.Module):
         others = self._drawn(jnp.repeat(x, count - 1, 0), jax.random.fold_in(key, 1)).reshape(batch, count - 1)
         driver = jnp.concatenate([carry["driver"][:, None], others], 1).reshape(-1)
 
-        def act(x: Array) -> Array:
-            return self.draw(x, driver, key)
-
+        guides = None if self.world is None else jnp.repeat(self.world.map(observations, state), count, 0)
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
+
+        def act(x: Array) -> Array:
+            return self.draw(x, driver, key, guides if x is seen else None)  # what is foreseen is proposed unguided
+
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 

@@ -21,7 +21,7 @@ from ringfence.world.dynamics import Dynamics
 
 WHOLE = 1.0  # share of a step by which a method that follows a barrier is guided by default
 MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
-LEAST_SLOPE = 1e-6  # no step is longer than by this
+LEAST_SLOPE = 1e-6  # of a slope's square: what hardly depends on x is not chased far
 
 
 def short_of_margin(

@@ -12,7 +12,6 @@ What becomes of several plans, and of what they would do, is a guard's (guard/).
 from __future__ import annotations
 
 import dataclasses
-import math
 from functools import partial
 from typing import Any
 
@@ -43,7 +42,7 @@ MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviat
 class Planner(HadStart, eqx.Module):
     """Receding-horizon diffusion planner."""
 
-    networks: dict[str, Any]  # denoiser, inverse; and prior, where there are drivers
+    networks: dict[str, Any]  # denoiser, inverse; mean, prior and barrier where there are such
     normaliser: Normaliser
     critic: Critic  # what states are worth
     alpha_bar: tuple[float, ...] = eqx.field(static=True)
@@ -84,6 +83,11 @@ class Planner(HadStart, eqx.Module):
                 f"barrier_guidance={o.barrier_guidance} asks a World that sees the whole team, which "
                 "execution='decentralized' does not; leave one of them out."
             )
+        if o.barrier_guidance and o.replan > 1:
+            raise UserError(
+                f"barrier_guidance={o.barrier_guidance} guides the first step of a plan, and replan={o.replan} follows "
+                "more of them; leave one of them out."
+            )
         if o.execution == "decentralized" and self.observe == "all":
             raise UserError("execution='decentralized' needs a model trained with observe='single' or 'mixed'.")
         if o.execution == "centralized" and self.observe == "single":
@@ -111,8 +115,8 @@ class Planner(HadStart, eqx.Module):
             ahead = plan[:, self.history + 1]
         else:
             fresh = carry["age"] % o.replan == 0
-            drawn = lambda: self.plans(past, present, key, 1, driver, judged)[:, 0]  # noqa: E731
-            plan = jax.lax.cond(fresh, drawn, lambda: carry["plan"])
+            anew = lambda: self.plans(past, present, key, 1, driver, judged)[:, 0]  # noqa: E731
+            plan = jax.lax.cond(fresh, anew, lambda: carry["plan"])
             ahead = jnp.take(plan, self.history + 1 + carry["age"] % o.replan, axis=1)
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
         info = {"plans": plan[:, None], "chosen": jnp.zeros(plan.shape[0], jnp.int32)}
@@ -170,6 +174,8 @@ class Planner(HadStart, eqx.Module):
         """(B · count,) whose plans to make: the episode's own driver's first, then of such as may drive here."""
         if not self.drivers:
             return None
+        if count == 1:
+            return carry["driver"]
         others = self._drawn(jnp.repeat(present, count - 1, 0), jax.random.fold_in(key, 2))
         own = carry["driver"][:, None]
         return jnp.concatenate([own, others.reshape(len(own), count - 1)], 1).reshape(-1)
@@ -177,7 +183,7 @@ class Planner(HadStart, eqx.Module):
     def _drawn(self, present: Array, key: Key) -> Array:
         """(B,) who drives at states (B, N, D), drawn, for the return that is asked for."""
         batch = present.shape[0]
-        seen = self.normaliser.state(present).reshape(batch, math.prod(present.shape[1:]))  # the batch may be empty
+        seen = self.normaliser.state(present).reshape(batch, -1)
         answer = partial(driver_scores, self.networks["prior"], seen)
         logits = classifier_free(answer, jnp.full(batch, self.options.target_return), self.options.cfg_scale)
         return drawn(logits, jax.random.normal(key, logits.shape))

@@ -62,7 +62,7 @@ class Retention:
 def shaping(
     h: Array, valid: Array, retention: Retention, eta: Array, delta: float, scaled_margin: bool, weight: Array
 ) -> Array:
-    """L_θ of the `split` preset: raise h̄ along the plan, against a frozen barrier.
+    """L_θ of the `shaped` preset: raise h̄ along the plan, against a frozen barrier.
 
         mean_t max(0, δ − h̄(x̂0_t)) + mean_t max(0, (1−α) δ − h̄(x̂0_{t+1}) + α sg h̄(x̂0_t)),   t ≥ 1 in the first
 

@@ -289,7 +289,7 @@ def place(algorithm: str, preset: str, variant: str) -> tuple:
     """Order of rows: that of NAMES, then by variant, numbers by size."""
     rank = ORDER.index(algorithm) if algorithm in ORDER else len(ORDER)
     parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", variant)]
-    return rank, algorithm, preset != "paper", [(isinstance(p, str), p) for p in parts]
+    return rank, algorithm, not preset.startswith("algorithm1"), [(isinstance(p, str), p) for p in parts]
 
 
 def _paint(section: Section[Row]) -> None:

@@ -424,7 +424,7 @@ def _deleted(state: PyTree) -> bool:
 
 
 def folder_of(out: str | Path, job: Job, seed: int) -> Path:
-    """runs/simple_spread-medium/icbf-split/seed-0"""
+    """runs/simple_spread-medium/icbf/seed-0"""
     name = job.algorithm.name if job.preset == "default" else f"{job.algorithm.name}-{job.preset}"
     return Path(out) / job.task.name / name / f"seed-{seed}"
 

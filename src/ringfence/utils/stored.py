@@ -51,6 +51,8 @@ LATER_CONFIG = {
     "noisy_input": "unit",
     "guided": False,
     "error": "output",
+    "clone_width": 384,
+    "clone_depth": 3,
 }
 WORLD_SETTINGS = {
     "sight": "execution",
