@@ -41,7 +41,7 @@ LIMITS = {
     "ant_2x4-medium": (5, 12.5, 25, 50, 100),
 }
 TRAINED = {"ma-td3bc-lag": "MA-TD3+BC, Lagrange", "bc-safe": "BC on episodes within the limit"}
-GUARDED = {"bc": "BC, guarded", "icbf": "ICBF, guarded"}
+GUARDED = {"bc": "BC, guarded"}
 
 
 def main() -> None:
@@ -78,16 +78,15 @@ def guarded(name: str, algorithm: str, out: Path) -> None:
     if not missing:
         return
     store, _ = make(task)
-    how = {"planner": "low_temperature"} if task.protocol and algorithm == "icbf" else {}
     with tempfile.TemporaryDirectory() as folder:
         (run,) = loop.train(algorithm, store, seeds=(0,), out=folder, quiet=True)
         for value in missing:
             if value == "alone":
-                _play(name, GUARDED[algorithm], "none", value, run, out, **how)
+                _play(name, GUARDED[algorithm], "none", value, run, out)
                 continue
             guard = {"guard": "adapt", "rate": value / 2000} if task.protocol else {"guard": "shield", "margin": value}
             guard |= {"barrier": "learned", "world": worlds.fit(store)}
-            _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **how, **guard)
+            _play(name, GUARDED[algorithm], "limit" if task.protocol else "margin", value, run, out, **guard)
 
 
 def _missing(name: str, method: str, values: tuple, out: Path) -> list:

@@ -63,6 +63,8 @@ _BEFORE = {"net": "attention", "width": 128}
 ABLATIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
     "as it is": MADIFF,
     "noise around the origin": ("madiff", "", {"around": "nothing"}),
+    # as many seconds on a pool as the mean plan and its denoiser take together
+    "noise around the origin, 5500 updates": ("madiff", "", {"around": "nothing", "num_updates": 5500}),
     "noise around the origin, noisy entries as they are": ("madiff", "", {"around": "nothing", "noisy_input": "unit"}),
     "noisy entries as they are": ("madiff", "", {"noisy_input": "unit"}),
     "EDM's preconditioning (v), around the origin": (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -256,6 +257,7 @@ class Line(eqx.Module):
     spec: Spec = eqx.field(static=True)
     ood_threshold: float = 1.0
     edge: float = 0.5
+    card = SimpleNamespace(barrier=None)
 
     @property
     def dynamics(self):

@@ -23,7 +23,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import from_unit, in_bounds_of, rolled
 from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_scores
-from ringfence.proposals.guidance import cleared, knows_danger, short_of_margin
+from ringfence.proposals.guidance import cleared, knows_danger, looks_ahead, short_of_margin
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
@@ -56,6 +56,7 @@ class FlowPolicy(eqx.Module):
     options: PlanOptions = eqx.field(static=True)
     world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
     guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
+    ahead: bool = eqx.field(static=True, default=True)  # and by V, too
 
     def __check_init__(self):
         usual = PlanOptions()
@@ -105,7 +106,8 @@ class FlowPolicy(eqx.Module):
 
     def guided_by(self, world: World, share: float) -> FlowPolicy:
         """The same, its sampling guided by the danger that this World has learned."""
-        return dataclasses.replace(self, world=knows_danger(in_bounds_of(self.spec, world)), guidance=share)
+        knowing = knows_danger(in_bounds_of(self.spec, world))
+        return dataclasses.replace(self, world=knowing, guidance=share, ahead=looks_ahead(knowing))
 
     def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None) -> Array:
         """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,); guided from `present` (B, N, D'), the
@@ -142,7 +144,7 @@ class FlowPolicy(eqx.Module):
         """(B,) what the next states lack of the margin, in all: 0 or negative."""
         world = self.world
         assert world is not None and world.barrier is not None, "checked by guided_by"
-        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, present, action)
+        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, present, action, self.ahead)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
         """What answers to (y, whether it is given), guided by the return that is asked for, if training knew any."""

@@ -1,7 +1,9 @@
 """Guidance inside sampling: what is drawn is moved to where a World's danger keeps its margin.
 
-f(a) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins,  ŝ' = f_φ(s, a)
-x ← x − w f ∇f / ‖∇f‖²      Polyak's step, of what the action a is read from
+    f(a) = Σ_i min(min(ℓ_i(s, ŝ'), V_i(ŝ')) − 1, 0) in calibrated margins,  ŝ' = f_φ(s, a)
+    x ← x − w f ∇f / ‖∇f‖²      Polyak's step, of what the action a is read from
+
+V is left out where it leaves less than half of the logs' safe steps their margin: it knows no way to stay safe there.
 """
 
 from __future__ import annotations
@@ -21,16 +23,23 @@ from ringfence.world.dynamics import Dynamics
 
 WHOLE = 1.0  # share of a step by which a method that follows a barrier is guided by default
 MARGIN = 1.0  # that guidance asks of danger, in units of the calibrated one, as guards do
+AHEAD_KEPT = 0.5  # share of safe steps that V has to leave their margin
 LEAST_SLOPE = 1e-6  # of a slope's square: what hardly depends on x is not chased far
 
 
 def short_of_margin(
-    dynamics: Dynamics, barrier: Barrier | MinBarrier, ood_threshold: Array, present: Array, action: Array
+    dynamics: Dynamics,
+    barrier: Barrier | MinBarrier,
+    ood_threshold: Array,
+    present: Array,
+    action: Array,
+    ahead: bool = True,
 ) -> Array:
     """(B,) what the states after actions (B, N, A) lack of the margin, in all agents: 0 or negative. As guards do, it
-    trusts less where the ensemble disagrees."""
+    trusts less where the ensemble disagrees. `ahead`: V is asked, too."""
     after, spread = dynamics.step(present, action)
-    score = jnp.minimum(barrier.apart(present, after), barrier.ahead_apart(after))
+    score = barrier.apart(present, after)
+    score = jnp.minimum(score, barrier.ahead_apart(after)) if ahead else score
     doubt = jnp.maximum(spread / ood_threshold - 1.0, 0.0)
     return jnp.minimum(lowest(score) - doubt - MARGIN, 0.0).sum(-1)
 
@@ -49,6 +58,12 @@ def knows_danger(world: World) -> World:
     if world.barrier is None:
         raise UserError("barrier_guidance needs a World that knows danger; fit one on logs with costs.")
     return world
+
+
+def looks_ahead(world: World) -> bool:
+    """Whether V is worth asking in this World."""
+    scores = world.card.barrier
+    return scores is None or scores.ahead_kept >= AHEAD_KEPT
 
 
 def cleared(short_of: Callable[[Array], Array], x: Array, share: float, rounds: int = 1) -> Array:

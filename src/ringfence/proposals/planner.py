@@ -28,7 +28,7 @@ from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit, in_bounds_of
 from ringfence.proposals.drivers import classifier_free, drawn, driver_scores
 from ringfence.proposals.generator import Generator, generator
-from ringfence.proposals.guidance import cleared, knows_danger, short_of_margin
+from ringfence.proposals.guidance import cleared, knows_danger, looks_ahead, short_of_margin
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
@@ -60,10 +60,12 @@ class Planner(HadStart, eqx.Module):
     options: PlanOptions = eqx.field(static=True)
     world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
     guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
+    ahead: bool = eqx.field(static=True, default=True)  # and by V, too
 
     def guided_by(self, world: World, share: float) -> Planner:
         """The same, its sampling guided by the danger that this World has learned."""
-        return dataclasses.replace(self, world=knows_danger(in_bounds_of(self.spec, world)), guidance=share)
+        knowing = knows_danger(in_bounds_of(self.spec, world))
+        return dataclasses.replace(self, world=knowing, guidance=share, ahead=looks_ahead(knowing))
 
     @property
     def rows_planned(self) -> int:
@@ -254,7 +256,7 @@ class Planner(HadStart, eqx.Module):
         assert world is not None and world.barrier is not None, "checked by guided_by"
         ahead = self.agreed(self.normaliser.invert(made.inpaint(clean)))[:, self.history + 1]
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
-        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, judged, action)
+        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, judged, action, self.ahead)
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
