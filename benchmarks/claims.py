@@ -601,8 +601,8 @@ def no_size_loses() -> tuple[bool, str]:
 
 
 def of_other_integrators() -> tuple[bool, str]:
-    """Steps with contact in simulators that move by another rule than the World's logs, and of logs recorded there."""
-    rows = {(r["policy"], r["place"], r["guard"]): r for r in rows_of("mpe2.csv")}
+    """Clones' steps with contact where things move by another rule than the World's logs, and of logs recorded there."""
+    rows = {(r["policy"], r["place"], r["guard"]): r for r in rows_of("mpe2.csv") if "icbf" not in r["policy"]}
     left = {}
     for who, place in {(who, place) for who, place, _ in rows if place != "ours, the data's rules"}:
         alone, guarded = (rows[who, place, g] for g in ("none", "shield"))
@@ -732,7 +732,7 @@ def shaping_costs_return() -> tuple[bool, str]:
 def printed_earns() -> tuple[bool, str]:
     """Algorithm 1 as printed on the pool, at the best of its λ."""
     found = [planned("algorithm1", FIVE, f"λ = {w:g}", "as it is") for w in (1.0, 0.1, 10.0)]
-    earned, cost = max(((e.mean(), c.mean()) for e, c in found), key=lambda x: x[0])
+    earned, cost = max(((e.mean(), c.mean()) for e, c in found if len(c)), key=lambda x: x[0])
     return bool(earned >= 0.95 and cost > 1), f"{earned:.3f} / {cost:.2f}"
 
 

@@ -243,24 +243,11 @@ def others() -> str:
     return markdown(("task", "who", "seeds", "return", "cost"), lines)
 
 
-def guarded() -> str:
-    """Plans and clones under the same guards, paired."""
-    lines = []
-    for task in (f"simple_spread-{tier}" for tier in SPREAD):
-        rows = rows_of("guards", task)
-        for guard in ("shield", "full"):
-            plans, clones = (played(rows, name, f"under {guard}") for name in ("icbf", "bc"))
-            if plans and clones:
-                lines.append((task, f"`{guard}`", brief(plans), brief(clones), less(plans, clones, task)))
-    return markdown(("task", "guard", "plans of `icbf`", "clones", "plans less clones"), lines)
-
-
 def write_tables() -> None:
     put(PAGE, "planner-rows", spread())
     put(PAGE, "planner-ablations", changes("ablations", "alone", LEARNED, "as it is"))
     put(PAGE, "planner-frontier", frontier())
     put(PAGE, "planner-algorithm1", changes("algorithm1", "as it is", LEARNED))
-    put(PAGE, "planner-guards", guarded())
     put(PAGE, "planner-others", others())
     for page in ("README.md", "docs/benchmark.md"):
         put(page, "glance", glance())
