@@ -601,7 +601,7 @@ def no_size_loses() -> tuple[bool, str]:
 
 
 def of_other_integrators() -> tuple[bool, str]:
-    """Clones' steps with contact where things move by another rule than the World's logs, and of logs recorded there."""
+    """Clones' steps with contact where things move by other rules than the World's logs, and of logs recorded there."""
     rows = {(r["policy"], r["place"], r["guard"]): r for r in rows_of("mpe2.csv") if "icbf" not in r["policy"]}
     left = {}
     for who, place in {(who, place) for who, place, _ in rows if place != "ours, the data's rules"}:
