@@ -189,7 +189,7 @@ def test_targets_of_costs_are_not_negative():
         (omar.check, omar.Config(search="elites", elites=1), "elites=1 must be 2 to 10"),
         (omar.check, omar.Config(cql_actions="policy", cql_noise=0.0), "cql_noise=0"),
         (fisor.check, fisor.Config(diffusion_steps=1), "at least 2 diffusion steps"),
-        (icbf.check, icbf.Config(snr_floor=6.0), "snr_floor=6.0 is above snr_ceiling=5.0"),
+        (icbf.check, icbf.Config(snr_floor=6.0), "snr_floor=6.0 is above snr_ceiling=1.0"),
         (icbf.check, icbf.Config(barrier_start=0.6), "barrier_start=0.6 is above barrier_full=0.5"),
     ],
 )

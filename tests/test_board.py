@@ -284,7 +284,7 @@ def test_numbers_of_a_row_by_hand(folder):
     assert bc.cost_safe_start == pytest.approx((12 + 4) / 7)  # without the unsafe start of seed 1
     assert (bc.violations, bc.episodes, bc.seeds) == (6, 8, (0, 1)) and not bc.safe
     assert (bc.train_seconds, bc.parameters, bc.plan_ms) == (10.0, 1234, None)
-    guarded = row(folder, "ICBF-Diffuser default+guarded")
+    guarded = row(folder, "ICBF-Diffuser guarded")
     assert guarded.returns_sd is None and guarded.plan_ms == 7.25 and guarded.violations == 1
     # 1 of 4: the bound p solves P(at most 1 of 4) = (1 - p)^4 + 4 p (1 - p)^3 = 0.05
     p = guarded.violation_upper
@@ -295,13 +295,13 @@ def test_ranks_are_lexicographic(folder):
     rows = standings(read(folder))[EXPERT]
     # guarded alone is within the limit; plain costs 2 and BC 2.5, although BC earns more
     assert [(r.label, r.rank, r.safe, r.best) for r in rows] == [
-        ("ICBF-Diffuser default+guarded", 1, True, True),
-        ("ICBF-Diffuser default", 2, False, False),
+        ("ICBF-Diffuser guarded", 1, True, True),
+        ("ICBF-Diffuser", 2, False, False),
         ("BC", 3, False, False),
     ]
     cell(folder, {"default": summary([405] * 4, [0] * 4)}, "omar")
     rows = standings(read(folder))[EXPERT]
-    assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser default+guarded", 1), ("OMAR", 2)]
+    assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser guarded", 1), ("OMAR", 2)]
 
 
 def test_equal_methods_share_a_place(folder):
@@ -309,8 +309,8 @@ def test_equal_methods_share_a_place(folder):
     rows = standings(read(folder))[EXPERT]
     assert [(r.label, r.rank, r.best) for r in rows] == [
         ("OMAR", 1, True),
-        ("ICBF-Diffuser default+guarded", 1, True),
-        ("ICBF-Diffuser default", 3, False),
+        ("ICBF-Diffuser guarded", 1, True),
+        ("ICBF-Diffuser", 3, False),
         ("BC", 4, False),
     ]
 
@@ -381,8 +381,8 @@ def test_aggregate_takes_methods_with_every_task(folder):
     bc = Method("bc", "default", "default")
     assert found.methods == [bc] and found.seeds == {bc: (0, 1)}
     assert {m.label: t for m, t in found.left_out.items()} == {
-        "ICBF-Diffuser default": [MEDIUM],
-        "ICBF-Diffuser default+guarded": [MEDIUM],
+        "ICBF-Diffuser": [MEDIUM],
+        "ICBF-Diffuser guarded": [MEDIUM],
     }
     scores = np.array([[300, 250], [320, 250]])
     assert found.returns[bc] == pytest.approx((scores - LOW) / (HIGH - LOW))
@@ -402,7 +402,7 @@ def test_aggregate_takes_methods_with_every_task(folder):
 
 def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
     against = {c.other.label: c for c in contests(standings(read(folder))[EXPERT])}
-    assert list(against) == ["ICBF-Diffuser default", "BC"]  # the first is ICBF-Diffuser default+guarded
+    assert list(against) == ["ICBF-Diffuser", "BC"]  # the first is ICBF-Diffuser guarded
     assert against["BC"].returns == 100.0 and against["BC"].cost == 0.25 - 2.5
     assert against["BC"].cost_interval[0] <= -2.25 <= against["BC"].cost_interval[1]
     # 400 420 410 410 against 310 each: four differences of one sign have p = 2/2^4 or, with ties, nearly so; the
@@ -487,7 +487,7 @@ def test_page_parses_links_resolve_and_nothing_is_loaded(folder, tmp_path):
 def test_page_shows_the_numbers(folder, tmp_path):
     expert = text_of(section_of(build_board(folder, tmp_path).read_text(), EXPERT))
     assert (tmp_path / "report.html").is_file()
-    assert "ICBF-Diffuser default+guarded ★ best within the limit 1 410.0" in expert
+    assert "ICBF-Diffuser guarded ★ best within the limit 1 410.0" in expert
     assert "BC 3 310.0 ± 14.1" in expert and "2.500 ± 0.707" in expert
     assert "6 of 8" in expert and "1 of 2" in expert  # unsafe episodes of BC; seeds of ICBF
     assert "For reference behaviour data – 530.0" in expert
@@ -498,18 +498,18 @@ def test_page_shows_the_numbers(folder, tmp_path):
 def test_page_does_not_hide_what_is_missing(folder, tmp_path):
     html = build_board(folder, tmp_path).read_text()
     medium = text_of(section_of(html, MEDIUM))
-    assert "ICBF-Diffuser default not measured on this task" in medium
+    assert "ICBF-Diffuser not measured on this task" in medium
     assert "3 of the grid's cells have no result" in text_of(html)
     assert "2 of the suite's 4 tasks were not begun" in text_of(html)
     made = text_of(section_of(html, "How it was made"))
     assert "simple_spread-expert, icbf, seed 1: failed: MemoryError: no memory" in made
     assert "simple_spread-medium, icbf, seeds 0, 1: not started" in made
-    assert "ICBF-Diffuser default is left out of this section: it has no result on medium" in text_of(html)
+    assert "ICBF-Diffuser is left out of this section: it has no result on medium" in text_of(html)
 
 
 def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
     text = text_of(section_of(build_board(folder, tmp_path).read_text(), "Ranking"))
-    assert text.index("BC 1.00") < text.index("ICBF-Diffuser default+guarded –")
+    assert text.index("BC 1.00") < text.index("ICBF-Diffuser guarded –")
     # the only method with every task: the mean of its ranks among such methods is 1, whatever the others did on one
     assert "BC 1.00 1 3 0.42, cost 2.50 over limit 1 ★ 0.25, cost 0.00 within limit" in text
     assert "1 ★ 0.70, cost 0.25 within limit 1 of 2 seeds" in text
@@ -578,9 +578,9 @@ def test_latex_by_hand(folder):
         r"BC & $310.0 \pm 14.1$ & $0.42 \pm 0.04$ & $2.50 \pm 0.71^{\dagger}$ & $2.286$ & $75.0\;(100.0)$ & 2 \\"
         in text
     )
-    assert r"\textbf{ICBF-Diffuser default+guarded} & $\mathbf{410.0}$" in text and text.count(r"\textbf") == 2
+    assert r"\textbf{ICBF-Diffuser guarded} & $\mathbf{410.0}$" in text and text.count(r"\textbf") == 2
     assert r"my\_method & $1.0$" in text
-    assert r"ICBF-Diffuser default+guarded & -- & -- & -- & -- & -- & 0 \\" in text
+    assert r"ICBF-Diffuser guarded & -- & -- & -- & -- & -- & 0 \\" in text
     body = [x for x in text.splitlines() if x.endswith(r"\\")]
     assert {x.count("&") for x in body} == {6}
 
@@ -596,11 +596,11 @@ def test_markdown_whole_and_short(folder):
     whole = board_markdown(board)
     assert r"**simple\_spread-expert**, cost limit 1, normalised with 159.8 → 516.8" in whole
     assert "| BC | 3 | 310.0 ± 14.1 | 0.421 ± 0.040 | 2.500 ± 0.707 † | 2.286 (" in whole
-    assert "| ICBF-Diffuser default+guarded | 1 | **410.0** | 0.701 | 0.250 |" in whole
-    assert "| ICBF-Diffuser default | – | not measured |" in whole and "0 of 2" in whole
+    assert "| ICBF-Diffuser guarded | 1 | **410.0** | 0.701 | 0.250 |" in whole
+    assert "| ICBF-Diffuser | – | not measured |" in whole and "0 of 2" in whole
     short = board_markdown_short(board)
     assert "| BC | 0.42 (2.286) † | **0.25 (0.000)** | 1.00 |" in short
-    assert "| ICBF-Diffuser default+guarded | **0.70 (0.250) [1]** | not measured | – |" in short
+    assert "| ICBF-Diffuser guarded | **0.70 (0.250) [1]** | not measured | – |" in short
     assert "| do nothing | 0.06 (0.000) | not measured | – |" in short
     for text in (whole, short):
         for block in re.findall(r"(?:^\|.*\n)+", text, re.M):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -12,7 +13,6 @@ from safetensors import safe_open
 
 from ringfence import guards, world
 from ringfence.datasets import registry
-from ringfence.deploy import zoo
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.guards.wrap import Nothing
@@ -45,7 +45,7 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
 
 def test_a_world_of_0_1_0_opens(tmp_path):
     """Its settings, its card and its arrays have names of before, and are written under today's."""
-    file = zoo.FOLDER / "crossing-hasty" / "icbf-world.safetensors"
+    file = Path(__file__).parent / "data" / "world-0.1.0.safetensors"
     with safe_open(file, "numpy") as opened:
         before = json.loads(opened.metadata()["ringfence_world"])["card"]
         threshold = opened.get_tensor("strange")
