@@ -730,10 +730,13 @@ def shaping_costs_return() -> tuple[bool, str]:
 
 
 def printed_earns() -> tuple[bool, str]:
-    """Algorithm 1 as printed on the pool, at the best of its λ."""
-    found = [planned("algorithm1", FIVE, f"λ = {w:g}", "as it is") for w in (1.0, 0.1, 10.0)]
-    earned, cost = max(((e.mean(), c.mean()) for e, c in found if len(c)), key=lambda x: x[0])
-    return bool(earned >= 0.95 and cost > 1), f"{earned:.3f} / {cost:.2f}"
+    """Algorithm 1 as printed on the pool at the best of its λ, and its cost at 1 beside 0 and at 10."""
+    found = {w: planned("algorithm1", FIVE, f"λ = {w:g}", "as it is") for w in (0.0, 1.0, 10.0)}
+    earned = {w: float(e.mean()) for w, (e, _) in found.items()}
+    cost = {w: float(c.mean()) for w, (_, c) in found.items()}
+    holds = earned[1.0] >= 0.95 and cost[1.0] > 0.95 * cost[0.0] and cost[10.0] < 0.6 * cost[0.0]
+    holds = holds and earned[10.0] < 0.6 * earned[0.0]
+    return holds, ", ".join(f"λ = {w:g}: {earned[w]:.2f} / {cost[w]:.2f}" for w in found)
 
 
 CLAIMS = (
@@ -860,7 +863,7 @@ CLAIMS = (
     ),
     Claim(
         "docs/drivers-results.md",
-        "Over five seeds `flow` earns more than the best driver does",
+        "Over five seeds `flow` earns more than the best driver did",
         POOL,
         of_a_pool(
             "flow",

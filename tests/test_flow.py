@@ -19,6 +19,7 @@ from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
 from ringfence.proposals.base import act_with
+from ringfence.proposals.guidance import guided
 from ringfence.proposals.options import PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.types import Spec
@@ -298,7 +299,7 @@ def test_guidance_moves_actions_to_the_margin(two_drifts, tmp_path):
 
     def drawn(share, present, steps=1):
         options = PlanOptions(sampling_steps=steps, temperature=0.0)
-        asked = dataclasses.replace(policy, options=options).guided_by(Line(policy.spec), share)
+        asked = guided(dataclasses.replace(policy, options=options), Line(policy.spec), share)
         return np.asarray(eqx.filter_jit(asked.draw)(x, driver, jax.random.key(0), present))
 
     free = drawn(0.0, x)

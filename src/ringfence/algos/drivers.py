@@ -45,12 +45,13 @@ class Driven(NamedTuple):
     metrics: Metrics
 
 
-def networks(key: Key, drivers: int, seen: int, acts: int, width: int, depth: int) -> dict[str, ResidualMLP]:
+def networks(
+    of_clones: Key, of_prior: Key, drivers: int, seen: int, acts: int, width: int, depth: int
+) -> dict[str, ResidualMLP]:
     """Joint clones of every driver, and who drives: of `seen` entries of a team, whose joint action has `acts`."""
-    kc, kq = jax.random.split(key)
     return {
-        "clones": ResidualMLP(kc, seen, drivers * acts, width, depth),
-        "prior": ResidualMLP(kq, seen + 2, drivers, PRIOR_WIDTH, 2, 0.1),
+        "clones": ResidualMLP(of_clones, seen, drivers * acts, width, depth),
+        "prior": ResidualMLP(of_prior, seen + 2, drivers, PRIOR_WIDTH, 2, 0.1),
     }
 
 

@@ -96,11 +96,8 @@ def init(
     inputs = seen + acts + 2 * WAVES + config.drivers + 2
 
     def networks() -> dict:
-        params = {
-            "clones": ResidualMLP(kc, seen, config.drivers * acts, config.width, config.depth),
-            "flow": ResidualMLP(kf, inputs, acts, config.width, config.depth, 0.1),
-            "prior": ResidualMLP(kp, seen + 2, config.drivers, drivers.PRIOR_WIDTH, 2, 0.1),
-        }
+        params = drivers.networks(kc, kp, config.drivers, seen, acts, config.width, config.depth)
+        params["flow"] = ResidualMLP(kf, inputs, acts, config.width, config.depth, 0.1)
         return fresh(_optimiser(config), params, "ema")
 
     state = jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}

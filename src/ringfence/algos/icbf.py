@@ -230,9 +230,9 @@ def init(
             params["barrier"] = MLP(kb, (d, *[config.barrier_width] * 3, 1), groups=groups)
         if config.searched:
             acts = n * spec.action_dim
-            params |= drivers.networks(
-                jax.random.fold_in(key, 1), config.searched, seen, acts, config.clone_width, config.clone_depth
-            )
+            kc, kq = jax.random.split(jax.random.fold_in(key, 1))
+            sizes = (config.clone_width, config.clone_depth)
+            params |= drivers.networks(kc, kq, config.searched, seen, acts, *sizes)
         return fresh(optimiser(config), params, "ema")
 
     if data is None:

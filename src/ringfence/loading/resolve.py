@@ -20,7 +20,7 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints, features
 from ringfence.problem.homogeneous import team_policy
 from ringfence.problem.origins import Origins
-from ringfence.proposals.guidance import WHOLE, TakesGuidance
+from ringfence.proposals.guidance import WHOLE, TakesGuidance, guided
 from ringfence.proposals.options import PLANNERS, PlanOptions, TakesPlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
@@ -172,7 +172,7 @@ def _guided(policy: Any, run: Run, job: Job, read: World | None, spec: PolicySpe
             "or set barrier_guidance=0."
         )
         return policy
-    return policy.guided_by(world, WHOLE if asked is None else asked)
+    return guided(policy, world, WHOLE if asked is None else asked)
 
 
 def _trained(run: Run, job: Job, world: World | None, spec: PolicySpec) -> tuple[int, Policy]:

@@ -8,7 +8,6 @@ With `barrier_guidance` w, every step moves â by w of a step to where a World's
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
@@ -21,9 +20,9 @@ import jax.numpy as jnp
 from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
-from ringfence.proposals.base import from_unit, in_bounds_of, rolled
+from ringfence.proposals.base import from_unit, rolled
 from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_scores
-from ringfence.proposals.guidance import cleared, knows_danger, looks_ahead, short_of_margin
+from ringfence.proposals.guidance import cleared, lacking
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.world import World
@@ -104,11 +103,6 @@ class FlowPolicy(eqx.Module):
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
-    def guided_by(self, world: World, share: float) -> FlowPolicy:
-        """The same, its sampling guided by the danger that this World has learned."""
-        knowing = knows_danger(in_bounds_of(self.spec, world))
-        return dataclasses.replace(self, world=knowing, guidance=share, ahead=looks_ahead(knowing))
-
     def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None) -> Array:
         """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,); guided from `present` (B, N, D'), the
         same in the World's view."""
@@ -136,15 +130,9 @@ class FlowPolicy(eqx.Module):
         s = self.spec
 
         def missing(action: Array) -> Array:
-            return self._missing(present, s.own(jnp.clip(action, -1.0, 1.0).reshape(-1, s.n_agents, s.action_dim)))
+            return lacking(self, present, s.own(jnp.clip(action, -1.0, 1.0).reshape(-1, s.n_agents, s.action_dim)))
 
         return cleared(missing, action, self.guidance)
-
-    def _missing(self, present: Array, action: Array) -> Array:
-        """(B,) what the next states lack of the margin, in all: 0 or negative."""
-        world = self.world
-        assert world is not None and world.barrier is not None, "checked by guided_by"
-        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, present, action, self.ahead)
 
     def _guided(self, answer: Callable[[Array, Array], Array], batch: int) -> Array:
         """What answers to (y, whether it is given), guided by the return that is asked for, if training knew any."""

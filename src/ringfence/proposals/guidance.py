@@ -8,15 +8,17 @@ V is left out where it leaves less than half of the logs' safe steps their margi
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 
 from ringfence.errors import UserError
 from ringfence.problem.constraints import lowest
-from ringfence.types import Array
+from ringfence.proposals.base import in_bounds_of
+from ringfence.types import Array, Spec
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, MinBarrier
 from ringfence.world.dynamics import Dynamics
@@ -48,22 +50,31 @@ def short_of_margin(
 class TakesGuidance(Protocol):
     """A policy that draws plans or actions, and can be guided by danger while it does."""
 
-    guidance: float
+    spec: Spec
+    world: World | None  # whose danger guides
+    guidance: float  # by what share of a step
+    ahead: bool  # and by V, too
 
-    def guided_by(self, world: World, share: float) -> Any: ...
+
+P = TypeVar("P", bound=TakesGuidance)
 
 
-def knows_danger(world: World) -> World:
-    """The World, if it can guide."""
+def guided(policy: P, world: World, share: float) -> P:
+    """The policy, its sampling guided by the danger that this World has learned."""
     if world.barrier is None:
         raise UserError("barrier_guidance needs a World that knows danger; fit one on logs with costs.")
-    return world
-
-
-def looks_ahead(world: World) -> bool:
-    """Whether V is worth asking in this World."""
     scores = world.card.barrier
-    return scores is None or scores.ahead_kept >= AHEAD_KEPT
+    ahead = scores is None or scores.ahead_kept >= AHEAD_KEPT
+    about: dict[str, Any] = {"world": in_bounds_of(policy.spec, world), "guidance": share, "ahead": ahead}
+    return dataclasses.replace(policy, **about)  # type: ignore[type-var]
+
+
+def lacking(policy: TakesGuidance, present: Array, action: Array) -> Array:
+    """(B,) what the World that guides a policy says that actions (B, N, A) from its view of the present (B, N, D) lack
+    of the margin: 0 or negative."""
+    world = policy.world
+    assert world is not None and world.barrier is not None, "checked by guided"
+    return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, present, action, policy.ahead)
 
 
 def cleared(short_of: Callable[[Array], Array], x: Array, share: float, rounds: int = 1) -> Array:

@@ -11,7 +11,6 @@ What becomes of several plans, and of what they would do, is a guard's (guard/).
 
 from __future__ import annotations
 
-import dataclasses
 from functools import partial
 from typing import Any
 
@@ -25,10 +24,10 @@ from ringfence.nets.heads import infer_action
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
-from ringfence.proposals.base import from_unit, in_bounds_of
+from ringfence.proposals.base import from_unit
 from ringfence.proposals.drivers import classifier_free, drawn, driver_scores
 from ringfence.proposals.generator import Generator, generator
-from ringfence.proposals.guidance import cleared, knows_danger, looks_ahead, short_of_margin
+from ringfence.proposals.guidance import cleared, lacking
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
 from ringfence.utils.renamed import HadStart
@@ -61,11 +60,6 @@ class Planner(HadStart, eqx.Module):
     world: World | None = None  # whose danger guides the sampling, where `barrier_guidance` asks for it
     guidance: float = eqx.field(static=True, default=0.0)  # by what share of a step
     ahead: bool = eqx.field(static=True, default=True)  # and by V, too
-
-    def guided_by(self, world: World, share: float) -> Planner:
-        """The same, its sampling guided by the danger that this World has learned."""
-        knowing = knows_danger(in_bounds_of(self.spec, world))
-        return dataclasses.replace(self, world=knowing, guidance=share, ahead=looks_ahead(knowing))
 
     @property
     def rows_planned(self) -> int:
@@ -252,11 +246,9 @@ class Planner(HadStart, eqx.Module):
 
     def _short_of_margin(self, made: Generator, present: Array, judged: Array, clean: Array) -> Array:
         """(B,) what the World says that the first step of plans (B, rows, N, D) lacks of the margin."""
-        world = self.world
-        assert world is not None and world.barrier is not None, "checked by guided_by"
         ahead = self.agreed(self.normaliser.invert(made.inpaint(clean)))[:, self.history + 1]
         action = jnp.clip(infer_action(self.networks["inverse"], self.normaliser, present, ahead), -1.0, 1.0)
-        return short_of_margin(world.dynamics, world.barrier, world.ood_threshold, judged, action, self.ahead)
+        return lacking(self, judged, action)
 
     def agreed(self, x: Array) -> Array:
         """Plans (B, rows, N, D) in which all agents agree on where everybody will be, where the task knows how."""
