@@ -18,7 +18,7 @@ from ringfence.evaluation.statistics import upper_bound
 
 LOGGED, EPISODES = 600, 100
 HEAD = ("system", "seed", "driver", "causes", "verdict", "found", "guard")
-HEAD += ("episodes", "return", "violated", "bound", "infeasible")
+HEAD += ("episodes", "return", "violated", "bound", "infeasible_rate")
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ HEAD = (
     "return",
     "contact",
     "bound",
-    "infeasible",
+    "infeasible_rate",
 )
 ALONE, AS_THEY_ARE, UNDELAYED = "none", "of the logs as they are", "of undelayed logs"
 
