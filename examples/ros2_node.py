@@ -90,6 +90,13 @@ def observed(names: list[str], place: np.ndarray, speed: np.ndarray, goal: np.nd
     return np.asarray(rows, np.float32)
 
 
+def check(robots: list[str], agents: list[str]) -> None:
+    """Refuse robots whose rows the policy would take for others': the logs know their names in another order."""
+    for robot, agent in zip(robots, agents):
+        if robot != agent and robot in agents:
+            raise SystemExit(f"{robot} stands where the logs have {agent}; name robots in this order: {agents}.")
+
+
 def main(file: str, robots: list[str]) -> None:
     import rclpy
     from geometry_msgs.msg import PointStamped, Twist
@@ -101,6 +108,7 @@ def main(file: str, robots: list[str]) -> None:
         def __init__(self):
             super().__init__("ringfence")
             self.pilot, nowhere = Pilot(file), np.full((len(robots), 2), np.nan)
+            check(robots, self.pilot.facts["names"].get("agents", []))
             self.place, self.speed, self.goal = nowhere, nowhere.copy(), nowhere.copy()
             self.senders = [self.create_publisher(Twist, f"/{name}/cmd_vel", 1) for name in robots]
             for i, name in enumerate(robots):

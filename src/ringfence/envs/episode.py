@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.problem.origins import NOWHERE, Origins
-from ringfence.utils.given import NUMBERS, given_as
+from ringfence.utils.given import NUMBERS, given_as, refuse_other_order
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
 ByAgent = Mapping[Any, Any]
@@ -39,6 +39,7 @@ class Shape:
     origins: Origins = NOWHERE  # of what is shown, which is taken from it
     needs_state: bool = True  # a simulator without a state that is asked for is refused
     double: bool = False  # what is shown in double precision stays in it
+    names: Sequence[str] | None = None  # of the logs' agents, in order
 
 
 def check(env: Any, *names: str) -> None:
@@ -108,6 +109,7 @@ class Episode:
             raise UserError(f"{self.name} has no possible_agents; give at least one.")
         if len(set(map(str, self.agents))) < count:
             raise UserError(f"{self.name} names an agent twice in possible_agents; give each its own name.")
+        refuse_other_order(self.agents, self.shape.names, all_known=False)
 
     def _check_count(self, observations: ByAgent) -> None:
         """Refuse another number of agents; where they see something else, too, that is said first."""

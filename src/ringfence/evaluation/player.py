@@ -100,7 +100,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         policy=resolved.team,
         act=in_float32(jax.jit(act_with)),
         task=job.task,
-        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins),
+        shape=Shape(job.team, observation, state or 0, job.task.homogeneous, job.origins, names=resolved.run.agents),
         episode_length=job.spec.episode_length,
         action_dim=job.spec.action_dim,
         observation_names=_names_of(resolved),
@@ -164,6 +164,7 @@ def shape_of(world: World, agents: int) -> Shape:
         homogeneous=world.spec.homogeneous,
         origins=world.origins,
         needs_state=needed,
+        names=world.card.data.agents,
     )
 
 

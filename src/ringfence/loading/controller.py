@@ -30,7 +30,7 @@ from ringfence.training.job import Job
 from ringfence.training.runs import Run
 from ringfence.types import Key, Policy, PolicyStep, PyTree
 from ringfence.utils.compilation import keep_programs
-from ringfence.utils.given import given_as
+from ringfence.utils.given import given_as, refuse_other_order
 from ringfence.utils.precision import in_float32
 from ringfence.utils.renamed import Info
 from ringfence.world import World
@@ -117,6 +117,11 @@ class Controller:
             raise UserError("This controller is of a callable, which has no job; only one of a run has.")
         return self._source.job
 
+    @property
+    def agents(self) -> list[str] | None:
+        """Whose row is whose, by the logs' names; None of those who are homogeneous, or whom nobody named."""
+        return self._source.names
+
     @in_float32
     def reset(self) -> None:
         """Begin an episode: plans in progress and histories are forgotten."""
@@ -155,19 +160,23 @@ class Controller:
         cost: Paid | None = None,
         age: int | np.ndarray | None = None,
         observed_at: float | np.ndarray | None = None,
+        agents: Sequence[Any] | None = None,
     ) -> np.ndarray:
         """(N, A) joint action within the task's bounds; a callable is asked with the same arrays. `cost` is what the
         last step cost, in all or by each constraint's name, which an adapting guard follows. Arrays of another shape
         than the run's or the World's are refused, and so is what is not finite: indices beyond an array's end would be
         clipped in silence, and noise would follow NaN. `age` is how many steps old the observations are, of all or of
         each agent, for a guard with `max_age`; `observed_at` is when they were made, in seconds by the controller's
-        `clock`, from which the age follows, and to which what deciding took lately is added.
+        `clock`, from which the age follows, and to which what deciding took lately is added. `agents` are the names of
+        whose rows these are, which must be `agents` of the logs, in their order.
 
         A refusal is a `NoSafeAction`, whose `last_action` is that of the step before."""
         source = self._source
         begun = time.perf_counter()
         with no_safe_action(self.last_action), self._recorded():
             self._watch.check()
+            if agents is not None:
+                refuse_other_order(agents, self.agents)
             seen = source.seen(observations, state)
             paid = None if cost is None else costs_of_one(cost, source.agents)
             age = self._age(age, observed_at)
@@ -263,7 +272,7 @@ class _TrainedRun:
     @in_float32
     def __init__(self, run: Run | str | Path, planner: str, options: dict[str, Any]):
         self.job, self.policy = load(cast("Run | str", run), planner=planner, **options)
-        self.agents = self.job.team
+        self.agents, self.names = self.job.team, Run.of(run).agents
         self._act = jax.jit(act_with)
 
     def seen(self, observations: Any, state: Any) -> Seen:
@@ -308,7 +317,7 @@ class _Function:
 
     def __init__(self, policy: Callback):
         self.policy = policy
-        self.agents = policy.agents
+        self.agents, self.names = policy.agents, policy.guarded.guard.world.card.data.agents
         self.seen = policy.seen
 
     def act(self, carry: PyTree, seen: Seen, cost: OneCost | None, key: Key) -> tuple[PyTree, PolicyStep]:

@@ -38,6 +38,7 @@ from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, comple
 from ringfence.problem import constraints
 from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
+from ringfence.utils.given import refuse_other_order
 from ringfence.utils.pytrees import digest_of
 from ringfence.utils.renamed import deprecated, renamed
 
@@ -212,6 +213,8 @@ class EpisodeStore:
             raise StoreError("The stores name other constraints; give both the same ones, in the same order.")
         if self._shape_of_agents() != other._shape_of_agents():
             raise StoreError("The stores are of other agents (their shapes differ); keep them apart.")
+        if not self.card.homogeneous:
+            refuse_other_order(other.card.agents or (), self.card.agents, all_known=False)
         if self.card.action_delay != other.card.action_delay:
             raise StoreError("The stores were undelayed by other steps; join them before.")
         if self.card.origins != other.card.origins:

@@ -66,6 +66,13 @@ class Run:
         return stored.config(schemas.read(self.path / "config.json", schemas.Config, remedy))
 
     @property
+    def agents(self) -> list[str] | None:
+        """Names of the agents that it was trained on, in order; None where any number plays, or nobody named them."""
+        config = self.config
+        names = config["data"].get("agents")
+        return names if names and len(names) == config.get("team") and not config["spec"].get("homogeneous") else None
+
+    @property
     def results(self) -> dict[str, dict[str, Any]]:
         """Evaluations by variant, under today's names; empty before the first `ringfence eval`."""
         file = self.path / "results.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 from ringfence.errors import UserError
 
 NUMBERS = "biuf"  # kinds of NumPy's types; complex, text, times and objects are none
+SHOWN = 20  # names of agents in a refusal
 LETTERS = {1: "S", 2: "NO", 3: "BNA"}  # axes that messages name
 
 
@@ -52,6 +54,19 @@ def given_as(
             f"{name}{where} is {array[tuple(where)]}, but a policy takes finite numbers alone; repair that entry."
         )
     return array
+
+
+def refuse_other_order(agents: Sequence[Any], known: Sequence[str] | None, all_known: bool = True) -> None:
+    """Refuse agents whose rows would be taken for others': those that the logs know at another place, or, where they
+    are `all_known`, not at all. Logs that name none are of nobody in particular."""
+    if known is None:
+        return
+    for k, (agent, logged) in enumerate(itertools.zip_longest(map(str, agents), known)):
+        if agent != logged and (all_known or agent in known):
+            raise UserError(
+                f"Agent {k} is {agent or 'nobody'} here and {logged or 'nobody'} in the logs; bring all into the logs' "
+                f"order: {', '.join(known[:SHOWN])}{', ...' * (len(known) > SHOWN)}."
+            )
 
 
 def cost_given(value: Any, agents: int) -> float | dict[str, float]:

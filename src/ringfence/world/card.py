@@ -47,6 +47,7 @@ class Data(Part, frozen=True):
     impacts: int = 0  # unsafe steps that threw a body back (world/impacts.py)
     action_delay: int = 0  # steps that commands took to take effect: a guard decides for so much later (logs/late.py)
     late: tuple[int | None, ...] = ()  # steps after which commands of each agent take effect, where not at once
+    agents: list[str] | None = None  # their names, in order, where these say more than numbers do
     partners: bool = False  # predictions read what those do who are in lists of the nearest (problem/partners.py)
 
 

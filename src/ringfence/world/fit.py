@@ -114,6 +114,7 @@ def fit_view(
     content += ["undelayed by", store.card.action_delay] if store.card.action_delay else []
     content += [store.limits, "unsafe costs"] if store.limits else []
     content += [dataclasses.astuple(store.card.origins)] if store.card.origins else []
+    content += ["of", named] if (named := _agents(store)) else []
     heading = Heading.of(map.names)
     content += [AHEAD] if heading else []
     content += ["with what is relative to it"] if heading and not set(heading.about) <= set(map.follows) else []
@@ -211,8 +212,16 @@ def _data(store: EpisodeStore, logged: Logged, thrown: int, looked_up: bool) -> 
         impacts=thrown,
         action_delay=store.card.action_delay,
         late=delays.steps if delays.any else (),
+        agents=_agents(store),
         partners=looked_up,
     )
+
+
+def _agents(store: EpisodeStore) -> list[str] | None:
+    """Names of the store's agents, where these say more than their numbers do."""
+    agents = store.card.agents
+    numbers = [f"agent{i}" for i in range(store.n_agents)]
+    return None if store.card.homogeneous or agents is None or agents == numbers else agents
 
 
 def _inferred_names(store: EpisodeStore, map: features.FeatureMap) -> dict[str, str]:

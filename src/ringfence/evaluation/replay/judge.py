@@ -35,6 +35,7 @@ from ringfence.training import worlds
 from ringfence.training.runs import Run
 from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
+from ringfence.utils.given import refuse_other_order
 from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Progress
 from ringfence.world import World
@@ -277,6 +278,8 @@ def check_view(world: World, store: EpisodeStore) -> None:
             f"The World reads {wanted[0]} agents of {wanted[1]} entries and {wanted[2]} actions, the logs hold "
             f"{shape[0]} of {shape[1]} and {shape[2]}; fit a World to these logs."
         )
+    if store.card.agents is not None and not store.card.homogeneous:
+        refuse_other_order(store.card.agents, world.card.data.agents)
     if world.origins != store.card.origins:
         raise UserError("The logs were moved by other origins than those of the World; fit a World to these logs.")
     if world.card.data.action_delay != store.card.action_delay:

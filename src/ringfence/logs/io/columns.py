@@ -111,7 +111,7 @@ def words(columns: Columns, name: str) -> np.ndarray:
     if column.dtype.kind == "f" and not np.isfinite(column).all():
         row = int(np.flatnonzero(~np.isfinite(column))[0])
         raise StoreError(f"row {row}: {name} is missing; fill or drop it.")
-    if column.dtype.kind != "O":
+    if column.dtype.kind not in "OS":
         return column
     missing = [row for row, entry in enumerate(column) if is_missing(entry)]
     if missing:

@@ -86,6 +86,7 @@ class Episodes:
     cost: np.ndarray  # (W, N, K)
     notes: tuple[str, ...] = ()
     sensing_radius: float | None = None  # m, of agents who see their neighbours
+    agents: list[str] | None = None  # N names, of a team whose members stay the same
 
     @property
     def last(self) -> np.ndarray:
@@ -125,7 +126,13 @@ def team_episodes(motion: Motion) -> Episodes:
     if motion.schema.separation is not None:
         cost = _too_close(motion.place[rows], motion.schema.separation.radius)
     notes = (*short, *_left_out(motion, rows))
-    return Episodes(rows, lengths, np.concatenate(seen, -1), names, cost, notes)
+    return Episodes(rows, lengths, np.concatenate(seen, -1), names, cost, notes, agents=_members(motion, rows))
+
+
+def _members(motion: Motion, rows: np.ndarray) -> list[str] | None:
+    """Who stands in each column of rows (W, N), where that is the same agent throughout."""
+    who = motion.tracks.agent[rows]
+    return None if (who != who[0]).any() else [str(name) for name in motion.agents[who[0]].tolist()]
 
 
 def _team_windows(motion: Motion) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:

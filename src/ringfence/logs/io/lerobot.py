@@ -16,6 +16,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Columns, Table, read_columns
+from ringfence.utils.natural import natural
 
 INFO = "meta/info.json"
 LARGEST = 2**24  # bytes of meta/info.json
@@ -130,7 +131,7 @@ def _words(names: Any) -> Iterator[str]:
 
 # --- data ---
 def _read_files(folder: Path, wanted: list[str]) -> Columns:
-    files = sorted(folder.glob("data/*/*.parquet"))
+    files = sorted(folder.glob("data/*/*.parquet"), key=lambda file: natural(str(file)))
     if not files:
         raise StoreError(f"'{folder}' holds no data/*/*.parquet; download the data set with its data, films aside.")
     parts = [read_columns(file, wanted) for file in files]

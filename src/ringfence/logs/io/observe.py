@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,15 +16,21 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.features import others
 from ringfence.utils import stored
+from ringfence.utils.given import refuse_other_order
 
 
-def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] | None = None) -> np.ndarray:
+def observe(
+    card: GivenCard,
+    state: Mapping[str, Any],
+    goal: Mapping[str, Any] | None = None,
+    agents: Sequence[Any] | None = None,
+) -> np.ndarray:
     """(N, O) what agents observe now, as in the store of a table with this `card`: for a policy at run time.
 
     `state` holds (N,) of every column of the table's state (velocities, too, if the import had to make them), and
-    `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the table's names; of agents who
-    are homogeneous, any number in any order. Numbers are as they were measured: where the card tells origins, they are
-    in double precision, and whoever acts on them takes the origins from them.
+    `goal` those of x, y, z: where each agent is to go. Agents stand in the order of the card's `agents`: others named
+    here are refused. Agents who are homogeneous come in any number and order. Numbers are as they were measured: where
+    the card tells origins, they are in double precision, and whoever acts on them takes the origins from them.
     """
     fields = stored.card(card.to_dict() if isinstance(card, StoreCard) else card)
     names: list[str] = list(fields.get("observation_names") or ())
@@ -33,6 +39,8 @@ def observe(card: GivenCard, state: Mapping[str, Any], goal: Mapping[str, Any] |
     for name in [name for name in columns if f"own.cos_{name}" in names]:
         angle = angle_of(name, columns[name])
         columns |= {f"cos_{name}": np.cos(angle), f"sin_{name}": np.sin(angle)}
+    if agents is not None:
+        refuse_other_order(agents, None if fields.get("homogeneous") else fields.get("agents"))
     shapes = {column.shape for column in (*columns.values(), *goals.values())}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")

@@ -17,6 +17,7 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.bagfile import ROLES, SHOWN, BagFile, Topic, joined, opened, topic_name
+from ringfence.utils.natural import natural
 
 TWIST = ("vx", "vy", "wz")
 COMMAND = ("cmd_vx", "cmd_vy", "cmd_wz")
@@ -177,7 +178,7 @@ def _asked_of(
 
 
 def _prefixes(bag: BagFile, agents: str | Sequence[str], odom: str) -> list[str]:
-    """Agents' prefixes, "" of topics at the root; those of a pattern are sorted, numbers as numbers."""
+    """Agents' prefixes, "" of topics at the root; those of a pattern in natural order."""
     if not isinstance(agents, str):
         prefixes = ["/" + prefix.strip("/") if prefix.strip("/") else "" for prefix in agents]
         if not prefixes or len(set(prefixes)) < len(prefixes):
@@ -194,8 +195,7 @@ def _prefixes(bag: BagFile, agents: str | Sequence[str], odom: str) -> list[str]
         raise StoreError(
             f"The pattern '{agents}' matches no agent: {bag.lacks(joined(agents, odom))}; pass another pattern or odom."
         )
-    order = sorted(found, key=lambda word: (not word.isdecimal(), int(word) if word.isdecimal() else 0, word))
-    return [f"{before}{word}{after}" for word in order]
+    return [f"{before}{word}{after}" for word in sorted(found, key=natural)]
 
 
 def _cost_topics(bag: BagFile, prefixes: list[str], cost: str) -> list[str]:
@@ -334,7 +334,9 @@ def _columns_of(path: Path, robot: _Robot, clock: Clock, twist: str, notes: list
         known = latest >= 0
     if robot.joints is not None:
         row_times, joint_times = clock.align(rows, robot.joints)
-        for name, (which, values) in sorted(_joints(robot.joints, robot.name).items()):
+        joints = _joints(robot.joints, robot.name)
+        for name in sorted(joints, key=natural):
+            which, values = joints[name]
             latest = _latest(row_times, joint_times[which])
             columns[name] = values[latest]
             known &= latest >= 0

@@ -11,6 +11,7 @@ import numpy as np
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
+from ringfence.utils.natural import numbered
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
 GAP = 5.0  # steps without a row that end an episode
@@ -28,7 +29,7 @@ class Rows:
     recording: np.ndarray  # (M,)
     agent: np.ndarray  # (M,)
     time: np.ndarray  # (M,) s
-    agents: np.ndarray  # names, by number
+    agents: np.ndarray  # names, by number, in natural order
 
     @cached_property
     def follows(self) -> np.ndarray:
@@ -72,10 +73,10 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     """The rows in order; an agent's times must increase."""
     dates = columns[schema.time].dtype.kind in "mM"
     clock = seconds(columns, schema.time) * (1.0 if dates else schema.time_unit)
-    agents, owner = np.unique(words(columns, schema.agent), return_inverse=True)
+    agents, owner = numbered(words(columns, schema.agent))
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:
-        recording = np.unique(words(columns, schema.episode), return_inverse=True)[1]
+        recording = numbered(words(columns, schema.episode))[1]
     order = np.lexsort((np.arange(len(clock)), owner, recording))  # an agent's rows in the order of the table
     rows = Rows(order, recording[order], owner[order], clock[order], agents)
     _refuse_disorder(rows, columns, schema)

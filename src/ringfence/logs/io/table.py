@@ -261,6 +261,8 @@ def _steps(motion: Motion, episodes: Episodes, warnings: list[str], card: Mappin
         "action_low": low,
         "action_high": high,
     }
+    if episodes.agents is not None:
+        facts["agents"] = episodes.agents
     if schema.homogeneous:
         facts |= {"homogeneous": True, "sensing_radius": episodes.sensing_radius}
     named = len(schema.cost) > 1
