@@ -2,9 +2,9 @@
 and is tested against it on the same resets.
 
     python benchmarks/ablations.py           # writes results/ablations.csv; resumable, forty minutes on one core
-    python benchmarks/ablations.py --table   # writes docs/ablations.md's tables from it
 
 Cloned policies and Worlds of seed 0, test resets, danger learned of the cost column where nothing else is said.
+Rows of agents who foresee by their own action alone were made by revision cac628af, which patched the library.
 """
 
 from __future__ import annotations
@@ -12,16 +12,13 @@ from __future__ import annotations
 import argparse
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from unittest import mock
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from _rows import append, read
-from readme import put
+from common import RESULTS, append, brief, read
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
@@ -29,15 +26,15 @@ from ringfence.envs import SimpleSpread
 from ringfence.evaluation import statistics
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.loading.resolve import load
-from ringfence.problem import features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import loop, worlds
 from ringfence.types import Array
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, Widening
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "ablations.csv"
-FIELDS = ("task", "proposal", "guard", "way", "episodes", "return", "cost", "infeasible_rate")
+OUT = RESULTS / "ablations.csv"
+PLAYED = ("episodes", "return", "cost", "infeasible_rate")
+FIELDS = ("task", "proposal", "guard", "way", *PLAYED)
 FIELDS += ("more_return", "more_return_low", "more_return_high", "p_return")
 FIELDS += ("more_cost", "more_cost_low", "more_cost_high", "p_cost")
 
@@ -94,12 +91,6 @@ def by_simulator(world: World) -> World:
     return eqx.tree_at(lambda w: w.dynamics, world, simulated)
 
 
-def unguessed():
-    """While it lasts, Worlds of own sight foresee by the own view and action alone."""
-    usual = features.alone
-    return mock.patch.object(features, "alone", lambda map: replace(usual(map), models_others=False))
-
-
 @dataclass(frozen=True)
 class Way:
     """One thing that differs from the default."""
@@ -107,7 +98,6 @@ class Way:
     options: dict = field(default_factory=dict)  # of the guard
     world: dict = field(default_factory=dict)  # settings of the World
     other: Callable[[World], World] = lambda world: world  # what is put in the place of a part
-    fitted: Callable[[], AbstractContextManager] = nullcontext  # how the World is fitted
 
 
 ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
@@ -120,7 +110,6 @@ TRUE = {
 }
 V = {"the last row judged by V": Way({"terminal_value": True})}
 V_ALONE = {"by V alone": Way({"terminal_value": False}, other=by_value)}
-GUESS = {"foreseen by the own action alone": Way(world={"cached": False}, fitted=unguessed)}
 OWN = ", own sight"  # of a guard's name here
 # By task, algorithm and preset, and guard; the default is not named among the ways.
 STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
@@ -155,9 +144,6 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
         "climbing anywhere": Way({"trust_radius": 2.0}),
     },
-    ("simple_spread-expert", "bc", f"full{OWN}"): GUESS,
-    ("simple_spread-medium-replay", "bc", f"full{OWN}"): GUESS,
-    ("simple_spread-medium-replay", "bc", f"shield{OWN}"): GUESS,
 }
 
 
@@ -166,14 +152,10 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(dict.fromkeys(task for task, *_ in STUDIES)))
     parser.add_argument("--guards", nargs="+", default=list(dict.fromkeys(guard for *_, guard in STUDIES)))
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--table", action="store_true", help="only write the documents")
     a = parser.parse_args()
-    if not a.table:
-        for study, ways in STUDIES.items():
-            if study[0] in a.tasks and study[2] in a.guards:
-                measure(study, ways, a.out)
-    if a.out == OUT:
-        put("docs/ablations.md", "ablations", table(read(OUT)))
+    for study, ways in STUDIES.items():
+        if study[0] in a.tasks and study[2] in a.guards:
+            measure(study, ways, a.out)
 
 
 def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> None:
@@ -183,7 +165,6 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
     if {"default", *ways} <= there:
         return
     task = registry.get(name)
-    execution = "decentralized" if guard.endswith(OWN) else None
     episodes = 20 if task.protocol else 200
     store, _ = make(task)
     with tempfile.TemporaryDirectory() as folder:
@@ -191,9 +172,8 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
         (run,) = loop.train(kind, store, preset=preset or None, seeds=(0,), out=folder, quiet=True)
 
         def played(way: Way) -> dict:
-            with way.fitted():
-                world = way.other(worlds.fit(store, execution=execution, **way.world))
-            _, policy = load(run, world=world, guard=guard.removesuffix(OWN), execution=execution, **way.options)
+            world = way.other(worlds.fit(store, **way.world))
+            _, policy = load(run, world=world, guard=guard, **way.options)
             return evaluate_policy(policy, task, episodes, "test", 0)[0]
 
         usual = None
@@ -209,15 +189,8 @@ def measure(study: tuple[str, str, str], ways: dict[str, Way], out: Path) -> Non
                 test = statistics.paired_test(*(r["per_episode"][key] for r in (found, usual)))
                 row |= dict(zip((f"more_{key}_low", f"more_{key}_high"), test["interval"]))
                 row |= {f"more_{key}": test["difference"], f"p_{key}": test["p"]}
-            row = {k: f"{v:.5g}" if isinstance(v, float) else v for k, v in row.items()}
-            print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
             if way not in there:
-                append(out, row, FIELDS)
-
-
-# What the page leaves out: neighbours of rows that it has.
-UNSHOWN = ("an ensemble of 5", "the true dynamics and formula", "5 rows foreseen", "climbed from 4 starts")
-UNSHOWN += ("10 steps of climbing", "4 plans to select from")
+                append(out, brief(row), FIELDS)
 
 
 def adjusted(rows: list[dict]) -> list[dict]:
@@ -226,38 +199,6 @@ def adjusted(rows: list[dict]) -> list[dict]:
     for (r, key), p in zip(tested, statistics.holm(np.array([float(r[f"p_{key}"]) for r, key in tested]))):
         r[f"holm_{key}"] = p
     return rows
-
-
-def table(rows: list[dict]) -> str:
-    """A table for each study, bold where Holm's adjusted p and the interval agree."""
-    rows = adjusted(rows)
-
-    def more(r: dict, key: str) -> str:
-        mean, low, high = (float(r[f"more_{key}{x}"]) for x in ("", "_low", "_high"))
-        text = f"{mean:+.3g} [{low:.3g}, {high:.3g}]" if mean or low or high else "0"
-        return f"**{text}**" if r[f"holm_{key}"] < 0.05 and not low <= 0 <= high else text
-
-    out = []
-    for study in dict.fromkeys((r["task"], r["proposal"], r["guard"]) for r in rows):
-        found = [r for r in rows if (r["task"], r["proposal"], r["guard"]) == study]
-        guard = study[2].replace(OWN, ", decentralized")
-        out += [
-            f"`{study[0]}`, `{study[1]}` under `{guard}`, {found[0]['episodes']} episodes:",
-            "",
-        ]
-        out += ["| | return | cost | return, more | cost, more |", "|---|---|---|---|---|"]
-        for r in found:
-            if r != found[0] and all(r[k] == found[0][k] for k in FIELDS if k != "way"):
-                continue  # a way that is the default here
-            if r["way"] in UNSHOWN:
-                continue
-            way = r["way"].replace("rows foreseen", "predicted steps").replace("row foreseen", "predicted step")
-            way = way.replace("foreseen by", "predicted by").replace("row judged", "step judged")
-            part = [way, f"{float(r['return']):.4g}", f"{float(r['cost']):.3g}"]
-            part += ["", ""] if r["way"] == "default" else [more(r, "return"), more(r, "cost")]
-            out.append("| " + " | ".join(part) + " |")
-        out.append("")
-    return "\n".join(out).strip()
 
 
 if __name__ == "__main__":

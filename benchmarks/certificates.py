@@ -3,8 +3,7 @@ no more than it allows.
 
 python benchmarks/certificates.py play --batches 2     # plays each setting, a file for each batch, resumable
 python benchmarks/certificates.py judge                # writes results/stress/certificates.csv and .json from these
-python benchmarks/certificates.py picture              # docs/images/certificate.png, of certificates.csv
-python benchmarks/certificates.py table                # writes the table of docs/stress-results.md
+python benchmarks/certificates.py monitor              # writes results/stress/monitor.csv
 
 Margins are those of a grid: a calibration takes the least of them that is no less than its quantile. A larger one is
 played where a batch's quantile asks for it. The episodes of a setting are one pool. A repetition draws its
@@ -13,28 +12,28 @@ rate is as uncertain as the bound, and with all of it (`kept_of_pool`), which ho
 share their episodes; `disjoint` ones, of consecutive episodes, share none.
 
 Two minutes for a batch of 600 episodes, on one core that has nothing else to do.
+
+`monitor` asks how seldom the monitor of a certificate raises a false alarm, and how soon a true one. Episodes violate
+or not, independently and with a given probability; no simulator is asked. Promises and rates are those of
+results/stress/crossing.csv (stress.py): a guard's upper bound as it was tested, and the rate that was counted with two
+more late steps than it knows of.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import os
-import subprocess
-import sys
 import tempfile
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import _rows
 import numpy as np
-from stress import MIDDLE, in_words, name_of
+from common import RESULTS, keep, read, side_by_side, write
+from stress import MIDDLE
 
-ROOT = Path(__file__).resolve().parent.parent
-FOLDER = ROOT / "results" / "stress" / "certificates"
-OUT = ROOT / "results" / "stress" / "certificates.csv"
-PICTURE = ROOT / "docs" / "images" / "certificate.png"
+FOLDER = RESULTS / "stress" / "certificates"
+OUT = RESULTS / "stress" / "certificates.csv"
 RUN = "crossing-hasty/bc"
 MARGINS = (1.0, 1.5, 2.0, 3.0)
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -54,7 +53,7 @@ Pool = dict[str, np.ndarray]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("play", "judge", "picture", "table"))
+    parser.add_argument("what", choices=("play", "judge", "monitor"))
     parser.add_argument("--settings", nargs="*", choices=list(SETTINGS), default=list(SETTINGS))
     parser.add_argument("--batches", type=int, default=2)
     parser.add_argument("--episodes", type=int, default=BATCH, help="of a batch")
@@ -65,29 +64,16 @@ def main() -> None:
     a = parser.parse_args()
     if a.what == "judge":
         judge(a.folder, a.out, a.repetitions)
-    elif a.what == "picture":
-        picture(a.out, PICTURE)
-    elif a.what == "table":
-        write_table(a.out)
+    elif a.what == "monitor":
+        monitor(RESULTS / "stress" / "monitor.csv" if a.out == OUT else a.out)
     elif a.jobs > 1:
-        side_by_side(a)
+        same = ["certificates.py", "play", "--batches", str(a.batches), "--episodes", str(a.episodes)]
+        same += ["--folder", str(a.folder), "--settings"]
+        side_by_side(([*same, setting] for setting in a.settings), a.jobs)
     else:
         for batch in range(a.batches):
             for setting in a.settings:
                 play_batch(setting, batch, a.episodes, a.folder)
-
-
-def side_by_side(a: argparse.Namespace) -> None:
-    """Every setting in a process with one core."""
-    one_core = {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false", "NPROC": "1", "OPENBLAS_NUM_THREADS": "1"}
-    same = ["--batches", str(a.batches), "--episodes", str(a.episodes), "--folder", str(a.folder)]
-    waiting = list(a.settings)
-    running: list[subprocess.Popen] = []
-    while waiting or running:
-        while waiting and len(running) < a.jobs:
-            one = [sys.executable, __file__, "play", *same, "--settings", waiting.pop(0)]
-            running.append(subprocess.Popen(one, env={**os.environ, **one_core}))
-        running.pop(0).wait()
 
 
 def file_of(folder: Path, setting: str, margin: float, batch: int) -> Path:
@@ -170,9 +156,9 @@ def judge(folder: Path, out: Path, repetitions: int) -> None:
             rows.append({"setting": setting, "disjoint": True, **repetition(pools, orders)})
     if not rows:
         raise SystemExit(f"{folder} holds nothing that was played; run this with `play` first.")
-    _rows.write(out, rows)
+    write(out, rows)
     summary = {"confidence": CONFIDENCE, "drawn": shares(rows, False), "disjoint": shares(rows, True)}
-    out.with_suffix(".json").write_text(json.dumps(summary, indent=1) + "\n")
+    keep(out.with_suffix(".json"), summary)
     print(json.dumps(summary, indent=1))
 
 
@@ -228,63 +214,63 @@ def repetition(pools: dict[float, Pool], orders: dict[float, np.ndarray]) -> dic
     }
 
 
-def by_setting(out: Path) -> dict[str, list[dict[str, str]]]:
+def by_setting(out: Path = OUT) -> dict[str, list[dict[str, str]]]:
     """Rows of the repetitions that were drawn."""
     found: dict[str, list[dict[str, str]]] = defaultdict(list)
-    for row in _rows.read(out):
+    for row in read(out):
         if row["disjoint"] == "False":
             found[row["setting"]].append(row)
     return found
 
 
-def picture(out: Path, file: Path) -> None:
-    """What certificates allow beside what all episodes of their setting did."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    found = by_setting(out)
-    figure, axis = plt.subplots(figsize=(7.2, 0.55 * len(found) + 1.6), layout="constrained")
-    for y, rows in enumerate(found.values()):
-        bounds = 100 * np.array([float(row["bound"]) for row in rows])
-        rate = 100 * float(rows[0]["pool_rate"])
-        spread = y + 0.22 * np.linspace(-1, 1, len(bounds))
-        axis.barh(y, rate, height=0.62, color="#f2b8a0", label="violated, of all episodes" if y == 0 else None)
-        axis.scatter(bounds, spread, s=18, color="#1f5fa8", zorder=3, label="allowed, a certificate each" * (y == 0))
-    axis.set_yticks(range(len(found)), [in_words(name_of(SETTINGS[setting])) for setting in found])
-    axis.invert_yaxis()
-    axis.set_xlim(left=0)
-    axis.set_xlabel("episodes with a violation, %")
-    figure.legend(loc="outside upper right", ncols=2, frameon=False)
-    axis.spines[["top", "right"]].set_visible(False)
-    file.parent.mkdir(exist_ok=True)
-    figure.savefig(file, dpi=110)
-    print(file)
+STREAMS, EPISODES = 2000, 500
+# What the guard knows, as rows of crossing.csv, and what befalls it: two more late steps.
+KNOWS: dict[str, tuple[tuple[str, str, str], tuple[str, str, str]]] = {
+    "none": (("none", "shield", "False"), ("delay2", "shield", "False")),
+    **{
+        f"delay {k}": (
+            (f"delay{k}", "shield", "True"),
+            (f"delay{k + 2}", f"shield, delay {k}, others_acceleration 1.0", "False"),
+        )
+        for k in (1, 2)
+    },
+}
 
 
-def write_table(out: Path) -> None:
-    """The table of docs/stress-results.md between its markers."""
-    from readme import put
+def monitor(out: Path) -> None:
+    played = {(r["faults"], r["guard"], r["compensated"]): r for r in read("stress/crossing.csv")}
+    rows: list[dict[str, Any]] = []
+    for name, (before, after) in KNOWS.items():
+        promised = float(played[before]["violation_upper"])
+        cases = {"as promised, at most": promised, "as it was played": float(played[before]["violation_rate"])}
+        if after in played:
+            cases["two more late steps"] = float(played[after]["violation_rate"])
+        rows += [{"guard knows": name, "promised": promised, **case(what, promised, r)} for what, r in cases.items()]
+    write(out, rows)
 
-    head = "faults | episodes of the setting | violated, % | bounds, % | certificates | kept, by the rest | by all"
-    lines = [f"| {head} | not vacuous |", "|---" * 8 + "|"]
-    for setting, rows in by_setting(out).items():
-        bounds = [100 * float(row["bound"]) for row in rows]
-        kept = sum(row["kept"] == "True" for row in rows)
-        told = sum(row["vacuous"] == "False" for row in rows)
-        cells = [
-            in_words(name_of(SETTINGS[setting])),
-            str(int(rows[0]["tested"]) + int(rows[0]["others"])),
-            f"{100 * float(rows[0]['pool_rate']):.1f}",
-            " to ".join(dict.fromkeys(f"{b:.1f}" for b in (min(bounds), max(bounds)))),
-            str(len(rows)),
-            str(kept),
-            str(sum(row["kept_of_pool"] == "True" for row in rows)),
-            str(told),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    put("docs/stress-results.md", "certificates", "\n".join(lines))
+
+def case(what: str, promised: float, rate: float) -> dict[str, Any]:
+    """Streams of episodes that violate at this rate, watched against what was promised."""
+    rng = np.random.default_rng(0)
+    first = np.array([first_alarm(promised, rng.random(EPISODES) < rate) for _ in range(STREAMS)])
+    raised = first <= EPISODES
+    row = {"episodes": what, "rate": rate, "streams": STREAMS, "length": EPISODES}
+    row |= {"alarms": round(float(raised.mean()), 4), "median": "", "nine tenths": ""}
+    if raised.mean() >= 0.9:
+        row |= {"median": int(np.median(first)), "nine tenths": int(np.quantile(first, 0.9))}
+    print(row, flush=True)
+    return row
+
+
+def first_alarm(promised: float, violated: np.ndarray) -> float:
+    """The episode after which the alarm is raised; infinite where it never is."""
+    from ringfence.faults.monitor import Monitor
+
+    monitor = Monitor(promised)
+    for k, one in enumerate(violated):
+        if monitor.observe(bool(one)):
+            return k + 1
+    return np.inf
 
 
 if __name__ == "__main__":

@@ -18,11 +18,10 @@ from pathlib import Path
 import numpy as np
 import planner_tables
 import pooled
-from _proven import proven
 from ablations import adjusted
-from attribution import FULL, OF_ROBOTS, QUESTIONS, SHIELD, Question, answers
-from evidence import LEVEL, difference, evaluations, mean, of, tasks_of, variant
-from readme import put
+from common import put
+from evidence import LEVEL, difference, evaluations, mean, of, proven, tasks_of, variant
+from guards_tables import FULL, QUESTIONS, SHIELD, Question, answers
 from scipy.stats import fisher_exact, spearmanr
 
 from ringfence.datasets.registry import TASKS
@@ -81,7 +80,7 @@ def on_robots(row, paired, more: int, less: int) -> Callable[[], tuple[bool, str
     questions of robots."""
 
     def check():
-        answered = answers(ROBOTS, OF_ROBOTS)
+        answered = answers(ROBOTS)
         found = next(ds for q, key, ds in answered if (q.row, q.paired) == (row, paired) and key == "return")
         sides = [[f"{d.task} {d.mean:+.0f}" for d in found if d.holds and d.mean * sign > 0] for sign in (1, -1)]
         seeds = {len(d.seeds) for d in found}

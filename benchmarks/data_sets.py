@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from _rows import read, write
+from common import read, write
 
 from ringfence.datasets import registry
 from ringfence.datasets.audit import disagreement

@@ -4,18 +4,19 @@ test of one row against its paired baseline."""
 from __future__ import annotations
 
 import functools
+import json
 from collections import defaultdict
 from dataclasses import dataclass, replace
-from pathlib import Path
+from typing import Any
 
 import numpy as np
+from common import RESULTS
 
 from ringfence import algos
 from ringfence.bench import rows
 from ringfence.datasets import registry
 from ringfence.evaluation import statistics
 
-RESULTS = Path(__file__).resolve().parent.parent / "results"
 Row = tuple[str, str]  # algorithm and variant
 LEVEL = 0.05
 
@@ -92,3 +93,27 @@ def family(found: list[Difference]) -> list[Difference]:
     """The same with p-values adjusted by Holm's method."""
     adjusted = statistics.holm(np.array([d.p for d in found])) if found else []
     return [replace(d, p=float(p)) for d, p in zip(found, adjusted)]
+
+
+POOLED = ("violation_rate", "return_mean")
+
+
+def proven(where: str = "proving", files: str = "proving-*.json") -> list[dict[str, Any]]:
+    """By system, what seed 0 found, but for `rows`, each the mean over the seeds that played it and the `most`
+    violations of one, the `verdicts` of all seeds, and the `causes` of all."""
+    found, folder = [], RESULTS / where
+    for file in sorted(folder.glob(files)):
+        others = sorted(folder.glob(f"seed-*/{file.name}"))
+        seeds = [json.loads(one.read_text()) for one in (file, *others)]
+        rows = {name: _mean([one["rows"][name] for one in seeds if name in one["rows"]]) for name in seeds[0]["rows"]}
+        causes = list(dict.fromkeys(cause for one in seeds for cause in one["causes"]))
+        found.append(seeds[0] | {"rows": rows, "verdicts": [one["verdict"] for one in seeds], "causes": causes})
+    return found
+
+
+def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    for row in rows:
+        if "refused" in row:
+            return row
+    pooled = {name: float(np.mean([row[name] for row in rows])) for name in POOLED}
+    return pooled | {"most": max(row["violation_rate"] for row in rows)}

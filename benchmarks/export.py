@@ -1,7 +1,7 @@
 """Exported policies against `Controller`: how far their actions are apart, and how long one takes.
 
     ringfence bench guards --tasks simple_spread-expert --out DIR   # policies with their checkpoints
-    python benchmarks/export.py DIR          # writes results/export.csv and docs/export.md; ten minutes
+    python benchmarks/export.py DIR          # writes results/export.csv; ten minutes
 
 500 test resets and 500 logged states of another tier, noise alike, one thread of onnxruntime.
 """
@@ -9,7 +9,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import tempfile
 import time
@@ -19,7 +18,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import onnxruntime
-from readme import put
+from common import RESULTS, write
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
@@ -27,9 +26,8 @@ from ringfence.deploy import export
 from ringfence.evaluation import rollout
 from ringfence.loading.resolve import load
 from ringfence.proposals.base import act_with
-from ringfence.utils.files import whole
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "export.csv"
+OUT = RESULTS / "export.csv"
 TASK, OTHER, STATES, CLOSE = "simple_spread-expert", "simple_spread-medium-replay", 500, 1e-5
 POLICIES = (
     ("BC", "bc", {}),
@@ -59,11 +57,7 @@ def main() -> None:
         run = next((cells / cell).glob("seed-0-*"))
         rows.append({"policy": name} | compared(run, options, seen, whole_states))
         print(rows[-1], flush=True)
-        with whole(OUT) as temporary, temporary.open("w") as f:
-            writer = csv.DictWriter(f, rows[0], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-    put("docs/export.md", "parity", table(rows))
+        write(OUT, rows)
 
 
 def compared(run: Path, options: dict, seen: np.ndarray, whole_states: np.ndarray) -> dict:
@@ -111,19 +105,6 @@ def _player(file: Path, form: str):
         names = [x["name"] for x in json.loads(packed.read("metadata.json"))["outputs"]]
         call = jax.jit(jax.export.deserialize(bytearray(packed.read("policy.jax"))).call)
     return lambda given: {k: np.asarray(v) for k, v in zip(names, call(*given.values()))}
-
-
-def table(rows: list[dict]) -> str:
-    lines = [
-        "| policy | StableHLO | ONNX | above 1e-5, of 1000 | ms: Controller, StableHLO, ONNX |",
-        "|---|---|---|---|---|",
-    ]
-    for r in rows:
-        apart = f"{r['stablehlo_apart']}, {r['onnx_apart']}"
-        ms = f"{float(r['controller_ms']):.1f}, {float(r['stablehlo_ms']):.1f}, {float(r['onnx_ms']):.1f}"
-        largest = [f"{float(r[f + '_largest']):.0e}" for f in FORMATS]
-        lines.append(f"| {r['policy']} | {largest[0]} | {largest[1]} | {apart} | {ms} |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

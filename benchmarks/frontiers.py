@@ -1,7 +1,6 @@
 """Return against cost as the limit moves: what is trained anew for every limit, and one model whose guard is told it.
 
     python benchmarks/frontiers.py            # writes results/frontiers.csv; resumable, an hour on one core
-    python benchmarks/frontiers.py --picture  # draws docs/images/frontiers.png from it
 
 Seed 0, test resets. On robots the limit is a number of steps per episode of 1000, which an adapting guard is told as
 the rate at which its margin settles, half the limit as its default is of 25. Where episodes are short there is no time
@@ -14,11 +13,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from _rows import append, read
+from common import RESULTS, append, read
 
 from ringfence import algos
 from ringfence.datasets import registry
@@ -27,8 +22,7 @@ from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.loading.resolve import load
 from ringfence.training import loop, worlds
 
-ROOT = Path(__file__).resolve().parent.parent
-OUT, PICTURE = ROOT / "results" / "frontiers.csv", ROOT / "docs" / "images" / "frontiers.png"
+OUT = RESULTS / "frontiers.csv"
 FIELDS = ("task", "method", "knob", "value", "episodes", "return", "cost", "cost_safe_start", "train_seconds")
 MARGINS = (-1.0, 0.0, 0.25, 0.5, 1.0)
 # By task, the limits on an episode's cost.
@@ -49,14 +43,10 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(LIMITS))
     parser.add_argument("--of", nargs="+", default=[*GUARDED, *TRAINED], help="algorithms")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--picture", action="store_true", help="only draw what is there")
     a = parser.parse_args()
-    if not a.picture:
-        for name in a.of:
-            for task in a.tasks:
-                (guarded if name in GUARDED else trained)(task, name, a.out)
-    if a.out == OUT:
-        draw(read(OUT))
+    for name in a.of:
+        for task in a.tasks:
+            (guarded if name in GUARDED else trained)(task, name, a.out)
 
 
 def trained(name: str, algorithm: str, out: Path) -> None:
@@ -102,32 +92,7 @@ def _play(name: str, method: str, knob: str, value, run, out: Path, **how) -> No
     row |= {k: f"{found[k + '_mean']:.5g}" for k in ("return", "cost")}
     row |= {"cost_safe_start": f"{found['cost_safe_start']:.4g}"}
     row |= {"train_seconds": f"{sum(r['seconds'] for r in run.metrics):.0f}"}
-    print(", ".join(f"{k} {v}" for k, v in row.items()), flush=True)
     append(out, row, FIELDS)
-
-
-def draw(rows: list[dict]) -> None:
-    """Return over cost, a panel for every task."""
-    figure, axes = plt.subplots(2, 3, figsize=(11, 6.2), layout="constrained")
-    colours = dict(zip((*GUARDED.values(), *TRAINED.values()), ("#0b6e4f", "#7b2d8b", "#c8553d", "#3b6fb6")))
-    for axis, (name, limits) in zip(axes.ravel(), LIMITS.items()):
-        for method, colour in colours.items():
-            found = [r for r in rows if (r["task"], r["method"]) == (name, method) and r["knob"] != "none"]
-            found.sort(key=lambda r: float(r["value"]))
-            xy = [(float(r["cost"]), float(r["return"])) for r in found]
-            if xy:
-                axis.plot(*zip(*xy), "o-", color=colour, label=method, ms=4, lw=1.2)
-            alone = [r for r in rows if (r["task"], r["method"], r["knob"]) == (name, method, "none")]
-            for r in alone:
-                axis.plot(float(r["cost"]), float(r["return"]), "x", color=colour, ms=7)
-        if registry.get(name).protocol:
-            axis.axvspan(-10, 25, color="0.93", zorder=0)
-        axis.set_xscale("symlog", linthresh=limits[0])
-        axis.set(title=name, xlabel="cost of an episode", ylabel="return", xlim=(-0.1 * limits[0], None))
-    axes[0, 0].legend(fontsize=7)
-    PICTURE.parent.mkdir(exist_ok=True)
-    figure.savefig(PICTURE, dpi=80)
-    plt.close(figure)
 
 
 if __name__ == "__main__":

@@ -1,85 +1,85 @@
-"""Writes the tables of guards between their markers in docs/, from results/ alone.
-
-python benchmarks/guards_tables.py
+"""Tables of guards: docs/guard-results.md, docs/crossing-results.md, docs/proving-ground.md, and docs/attribution.md,
+where proposals are crossed with guards and every question stands beside its paired baseline (tables.py writes them).
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections import Counter
-from pathlib import Path
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
+import evidence
 import numpy as np
-from _proven import proven
-from evidence import Row, of, tasks_of, variant
-from readme import put
+from common import markdown, read
+from evidence import Difference, Row, difference, family, of, proven, tasks_of, variant
 
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.utils import stored
 
-RESULTS = Path(__file__).resolve().parent.parent / "results"
 Column = tuple[str, Row]  # a suite, and a row of it
-# Columns: their heads, and where their rows are.
-SPREAD: dict[str, Column] = {
-    "BC": ("guards", ("bc", "default")),
-    "shield, analytic": ("guards", ("bc", "default+shield-analytic")),
-    "**shield**": ("guards", ("bc", "default+shield-learned")),
-    "**full**": ("guards", ("bc", "default+full-learned")),
-    "MPC from a zero proposal, full": ("guards", ("mpc", "default+full-learned")),
-    "shield, decentralized": ("own-sight", ("bc", "default+shield-learned-decentralized")),
-    "full, decentralized": ("own-sight", ("bc", "default+full-learned-decentralized")),
-}
-ROBOTS: dict[str, Column] = {
-    "BC": ("guards-mujoco", ("bc", "default")),
-    "adapt, analytic": ("guards-mujoco", ("bc", "default+adapt-analytic")),
-    "**adapt**": ("guards-mujoco", ("bc", "default+adapt-learned")),
-    "full, analytic": ("guards-mujoco", ("bc", "default+full-analytic")),
-    "**full**": ("guards-mujoco", ("bc", "default+full-learned")),
-    "adapt, decentralized": ("own-sight-mujoco", ("bc", "default+adapt-learned-decentralized")),
-}
+SHIELD, FULL, ADAPT = "+shield-learned", "+full-learned", "+adapt-learned"
+OF_SEEDS = "\n\n[n]: of n seeds, but where a cell says another number."
+
+
+def _columns(more: dict[str, tuple[str, str]]) -> dict[str, Column]:
+    """Heads, and where their rows are: a suite and what a clone is guarded by."""
+    return {head: (suite, ("bc", f"default{guard}")) for head, (suite, guard) in more.items()}
+
+
+SPREAD: dict[str, Column] = _columns(
+    {
+        "BC": ("guards", ""),
+        "shield, analytic": ("guards", "+shield-analytic"),
+        "**shield**": ("guards", SHIELD),
+        "**full**": ("guards", FULL),
+    }
+)
+SPREAD["MPC from a zero proposal, full"] = ("guards", ("mpc", f"default{FULL}"))
+SPREAD |= _columns(
+    {
+        "shield, decentralized": ("own-sight", f"{SHIELD}-decentralized"),
+        "full, decentralized": ("own-sight", f"{FULL}-decentralized"),
+    }
+)
+ROBOTS: dict[str, Column] = _columns(
+    {
+        "BC": ("guards-mujoco", ""),
+        "adapt, analytic": ("guards-mujoco", "+adapt-analytic"),
+        "**adapt**": ("guards-mujoco", ADAPT),
+        "full, analytic": ("guards-mujoco", "+full-analytic"),
+        "**full**": ("guards-mujoco", FULL),
+        "adapt, decentralized": ("own-sight-mujoco", f"{ADAPT}-decentralized"),
+    }
+)
 # Crossing's rows: algorithm and variant, and their words.
-SHIELDED = "+shield-learned"
 WAYS = {
     "certificates reference": "certificates (true state and brakes)",
     "bc default": "BC",
     **{
-        f"bc default{SHIELDED}+horizon{k}+terminal_valueFalse": f"shield, ℓ, {k} step{'s' * (k > 1)}"
+        f"bc default{SHIELD}+horizon{k}+terminal_valueFalse": f"shield, ℓ, {k} step{'s' * (k > 1)}"
         for k in (1, 3, 7, 15)
     },
-    f"bc default{SHIELDED}+horizon1": "shield, ℓ and V, 1 step",
-    f"bc default{SHIELDED}": "**shield, ℓ and V, 3 steps**",
+    f"bc default{SHIELD}+horizon1": "shield, ℓ and V, 1 step",
+    f"bc default{SHIELD}": "**shield, ℓ and V, 3 steps**",
     "bc default+shield-analytic+horizon15+terminal_valueFalse": "shield, analytic, 15 steps",
-    "bc default+full-learned": "**full**",
+    f"bc default{FULL}": "**full**",
 }
 PROPOSALS = {
-    "bc default": "BC",
-    "bc-best default": "10 % BC",
-    "bc-return default": "return-conditioned BC",
-    "bc-safe default": "BC on episodes without contact",
-    "ma-td3bc default": "MA-TD3+BC",
-    "ma-td3bc-lag default": "MA-TD3+BC, Lagrange",
-    "omar default": "OMAR",
+    "bc": "BC",
+    "bc-best": "10 % BC",
+    "bc-return": "return-conditioned BC",
+    "bc-safe": "BC on episodes without contact",
+    "ma-td3bc": "MA-TD3+BC",
+    "ma-td3bc-lag": "MA-TD3+BC, Lagrange",
+    "omar": "OMAR",
 }
-TEAMS = {"bc default+shield-learned": "8 agents, as in the logs"}
-TEAMS |= {f"bc default+shield-learned+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
-SIZES = {"BC": "", "shield": "+shield-learned", "full": "+full-learned"}
+TEAMS = {f"bc default{SHIELD}": "8 agents, as in the logs"}
+TEAMS |= {f"bc default{SHIELD}+agents{n}": f"{n} agents" for n in (4, 16, 64, 256)}
+SIZES = {"BC": "", "shield": SHIELD, "full": FULL}
 
 
-def main() -> None:
-    put("docs/guard-results.md", "spread", table(SPREAD, short))
-    put("docs/guard-results.md", "robots", table(ROBOTS, long))
-    put("docs/proving-ground.md", "proving", proving(RESULTS / "proving", "proving-*.json"))
-    put("docs/proving-ground.md", "others", proving(RESULTS / "proving" / "others", "*.json", filtered=False))
-    put("docs/proving-ground.md", "drawn", proving(RESULTS / "proving" / "drawn", "*.json", filtered=False))
-    put("docs/crossing-results.md", "tiers", tiers())
-    put("docs/crossing-results.md", "guards", crossing("crossing-guards", WAYS))
-    put("docs/crossing-results.md", "proposals", proposals())
-    put("docs/crossing-results.md", "teams", crossing("crossing-teams", TEAMS))
-    put("docs/crossing-results.md", "sizes", sizes())
-    put("docs/crossing-results.md", "other", other_simulator())
-
-
-def table(columns: dict[str, Column], cell) -> str:
+def table(columns: dict[str, Column], cell: Callable[[list[dict]], str]) -> str:
     """A row per task, a column per guard; – where nothing was made, and how many seeds each cell is of."""
     tasks = tasks_of(next(iter(columns.values()))[0])
     found = {
@@ -89,8 +89,8 @@ def table(columns: dict[str, Column], cell) -> str:
     }
     # Seeds stand in the head where all cells of a column have as many, else in the task's name or in the cell.
     seeds = {w: {len(rows) for (_, words), rows in found.items() if words == w and rows} for w in columns}
-    heads = [w + (f" [{max(seeds[w])}]" if len(seeds[w]) == 1 else "") for w in columns]
-    out = ["| | " + " | ".join(heads) + " |", "|---" * (1 + len(columns)) + "|"]
+    heads = ["", *(w + (f" [{max(seeds[w])}]" if len(seeds[w]) == 1 else "") for w in columns)]
+    lines = []
     for task in tasks:
         mixed = {w: len(found[task, w]) for w in columns if len(seeds[w]) > 1 and found[task, w]}
         usual = max(set(mixed.values()), key=list(mixed.values()).count) if len(mixed) > 1 else 0
@@ -100,8 +100,13 @@ def table(columns: dict[str, Column], cell) -> str:
             some = f" [{mixed[words]}]" if mixed.get(words, usual) != usual else ""
             cells.append(cell(rows) + some if rows else "–")
         if any(c != "–" for c in cells[1:]):
-            out.append(f"| `{task}`{f' [{usual}]' * bool(usual)} | " + " | ".join(cells) + " |")
-    return "\n".join([*out, "", "[n]: of n seeds."])
+            lines.append((f"`{task}`{f' [{usual}]' * bool(usual)}", *cells))
+    return bare(heads, lines) + "\n\n[n]: of n seeds."
+
+
+def bare(heads: Sequence[str], lines: Sequence) -> str:
+    """A table whose first head is empty."""
+    return markdown(heads, lines).replace("|  |", "| |", 1)
 
 
 def mean(rows: list[dict], key: str) -> float:
@@ -120,7 +125,7 @@ def long(rows: list[dict]) -> str:
 
 def of_crossing(suite: str, task: str, key: str) -> list[dict]:
     """A row's lines of table.csv, one for each seed."""
-    rows = stored.table(RESULTS / suite / "table.csv")
+    rows = read(f"{suite}/table.csv")
     return [r for r in rows if r["task"] == task and f"{r['algorithm']} {r['variant']}" == key]
 
 
@@ -133,52 +138,49 @@ def touching(found: list[dict]) -> str:
     return f"{100 * mean(found, 'violation_rate'):.3g} % (≤ {100 * bound:.3g} %)"
 
 
+def earned_touching(found: list[dict]) -> str:
+    return f"{mean(found, 'return_mean'):.2f} / {touching(found)}"
+
+
 def unmet(found: list[dict]) -> str:
     return f"{100 * mean(found, 'infeasible_rate'):.2g} %" if found[0]["infeasible_rate"] else ""
 
 
 def tiers() -> str:
     """A row per task of Crossing: the logs, a clone, and the clone under its shield."""
-    out = ["| tier | logs | BC | **BC, shield** | infeasible_rate | n_episodes |", "|---" * 6 + "|"]
-    for task in dict.fromkeys(r["task"] for r in stored.table(RESULTS / "crossing" / "table.csv")):
-        logs, clone, guarded = (
-            of_crossing("crossing", task, key)
-            for key in ("behaviour data reference", "bc default", f"bc default{SHIELDED}")
-        )
-        cells = [f"{mean(logs, 'return_mean'):.2f} / {100 * mean(logs, 'violation_rate'):.3g} %"]
-        cells += [f"{mean(found, 'return_mean'):.2f} / {touching(found)}" for found in (clone, guarded)]
+    lines = []
+    for task in dict.fromkeys(r["task"] for r in read("crossing/table.csv")):
+        keys = ("behaviour data reference", "bc default", f"bc default{SHIELD}")
+        logs, clone, guarded = (of_crossing("crossing", task, key) for key in keys)
         seeds = f", {len(guarded)} seeds" if len(guarded) > 1 else ""
-        cells += [unmet(guarded), f"{guarded[0]['episodes']}{seeds}"]
-        out.append(f"| `{task}` | " + " | ".join(cells) + " |")
-    return "\n".join(out)
+        logged = f"{mean(logs, 'return_mean'):.2f} / {100 * mean(logs, 'violation_rate'):.3g} %"
+        played = [earned_touching(found) for found in (clone, guarded)]
+        lines.append((f"`{task}`", logged, *played, unmet(guarded), f"{guarded[0]['episodes']}{seeds}"))
+    return markdown(("tier", "logs", "BC", "**BC, shield**", "infeasible_rate", "n_episodes"), lines)
 
 
 def crossing(suite: str, named: dict[str, str]) -> str:
     """A row per variant of one task."""
-    head = ("method", "return", "episodes with contact (bound)", "infeasible_rate")
-    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    lines = []
     for key, words in named.items():
         if found := of_crossing(suite, "crossing-hasty", key):
-            part = [words, f"{mean(found, 'return_mean'):.2f}"]
-            out.append("| " + " | ".join([*part, touching(found), unmet(found)]) + " |")
-    return "\n".join(out)
+            lines.append((words, f"{mean(found, 'return_mean'):.2f}", touching(found), unmet(found)))
+    return markdown(("method", "return", "episodes with contact (bound)", "infeasible_rate"), lines)
 
 
 def proposals() -> str:
     """A row per proposal on Crossing: alone and under a shield."""
-    out = ["| proposal | alone | under a shield |", "|---" * 3 + "|"]
-    for key, words in PROPOSALS.items():
-        both = [of_crossing("crossing-guards", "crossing-hasty", name) for name in (key, key + SHIELDED)]
-        cells = [f"{mean(found, 'return_mean'):.2f} / {touching(found)}" for found in both]
-        out.append(f"| {words} | " + " | ".join(cells) + " |")
-    return "\n".join(out)
+    lines = []
+    for name, words in PROPOSALS.items():
+        keys = (f"{name} default", f"{name} default{SHIELD}")
+        both = [of_crossing("crossing-guards", "crossing-hasty", key) for key in keys]
+        lines.append((words, *(earned_touching(found) for found in both)))
+    return markdown(("proposal", "alone", "under a shield"), lines)
 
 
 def sizes() -> str:
     """A row per task and number of agents, a column per guard."""
-    rows = stored.table(RESULTS / "spread-teams" / "table.csv")
-    seeds = set()
-    out = ["| learned from | agents | " + " | ".join(SIZES) + " |", "|---" * (2 + len(SIZES)) + "|"]
+    rows, seeds, lines = read("spread-teams/table.csv"), set(), []
     for task in dict.fromkeys(r["task"] for r in rows):
         for n in (2, 3, 4, 6):
             cells = []
@@ -187,40 +189,25 @@ def sizes() -> str:
                 found = [r for r in rows if (r["task"], r["algorithm"], r["variant"]) == (task, "bc", name)]
                 seeds.add(len(found))
                 cells.append(f"{mean(found, 'return_mean'):.0f} / {mean(found, 'cost_safe_start'):.3f}")
-            out.append(f"| `{task}` | {n}{', as in the logs' * (n == 3)} | " + " | ".join(cells) + " |")
+            lines.append((f"`{task}`", f"{n}{', as in the logs' * (n == 3)}", *cells))
     assert len(seeds) == 1, f"the page names one number of seeds, the rows have {seeds}"
-    return "\n".join(out)
+    return markdown(("learned from", "agents", *SIZES), lines)
 
 
-def other_simulator() -> str:
-    """Rows of benchmarks/other_simulator.py."""
-    rows = stored.table(RESULTS / "other_simulator.csv")
-    head = ("learned from", "agents", "guard", "return", "episodes with contact")
-    out = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
-    for r in rows:
-        part = [r[k] for k in ("learned from", "agents", "guard", "return")]
-        part.append(f"{100 * float(r['episodes with contact']):.3g} %")
-        part[-1] += f" (≤ {100 * float(r['bound']):.3g} %)" if r["bound"] else ""
-        out.append("| " + " | ".join(part) + " |")
-    return "\n".join(out)
-
-
-def proving(folder: Path, files: str, filtered: bool = True) -> str:
+def proving(folder: str, files: str, filtered: bool = True) -> str:
     """Systems of the proving ground's kind, by their results; `filtered` also by a filter that knows the formula."""
     kinds = {"none": "", "shield learned": "shield", "cbf-qp": "CBF-QP", "shield oracle": "oracle"}
     kinds = {row: head for row, head in kinds.items() if filtered or row != "cbf-qp"}
     drivers = {"bc": "clone", "naive": "naive"}
-    rows = [f"{driver} {row}" for driver in drivers for row in kinds]
     heads = ["system", "verdict", "causes found"]
     heads += [head or driver for driver in drivers.values() for head in kinds.values()]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    lines = []
     for found in proven(folder, files):
         causes = dict.fromkeys(_in_short(cause) for cause in found["causes"])
         name = found["task"].removeprefix("proving-").removeprefix("other-").removeprefix("drawn-")
         cells = [f"`{name}`{_in_words(found.get('system'))}", _verdicts(found), "; ".join(causes) or "none"]
-        cells += [_share_and_return(found["rows"].get(row)) for row in rows]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+        lines.append(cells + [_share_and_return(found["rows"].get(f"{d} {row}")) for d in drivers for row in kinds])
+    return markdown(heads, lines)
 
 
 def _verdicts(found: dict) -> str:
@@ -249,5 +236,172 @@ def _share_and_return(row: dict | None) -> str:
     return f"{share:.{int(0 < share < 10)}f}, {row['return_mean']:.2f}"
 
 
-if __name__ == "__main__":
-    main()
+# Proposals that the page shows: their words, and their row without a guard. `ringfence bench results
+# results/guards` prints all others, too.
+CROSSED: dict[str, Row] = {
+    "logs": ("behaviour data", "reference"),
+    "do nothing": ("do-nothing", "reference"),
+    "BC": ("bc", "default"),
+    "10 % BC": ("bc-best", "default"),
+    "return-conditioned BC": ("bc-return", "default"),
+    "MA-TD3+BC": ("ma-td3bc", "default"),
+    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "default"),
+    "OMAR": ("omar", "default"),
+    # the same under other guards
+    "BC, `full`": ("bc", f"default{FULL}"),
+    "MPC from a zero proposal (`mpc`), `full`": ("mpc", f"default{FULL}"),
+}
+# Robots' proposals under `adapt`, danger learned, and the one that only climbs. Cloning under `full` stands in
+# docs/guard-results.md.
+ON_ROBOTS: dict[str, Row] = {
+    "BC": ("bc", f"default{ADAPT}"),
+    "return-conditioned BC": ("bc-return", f"default{ADAPT}"),
+    "MPC, `full`": ("mpc", f"default{FULL}"),
+    "MPC, `full`, anywhere": ("mpc", f"default{FULL}+trust_radius2.0"),
+}
+
+
+@dataclass(frozen=True)
+class Question:
+    """Does what `row` has and `paired` lacks change a number?"""
+
+    words: str
+    row: Row
+    paired: Row
+    shown: bool = True  # on the page
+
+
+_CLONE, _SHIELDED, _ADAPTED, _FULL = (("bc", f"default{guard}") for guard in ("", SHIELD, ADAPT, FULL))
+QUESTIONS = (
+    Question("a shield, under BC", _SHIELDED, _CLONE),
+    Question("danger learned, not the formula, in that shield", _SHIELDED, ("bc", "default+shield-analytic")),
+    Question("`full`, not the shield alone", _FULL, _SHIELDED),
+    Question("BC under `full`, not MPC from a zero proposal", _FULL, ("mpc", f"default{FULL}")),
+)
+_FROM_NOTHING = "BC under `full`, not MPC from a zero proposal"
+OF_ROBOTS = (
+    Question("a guard (`adapt`), under BC", _ADAPTED, _CLONE),
+    Question("danger learned, not the formula", _ADAPTED, ("bc", "default+adapt-analytic")),
+    Question("`full`, not `adapt`", _FULL, _ADAPTED),
+    *(
+        Question(f"{name}, not bc", (name, f"default{ADAPT}"), _ADAPTED, shown=False)
+        for name in ("bc-return", "bc-best", "ma-td3bc", "omar")
+    ),
+    Question(f"{_FROM_NOTHING} (near rest)", _FULL, ("mpc", f"default{FULL}")),
+    Question(f"{_FROM_NOTHING} (climbed anywhere)", _FULL, ("mpc", f"default{FULL}+trust_radius2.0")),
+)
+# By suite: what is asked, and of which cost; no robot starts above the limit.
+ASKED = {"guards": (QUESTIONS, "cost_safe_start"), "guards-mujoco": (OF_ROBOTS, "cost")}
+
+
+def of_seeds(suite: str, task: str, row: Row, keys: tuple[str, str], digits: tuple[int, int]) -> tuple[str, int]:
+    """Two means of a row on a task, as words, and of how many seeds."""
+    here = variant(task, row)
+    means = [(evidence.mean(suite, task, here, key), n) for key, n in zip(keys, digits)]
+    words = "–" if means[0][0] is None else " / ".join(f"{value:z.{n}f}" for value, n in means)
+    return words, len(of(suite, task, here))
+
+
+def usual(counts: Iterable[int]) -> int:
+    """The most common number of seeds."""
+    return Counter(n for n in counts if n).most_common(1)[0][0]
+
+
+def crossed(suite: str) -> str:
+    """A line per proposal, a column per task: normalised return / cost of resets that start safely → return under a
+    shield, whose cost the page gives."""
+    columns = []
+    for task in tasks_of(suite):
+        cells = []
+        for row in CROSSED.values():
+            text, seeds = of_seeds(suite, task, row, ("return_norm", "cost_safe_start"), (2, 2))
+            guarded = evidence.mean(suite, task, variant(task, (row[0], row[1] + SHIELD)), "return_norm")
+            text += f" → {guarded:z.2f}" if guarded is not None else ""
+            cells.append((text, seeds if row[1] != "reference" else 0))
+        most = usual(n for _, n in cells)
+        marked = [text + (f" [{n}]" if n not in (0, most) else "") for text, n in cells]
+        columns.append((f"{task.partition('-')[2]} [{most}]", *marked))
+    heads, *lines = zip(("proposal", *CROSSED), *columns)
+    return markdown(heads, lines) + OF_SEEDS
+
+
+def robots(suite: str) -> str:
+    """A line per proposal, a column per data set under the limit that proposals were played with: return / steps above
+    it."""
+    names = [t for t in tasks_of(suite) if of(suite, t, variant(t, ON_ROBOTS["return-conditioned BC"]))]
+    lines = []
+    for words, row in ON_ROBOTS.items():
+        made = [of_seeds(suite, task, row, ("return_mean", "cost_mean"), (0, 1)) for task in names]
+        most = usual(seeds for _, seeds in made)
+        cells = [text + (f" [{seeds}]" if seeds not in (0, most) else "") for text, seeds in made]
+        lines.append((f"{words} [{most}]", *cells))
+    return bare(["", *names], lines) + OF_SEEDS
+
+
+@functools.cache
+def answers(suite: str) -> list[tuple[Question, str, list[Difference]]]:
+    """(question, key, difference on every task that has both rows); p-values adjusted over all of them together."""
+    asked, cost = ASKED[suite]
+    found = []
+    for q in asked:
+        for key in ("return", cost):
+            each = (difference(suite, t, variant(t, q.row), variant(t, q.paired), key) for t in tasks_of(suite))
+            found.append((q, key, [d for d in each if d]))
+    adjusted = iter(family([d for *_, ds in found for d in ds]))
+    return [(q, key, [next(adjusted) for _ in ds]) for q, key, ds in found]
+
+
+def questions(suite: str) -> str:
+    """A line per question and number: the difference on every task, bold where it is significant. Costs that differ
+    nowhere are left out."""
+    names, lines = tasks_of(suite), []
+    for q, key, ds in answers(suite):
+        if not q.shown or not ds or (key != "return" and not any(d.holds for d in ds)):
+            continue
+        by_task = {d.task: shown(d, key) for d in ds}
+        lines.append((q.words, "return" if key == "return" else "cost", *(by_task.get(n, "–") for n in names)))
+    return markdown(("what differs", "of", *(n.partition("-")[2] for n in names)), lines)
+
+
+def counted(suite: str) -> str:
+    """A line per question of robots: on how many tasks the row has more and less, beyond chance, and which they are.
+    What differs nowhere is left out."""
+    lines = []
+    for q, key, ds in answers(suite):
+        if not q.shown or not any(d.holds for d in ds):
+            continue
+        sides = [[f"`{d.task}` {d.mean:+.3g}" for d in ds if d.holds and d.mean * sign > 0] for sign in (1, -1)]
+        listed = [f": {', '.join(side)}" if len(side) <= 3 else "" for side in sides]
+        counts = [f"**{len(side)}**{names}" if side else "0" for side, names in zip(sides, listed)]
+        seeds = sorted({len(d.seeds) for d in ds})
+        some = "–".join(map(str, dict.fromkeys((seeds[0], seeds[-1]))))
+        lines.append((q.words, key, len(ds), some, *counts))
+    return markdown(("what differs", "of", "tasks", "seeds", "more on", "less on"), lines)
+
+
+def shown(d: Difference, key: str) -> str:
+    digits = 0 if key == "return" else 2
+    text = f"{d.mean:+.{digits}f} [{d.low:.{digits}f}, {d.high:.{digits}f}]"
+    return f"**{text}**" if d.holds else text
+
+
+def _proving(folder: str, files: str, filtered: bool = True) -> Callable[[], str]:
+    return lambda: proving(folder, files, filtered)
+
+
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
+    ("docs/guard-results.md", "spread"): lambda: table(SPREAD, short),
+    ("docs/guard-results.md", "robots"): lambda: table(ROBOTS, long),
+    ("docs/proving-ground.md", "proving"): _proving("proving", "proving-*.json"),
+    ("docs/proving-ground.md", "others"): _proving("proving/others", "*.json", False),
+    ("docs/proving-ground.md", "drawn"): _proving("proving/drawn", "*.json", False),
+    ("docs/crossing-results.md", "tiers"): tiers,
+    ("docs/crossing-results.md", "guards"): lambda: crossing("crossing-guards", WAYS),
+    ("docs/crossing-results.md", "proposals"): proposals,
+    ("docs/crossing-results.md", "teams"): lambda: crossing("crossing-teams", TEAMS),
+    ("docs/crossing-results.md", "sizes"): sizes,
+    ("docs/attribution.md", "crossed"): lambda: crossed("guards"),
+    ("docs/attribution.md", "questions"): lambda: questions("guards"),
+    ("docs/attribution.md", "robots"): lambda: robots("guards-mujoco"),
+    ("docs/attribution.md", "robot-questions"): lambda: counted("guards-mujoco"),
+}

@@ -1,7 +1,7 @@
 """Broken files, and values of every wrong kind, by the thousand: how many are refused in a sentence, raise anything
 else, are believed although they have changed, hang, or leave something behind; and the memory that they take.
 
-    python benchmarks/hostile.py                     # results/hostile.csv and docs/security.md's table; a quarter hour
+    python benchmarks/hostile.py                     # results/hostile.csv; a quarter of an hour
     python benchmarks/hostile.py --parts tables run  # parts by the beginning of their names; the others keep their rows
 """
 
@@ -20,11 +20,9 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
-import _rows
+import common as _rows
 import numpy as np
-from readme import put
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -80,20 +78,7 @@ def main() -> None:
         found[name] = dict(zip(HEAD, (name, *counts, grown)))
         print(*found[name].values(), sep=", ", flush=True)
         _rows.write(OUT, [{field: found[each].get(field, "") for field in HEAD} for each in PARTS if each in found])
-    put("docs/security.md", "hostile", table([found[name] for name in PARTS if name in found]))
     sys.exit(bad)
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """The four ways to fail are one column of the page, since all are to be 0."""
-    good, failures = HEAD[:4], HEAD[4:-1]
-    heads = (*good, "anything else", HEAD[-1])
-    lines = ["| " + " | ".join(heads) + " |", "|---" * len(heads) + "|"]
-    for row in rows:
-        failed = sum(int(row[field]) for field in failures)
-        cells = [*(row[field] for field in good), failed, row.get(HEAD[-1], "")]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    return "\n".join(lines)
 
 
 Case = strange.Case  # what was done, reading it, and whether what was read is what it was

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import yaml
-from _rows import read, write
+from common import read, write
 
 from ringfence import EpisodeStore, Separation
 from ringfence.datasets import registry

@@ -2,7 +2,7 @@
 rules than the data's; and logs recorded there, learned and guarded like anybody's own.
 
     pip install mpe2
-    python benchmarks/other_spread.py        # writes results/mpe2.csv and docs/guard-results.md's table; resumable
+    python benchmarks/other_spread.py        # writes results/mpe2.csv; resumable
 
 A quarter of an hour on one core. Rows that are there already are not made again.
 """
@@ -12,11 +12,9 @@ from __future__ import annotations
 import logging
 import tempfile
 import warnings
-from pathlib import Path
 
 import numpy as np
-from _rows import append, read
-from readme import put
+from common import RESULTS, append, read
 
 import ringfence
 from ringfence.deploy import zoo
@@ -24,7 +22,7 @@ from ringfence.envs import SimpleSpread
 from ringfence.envs.mpe2 import Spread
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "mpe2.csv"
+OUT = RESULTS / "mpe2.csv"
 EPISODES, LOGGED = 200, 2000
 NAMES = SimpleSpread().feature_map("decentralized").names
 OWN = "bc, learned of logs recorded there"
@@ -57,7 +55,6 @@ def main() -> None:
             if missing(OWN, "mpe2", how):
                 result = ringfence.play(run, Spread, episodes=EPISODES, num_envs=100, **how)
                 keep(OWN, "mpe2", "mpe2", result)
-    put("docs/guard-results.md", "mpe2", table(read(OUT)))
 
 
 def missing(policy: str, place: str, how: dict) -> bool:
@@ -83,18 +80,6 @@ def keep(policy: str, logs: str, place: str, result: dict) -> None:
         "infeasible_rate": round(result.get("infeasible_rate", 0.0), 4),
     }
     append(OUT, found, tuple(found))
-    print(found, flush=True)
-
-
-def table(rows: list[dict]) -> str:
-    """A line per policy and simulator: alone and under a shield."""
-    lines = ["| policy | played in | alone | shield |", "|---|---|---|---|"]
-    for policy, place in dict.fromkeys((r["policy"], r["place"]) for r in rows):
-        both = [r for r in rows if (r["policy"], r["place"]) == (policy, place)]
-        numbers = [[float(r[key]) for key in ("return", "cost", "violation_rate")] for r in both]
-        cells = (f"{earned:.1f} / {cost:.2f} / {100 * rate:.0f} %" for earned, cost, rate in numbers)
-        lines.append(f"| {policy.replace('learned of', 'from')} | {place} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from _common import command, machine
+from common import command, machine
 from pooled import milliseconds
 from safetensors.numpy import load_file
 

@@ -7,19 +7,17 @@ alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from common import RESULTS, markdown, put
 from evidence import evaluations, variant
-from readme import put
 
 from ringfence.bench import paper
 from ringfence.datasets.registry import TASKS
 from ringfence.evaluation.statistics import mean_of_runs
 
-RESULTS = Path(__file__).resolve().parent.parent / "results"
 PAGE = "docs/planner-results.md"
 SPREAD = ("expert", "medium-replay", "medium", "random")
 Rows = list[dict[str, Any]]
@@ -76,11 +74,6 @@ def less(found: Rows, others: Rows, task: str) -> str:
     low, high = mean_of_runs(x)
     text = f"{x.mean():+.3f} [{low:+.3f}, {high:+.3f}]"
     return f"**{text}**" if low > 0 or high < 0 else text
-
-
-def markdown(heads: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    out = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    return "\n".join(out + ["| " + " | ".join(line) + " |" for line in lines])
 
 
 WAYS = {
@@ -243,14 +236,20 @@ def others() -> str:
     return markdown(("task", "who", "seeds", "return", "cost"), lines)
 
 
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
+    (PAGE, "planner-rows"): spread,
+    (PAGE, "planner-ablations"): lambda: changes("ablations", "alone", LEARNED, "as it is"),
+    (PAGE, "planner-frontier"): frontier,
+    (PAGE, "planner-algorithm1"): lambda: changes("algorithm1", "as it is", LEARNED),
+    (PAGE, "planner-others"): others,
+    ("README.md", "glance"): glance,
+    ("docs/benchmark.md", "glance"): glance,
+}
+
+
 def write_tables() -> None:
-    put(PAGE, "planner-rows", spread())
-    put(PAGE, "planner-ablations", changes("ablations", "alone", LEARNED, "as it is"))
-    put(PAGE, "planner-frontier", frontier())
-    put(PAGE, "planner-algorithm1", changes("algorithm1", "as it is", LEARNED))
-    put(PAGE, "planner-others", others())
-    for page in ("README.md", "docs/benchmark.md"):
-        put(page, "glance", glance())
+    for (page, mark), make in TABLES.items():
+        put(page, mark, make())
 
 
 if __name__ == "__main__":

@@ -4,12 +4,11 @@
 
 One file for each task. Rows that a file holds already, of as many seeds (`--seeds`), are not made again; `runs/pooled`
 keeps the runs, so a row whose runs are there is only played. Budgets are small: a laptop makes a row in minutes, and
-each row says its own. At the end the table in docs/drivers-results.md is written anew; `--seeds 0` does that alone.
+each row says its own. tables.py writes the page.
 """
 
 import argparse
 import json
-import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,8 +16,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from _common import command, machine
-from readme import put
+from common import command, machine
 
 import ringfence
 from ringfence.datasets.make import make
@@ -31,7 +29,6 @@ from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.loading import run_worlds
 from ringfence.loading.resolve import load_job
 from ringfence.logs.store import EpisodeStore
-from ringfence.report.published import PUBLISHED
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run
 
@@ -258,67 +255,10 @@ def kept(robots: bool) -> list[dict]:
     return [json.loads(file.read_text()) for file in files if of_robot(TASKS[file.stem]) == robots]
 
 
-def printed(task: str) -> str:
-    """What others printed on the public files, which pool five learners, too."""
-    values = {p.name.split(" ")[0]: p.values[task] / 100 for p in PUBLISHED if task in p.values}
-    told = ", ".join(f"{name} {value:.3f}" for name, value in values.items())
-    return f"| *as printed, on the public files: {told}* | | | | |"
-
-
-def in_words(name: str, algorithm: str) -> str:
-    """What a row is called in the table."""
-    told = name.removeprefix(algorithm).replace("told raw", "given the raw return").replace("told", "given")
-    return f"`{algorithm}`" + re.sub(r"(\S+) asked", r"target \1", told.replace(", raw,", ", raw return,"))
-
-
-def table() -> str:
-    """Rows of all tasks but robots' in the order of `ROWS`, the data first."""
-    lines = ["| | seeds | return, normalised | cost | of safe starts |", "|---|---|---|---|---|"]
-    for found in kept(robots=False):
-        lines.append(f"| *{found['task']}*: the data | | {found['data']['return_norm']:.3f} | | |")
-        if drivers := found["data"].get("of_drivers"):
-            lines.append(f"| its best driver of {len(drivers)} | | {max(drivers):.3f} | | |")
-        if found["task"].startswith("simple_spread"):
-            lines.append(printed(found["task"]))
-        for name in ROWS:
-            if name in found["rows"] and name not in UNTOLD:
-                r = found["rows"][name]
-                interval = r.get("return_norm_interval")  # older rows tell none
-                within = f" [{interval[0]:.3f}, {interval[1]:.3f}]" if interval else ""
-                cost = f"{r['cost_mean']:.2f} | {r['cost_safe_start']:.2f}"
-                earned = f"{len(r['seeds'])} | {r['return_norm']:.3f}{within}"
-                lines.append(f"| {in_words(name, r['algorithm'])} | {earned} | {cost} |")
-    return "\n".join(lines)
-
-
 def more(row: dict, other: dict) -> tuple[float, tuple[float, float]]:
     """Return that a robot's row has more than another on the same resets, and its interval."""
     apart = np.array(row["per_episode"]["return"]) - np.array(other["per_episode"]["return"])
     return float(apart.mean()), mean_of_runs(apart)
-
-
-def robots() -> str:
-    """A line for each robot's data under `adapt`: a clone, a flow that is asked for a return, and the best of eight of
-    its proposals."""
-    heads = ["data set", "logs", "BC", "`flow`", "the best of 8", "`flow` − BC", "the best − BC"]
-    lines = ["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads)]
-    for found in kept(robots=True):
-        rows = [found["rows"].get(name) for name in (CLONE, ASKED, BEST)]
-        cells = ["–" if r is None else f"{r['return_mean']:.0f} / {r['cost_mean']:.0f}" for r in rows]
-        cells += [said(found["rows"], name, CLONE) for name in (ASKED, BEST)]
-        task = TASKS[found["task"]]
-        logged = found["data"]["return_norm"] * (task.return_max - task.return_min) + task.return_min
-        lines.append(f"| `{found['task']}` | {logged:.0f} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
-
-
-def said(rows: dict[str, dict], name: str, other: str) -> str:
-    """What one row earns more than another, bold beyond chance."""
-    if name not in rows or other not in rows:
-        return "–"
-    mean, (low, high) = more(rows[name], rows[other])
-    text = f"{mean:+.0f} [{low:.0f}, {high:.0f}]"
-    return f"**{text}**" if low > 0 or high < 0 else text
 
 
 def main() -> None:
@@ -330,7 +270,7 @@ def main() -> None:
     reader.add_argument("--runs", type=Path, default=Path("runs/pooled"))
     given = reader.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
-    for name in given.tasks if given.seeds else ():
+    for name in given.tasks:
         task = TASKS[name]
         store, _ = make(task)
         file = given.out / f"{name}.json"
@@ -344,9 +284,6 @@ def main() -> None:
             rows[which] = row(which, store, task, given.runs, given.seeds)
             print(name, which, rows[which], flush=True)
             file.write_text(json.dumps(found, indent=1) + "\n")
-    if given.out.resolve() == RESULTS:
-        put("docs/drivers-results.md", "pooled", table())
-        put("docs/drivers-results.md", "robots", robots())
 
 
 if __name__ == "__main__":

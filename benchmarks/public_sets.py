@@ -1,6 +1,6 @@
 """Public logs, each imported by one command: what comes of it.
 
-python benchmarks/public_sets.py FOLDER    # results/public_sets.csv and docs/import-tracks.md's table; half a minute
+python benchmarks/public_sets.py FOLDER    # writes results/public_sets.csv; half a minute
 
 FOLDER holds clones of the repositories in SETS, each under its own name (OpenTraj, SynDrone-Swarm, ...). Sets that are
 not there keep the row that they had.
@@ -14,12 +14,11 @@ import sys
 import tempfile
 from pathlib import Path
 
-from _rows import read, write
-from readme import put
+from common import RESULTS, read, write
 
 from ringfence.logs.store import EpisodeStore
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "public_sets.csv"
+OUT = RESULTS / "public_sets.csv"
 PEDESTRIANS = "--layout obsmat --neighbours 4 --separation 0.5"
 SETS = {  # name: (owner of the repository, command, file in FOLDER, options)
     "ETH, seq_eth": ("crowdbotp", "import-table", "OpenTraj/datasets/ETH/seq_eth/obsmat.txt", PEDESTRIANS),
@@ -63,22 +62,6 @@ def row(name: str, folder: Path) -> dict[str, object]:
     }
 
 
-def table(rows: list[dict[str, object]]) -> str:
-    """Markdown."""
-    lines = [
-        "| set | `ringfence data` | episodes, steps | agents | s a step | steps with cost |",
-        "|---|---|---|---|---|---|",
-    ]
-    for each in rows:
-        owner, command, place, options = SETS[str(each["set"])]
-        repository = place.split("/")[0]
-        name = f"[{each['set']}](https://github.com/{owner}/{repository})"
-        call = f"`{command} {place.split('/')[-1]} {options}`".replace(" `", "`")
-        numbers = f"{each['episodes']}, {each['steps']} | {each['agents']} | {each['dt']} | {each['unsafe']}"
-        lines.append(f"| {name} | {call} | {numbers} |")
-    return "\n".join(lines)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
@@ -88,9 +71,7 @@ def main() -> None:
         if (folder / place).exists():
             found[name] = row(name, folder)
             print(*found[name].values(), flush=True)
-    rows = [found[name] for name in SETS if name in found]
-    write(OUT, rows)
-    put("docs/import-tracks.md", "public sets", table(rows))
+    write(OUT, [found[name] for name in SETS if name in found])
 
 
 if __name__ == "__main__":

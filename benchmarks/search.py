@@ -26,8 +26,7 @@ import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from _pool import finished
-from _rows import append, measured, read
+from common import append, finished, read
 
 ROOT = Path(__file__).resolve().parent.parent / "results" / "tuning"
 SEED = 100
@@ -200,7 +199,10 @@ def one(job: tuple) -> dict:
         "seed": SEED,
         "split": r["split"],
         "episodes": r["episodes"],
-        **measured(r),
+        "return": round(r["return_mean"], 2),
+        "return_norm": round(r["return_norm"], 4),
+        "cost": round(r["cost_mean"], 4),
+        "cost_safe_start": round(r["cost_safe_start"], 4),
         "train_seconds": round(seconds, 1),
     }
 

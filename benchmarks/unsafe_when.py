@@ -12,7 +12,7 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from _rows import write
+from common import write
 
 from ringfence.datasets import registry
 from ringfence.datasets.make import make

@@ -3,27 +3,25 @@
 ringfence bench guards --tasks simple_spread-expert --out A       # likewise guards-mujoco, crossing-guards
 python benchmarks/zoo.py --pack A B C     # writes src/ringfence/zoo/TASK
 python benchmarks/zoo.py --fit crossing-hasty    # has a World that is fitted by this version guard the task's policies
-python benchmarks/zoo.py                  # plays them; writes results/zoo.csv and docs/start.md's table
+python benchmarks/zoo.py                  # plays them; writes results/zoo.csv
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import shutil
 import tempfile
 from pathlib import Path
 
-from readme import put
+from common import RESULTS, read, write
 
 from ringfence.deploy import zoo
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import run_worlds
 from ringfence.training import worlds
 from ringfence.training.runs import Run
-from ringfence.utils.files import whole
 
-OUT = Path(__file__).resolve().parent.parent / "results" / "zoo.csv"
+OUT = RESULTS / "zoo.csv"
 CELLS = {
     "simple_spread-expert/bc": "bc",
     "simple_spread-expert/icbf": "icbf",
@@ -35,7 +33,6 @@ CELLS = {
 READERS = [name for name in CELLS if name.endswith("/icbf")]  # whose training read a World
 EPISODES = {"simple_spread-expert": 200, "halfcheetah_2x3-good": 20, "crossing-hasty": 200}
 GUARDS = {"simple_spread-expert": "shield", "halfcheetah_2x3-good": "adapt", "crossing-hasty": "shield"}
-HEAD = ("policy", "guard", "episodes", "return", "cost", "violation_rate", "return_before", "cost_before", "kib")
 
 
 def main() -> None:
@@ -44,12 +41,12 @@ def main() -> None:
     parser.add_argument("--fit", nargs="*", default=[], help="tasks whose guards' Worlds are fitted anew")
     given = parser.parse_args()
     folders = given.pack
-    before = {(r["policy"], r["guard"]): r for r in csv.DictReader(OUT.open())} if OUT.exists() else {}
+    before: dict = {(r["policy"], r["guard"]): r for r in read(OUT)}
     for name, cell in CELLS.items():
         task = name.split("/")[0]
         for run in (Run(p) for f in folders for p in (f / "cells" / task / cell).glob("seed-0-*")):
-            read = run_worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
-            print(*zoo.put(run, name, read, run_worlds.for_guard(run)))
+            own = run_worlds.of_run(run) if (run.path / worlds.WORLD).exists() else None
+            print(*zoo.put(run, name, own, run_worlds.for_guard(run)))
             for guard in ("none", GUARDS[task]):
                 found = [r for r in run.results.values() if _is(r, guard)]
                 before[name, guard] = {
@@ -87,24 +84,12 @@ def main() -> None:
                     }
                 )
                 print(rows[-1], flush=True)
-    with whole(OUT) as temporary, temporary.open("w") as f:
-        writer = csv.DictWriter(f, HEAD, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    put("docs/start.md", "zoo", table(rows))
+    write(OUT, rows)
 
 
 def _is(result: dict, guard: str) -> bool:
     """Whether a cell's result is of this guard, as the zoo plays it."""
     return result["guard"] == guard and result["barrier"] in ("none", "learned")
-
-
-def table(rows: list[dict]) -> str:
-    lines = ["| policy | guard | return | cost | before it was halved |", "|---|---|---|---|---|"]
-    for r in rows:
-        old = f"{r['return_before']}, {r['cost_before']}" if r["return_before"] else "–"
-        lines.append(f"| {r['policy']} | {r['guard']} | {r['return']} | {r['cost']} | {old} |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

@@ -1,18 +1,26 @@
 """Writes the measured tables into README.md and docs/, between their markers, from results/ alone.
 
-python benchmarks/readme.py
+    python benchmarks/tables.py                          # all of them
+    python benchmarks/tables.py docs/yard.md yard ...    # some, by page or marker
+
+`TABLES` has them by page and marker; those of guards, of the planner and of single studies are in files of their own.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import sys
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import guards_tables
 import numpy as np
-from _proven import proven
+import planner_tables
+import study_tables
+from common import RESULTS, markdown, of_json, put, read
+from evidence import proven
 
 from ringfence import algos
 from ringfence.bench import paper, unpack
@@ -21,39 +29,32 @@ from ringfence.report import board, standings
 from ringfence.utils import stored
 from ringfence.utils.config import build_config
 
-ROOT = Path(__file__).resolve().parent.parent
-RESULTS = ROOT / "results"
 SEEDS = 5  # fewer are said in the cell
 TIERS = ("expert", "medium", "medium-replay", "random")
 ANY = ""  # the one plain variant of an algorithm, whose preset may be named after the tier
-ROWS = (
-    ("behaviour data", "reference", "behaviour data"),
-    ("data within the limit", "reference", "its episodes within the limit"),
-    ("do-nothing", "reference", "do nothing"),
-    ("bc", ANY, "BC"),
-    ("bc-safe", ANY, "BC on episodes without a collision"),
-    ("ma-td3bc", ANY, "MA-TD3+BC"),
-    ("ma-cql", ANY, "MA-CQL"),
-    ("omar", ANY, "OMAR"),
-    ("ma-td3bc-lag", ANY, "MA-TD3+BC, Lagrange"),
-    ("fisor", ANY, "FISOR per agent"),
-)
-ROBOTS = ("halfcheetah_2x3", "ant_2x4", "ant_4x2")
-LEVELS = ("good", "medium", "poor")
-BRIEF = (("return_mean", 0), ("cost_mean", 1))
+ROWS = {
+    "behaviour data": ("behaviour data", "reference"),
+    "its episodes within the limit": ("data within the limit", "reference"),
+    "do nothing": ("do-nothing", "reference"),
+    "BC": ("bc", ANY),
+    "BC on episodes without a collision": ("bc-safe", ANY),
+    "MA-TD3+BC": ("ma-td3bc", ANY),
+    "MA-CQL": ("ma-cql", ANY),
+    "OMAR": ("omar", ANY),
+    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", ANY),
+    "FISOR per agent": ("fisor", ANY),
+}
 # Columns of the robots' table.
-SHORT = (
-    ("behaviour data", "reference", "data"),
-    ("bc", "mujoco", "BC"),
-    ("ma-td3bc-lag", "mujoco", "MA-TD3+BC, Lagrange"),
-)
+SHORT = {
+    "data": ("behaviour data", "reference"),
+    "BC": ("bc", "mujoco"),
+    "MA-TD3+BC, Lagrange": ("ma-td3bc-lag", "mujoco"),
+}
 # Pan et al. 2022, means as tabulated in MADIFF's repository; on the public files.
 PUBLISHED = {
     "published: MA-TD3+BC, public data": (1.083, 0.293, 0.154, 0.098),
     "published: OMAR, public data": (1.149, 0.479, 0.379, 0.344),
 }
-
-
 # Measurements that the page of speeds leaves out: parts of others, and what only a script's reader asks for.
 UNSHOWN = re.compile(
     r"parameters|milliseconds|compile|mean return|size of|imports|all entries|PyTorch|random actions|"
@@ -65,52 +66,42 @@ UNSHOWN = re.compile(
 
 
 def main() -> None:
-    put("README.md", "front", front())
-    put("docs/replay-results.md", "drivers", replayed_drivers())
-    put("docs/replay-results.md", "recordings", replayed_recordings(RECORDINGS))
-    put("docs/replay-results.md", "machines", replayed_recordings(MACHINES))
-    put("docs/tables.md", "summary", summary())
-    put("docs/tables.md", "table", spread(grouped("simple_spread")))
-    measured = grouped("mujoco")
-    for protocol, ending in (("native", ""), ("quantile", "-quantile")):
-        put("docs/tables.md", f"robots-{protocol}", robots_short(measured, ending))
-    put("docs/benchmark.md", "cost", costs())
-    put("docs/benchmark.md", "paper", paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)))
-    put("docs/performance.md", "performance", speeds())
+    wanted = set(sys.argv[1:])
+    for (page, mark), make in TABLES.items():
+        if not wanted or {page, mark} & wanted:
+            put(page, mark, make())
 
 
 def speeds() -> str:
     """One line per measurement, a median and its 99th percentile in one."""
     rows = [r for file in sorted((RESULTS / "performance").glob("*.json")) for r in json.loads(file.read_text())]
     late = {r["name"].removesuffix(", p99"): r["value"] for r in rows if r["name"].endswith(", p99")}
-    lines = ["| what | measured |", "|---|---|"]
+    lines = []
     for r in rows:
         name = r["name"].removesuffix(", p50")
         if UNSHOWN.search(name) or name.endswith(", p99"):
             continue
         text = f"{r['value']:.4g} {r['unit']}" + (f" (p99 {late[name]:.3g})" if r["name"].endswith("p50") else "")
         name = name.replace("one joint action", "an action").replace("a loaded controller", "a controller")
-        lines.append(f"| {name} | {text} |")
-    return "\n".join(lines)
-
-
-NO_GUARD = "no guard"
+        lines.append((name, text))
+    return markdown(("what", "measured"), lines)
 
 
 def front() -> str:
     """The README's few rows, in words that need no footnote."""
-    lines = ["| who acts | what is known of danger | episodes with a violation | return |", "|---|---|---|---|"]
-    for words, danger, violated, earned in (*_front_crossing(), *_front_proving(), _front_replay()):
-        lines.append(f"| {words} | {danger} | {violated} | {earned} |")
-    return "\n".join(lines)
+    heads = ("who acts", "what is known of danger", "episodes with a violation", "return")
+    return markdown(heads, (*_front_crossing(), *_front_proving(), _front_replay()))
+
+
+LOGGED = "a logged cost column"
 
 
 def _front_crossing() -> Iterator[tuple[str, str, str, str]]:
     """One seed, by benchmarks/proving.py, as the rows below."""
-    found = json.loads((RESULTS / "proving" / "crossing-hasty.json").read_text())["rows"]
+    found = of_json("proving/crossing-hasty.json")["rows"]
     for words, danger, way in (
-        ("Eight discs cross a room: a clone of the logs", NO_GUARD, "none"),
-        ("the same clone under a guard", "a logged cost column", "shield learned"),
+        ("Eight discs cross a room: a clone of the logs", "no guard", "none"),
+        ("the same clone under a guard", LOGGED, "shield learned"),
     ):
         row = found[f"bc {way}"]
         violated = f"{100 * row['violation_rate']:.3g} % of {row['episodes']:,}"
@@ -124,8 +115,8 @@ def _front_proving() -> Iterator[tuple[str, str, str, str]]:
     refused = ("none", "one", "two", "three")[len(found) - len(systems)]
     clones = f"{len(systems)} of {len(found)} other systems, {refused} being refused: a clone of the logs"
     for words, danger, way in (
-        (clones, NO_GUARD, "none"),
-        ("the same clones under a guard", "a logged cost column", "shield learned"),
+        (clones, "no guard", "none"),
+        ("the same clones under a guard", LOGGED, "shield learned"),
         ("the same clones under a guard", "the true formula and motion", "shield oracle"),
     ):
         rows = [rows[f"bc {way}"] for rows in systems]
@@ -138,9 +129,8 @@ def _front_replay() -> tuple[str, str, str, str]:
     """Recordings of pedestrians, all drivers of each together."""
     shares = {"none": [], "shield": []}
     for name in RECORDINGS:
-        rows = json.loads((RESULTS / "replay" / f"{name}.json").read_text())["rows"]
         for way, found in shares.items():
-            mine = [r for r in rows if r["filter"] == way]
+            mine = [r for r in of_json(f"replay/{name}.json")["rows"] if r["filter"] == way]
             found.append(100 * sum(r["contacts"] for r in mine) / sum(r["windows"] for r in mine))
     alone, guarded = (f"{min(found):.2g} to {max(found):.2g} %" for found in shares.values())
     words = f"Filmed pedestrians, {len(RECORDINGS)} recordings: five drivers put among them"
@@ -162,25 +152,21 @@ DRIVERS = {"bc": "clone (`bc`)", "straight": "", "accelerate": "", "hasty": "", 
 
 def replayed_drivers() -> str:
     """Contacts prevented and caused in zara02, by driver."""
-    found = json.loads((RESULTS / "replay" / "zara02.json").read_text())
-    lines = [f"| driver | contacts | {' | '.join(FILTERS)} |", "|---" * (2 + len(FILTERS)) + "|"]
-    for driver, words in DRIVERS.items():
-        lines.append(f"| {words or f'`{driver}`'} | {_filtered(found, {driver})} |")
-    lines.append(f"| all | {_filtered(found, set(DRIVERS))} |")
-    return "\n".join(lines)
+    found = of_json("replay/zara02.json")
+    lines = [(words or f"`{driver}`", *_filtered(found, {driver})) for driver, words in DRIVERS.items()]
+    return markdown(("driver", "contacts", *FILTERS), [*lines, ("all", *_filtered(found, set(DRIVERS)))])
 
 
 def replayed_recordings(names: Sequence[str]) -> str:
     """The same of all drivers together, by recording."""
-    lines = [f"| recording | verdict | windows | contacts | {' | '.join(FILTERS)} |"]
-    lines.append("|---" * (4 + len(FILTERS)) + "|")
+    lines = []
     for name in names:
-        found = json.loads((RESULTS / "replay" / f"{name}.json").read_text())
-        lines.append(f"| `{name}` | {found['verdict']} | {found['windows']} | {_filtered(found, set(DRIVERS))} |")
-    return "\n".join(lines)
+        found = of_json(f"replay/{name}.json")
+        lines.append((f"`{name}`", found["verdict"], found["windows"], *_filtered(found, set(DRIVERS))))
+    return markdown(("recording", "verdict", "windows", "contacts", *FILTERS), lines)
 
 
-def _filtered(found: dict, drivers: set[str]) -> str:
+def _filtered(found: dict, drivers: set[str]) -> list[str]:
     """Contacts alone, and what each filter makes of them; nothing where a file does not have it."""
     if "beyond the logs" not in found:  # an older file, of a guard that went there
         guarded = [r for r in found["rows"] if r["filter"] == "shield"]
@@ -192,59 +178,48 @@ def _filtered(found: dict, drivers: set[str]) -> str:
         rows = [r for r in found.get(where, ()) if r["filter"] == name and r["policy"] in drivers]
         prevented, caused = (sum(r[what] for r in rows) for what in ("prevented", "caused"))
         cells.append(f"{prevented} ({100 * prevented / alone:.0f} %), {caused}" if rows else "")
-    return " | ".join(cells)
+    return cells
 
 
-# Rows of the summary: their words, and (suite, algorithm, method's variant) on Simple Spread, robots and Crossing.
-SUMMARY: dict[str, tuple[tuple[str, str, str] | None, ...]] = {
-    "BC": (("simple_spread", "bc", ""), ("mujoco", "bc", ""), ("crossing", "bc", "default")),
-    "MA-TD3+BC with a Lagrange multiplier": (
-        ("simple_spread", "ma-td3bc-lag", ""),
-        ("mujoco", "ma-td3bc-lag", ""),
-        ("crossing-guards", "ma-td3bc-lag", "default"),
-    ),
-    "BC + guard, *analytic*": (
-        ("guards", "bc", "default+shield-analytic"),
-        ("guards-mujoco", "bc", "+adapt-analytic"),
-        None,
-    ),
+# Rows of the summary: their words, and suites with a method's variant on Simple Spread, robots and Crossing.
+LAGRANGE = "MA-TD3+BC with a Lagrange multiplier"
+SUMMARY = {
+    "BC": ("simple_spread bc", "mujoco bc", "crossing bc default"),
+    LAGRANGE: ("simple_spread ma-td3bc-lag", "mujoco ma-td3bc-lag", "crossing-guards ma-td3bc-lag default"),
+    "BC + guard, *analytic*": ("guards bc default+shield-analytic", "guards-mujoco bc +adapt-analytic", ""),
     "**BC + guard**": (
-        ("guards", "bc", "default+shield-learned"),
-        ("guards-mujoco", "bc", "+adapt-learned"),
-        ("crossing", "bc", "default+shield-learned"),
+        "guards bc default+shield-learned",
+        "guards-mujoco bc +adapt-learned",
+        "crossing bc default+shield-learned",
     ),
     "**BC + guard that also climbs values** (`full`)": (
-        ("guards", "bc", "default+full-learned"),
-        ("guards-mujoco", "bc", "+full-learned"),
-        ("crossing-guards", "bc", "default+full-learned"),
+        "guards bc default+full-learned",
+        "guards-mujoco bc +full-learned",
+        "crossing-guards bc default+full-learned",
     ),
 }
 
 
 def summary() -> str:
     """One line per method: all tiers, all robots and Crossing in a cell each."""
-    data = {s: grouped(s) for s in ("simple_spread", "guards", "guards-before", "crossing", "crossing-guards")}
-    robots = {s: standings.standings(board.read(RESULTS / s)) for s in ("mujoco", "guards-mujoco")}
+    data = {s: grouped(s) for s in ("simple_spread", "guards", "crossing", "crossing-guards")}
     logs = [data["simple_spread"][f"simple_spread-{t}", "behaviour data", "reference"][0] for t in TIERS]
     logged = [data["crossing"]["crossing-hasty", "behaviour data", "reference"][0]]
-    lines = ["| method | Simple Spread | robots | Crossing |", "|---|---|---|---|"]
-    lines.append(f"| *the logs* | {_spread_cell(logs)} | | {_crossing_cell(logged)} |")
+    lines = [("*the logs*", _spread_cell(logs), "", _crossing_cell(logged))]
     for words, places in SUMMARY.items():
         cells = []
         for place, kind in zip(places, ("spread", "robots", "crossing")):
-            if place is None:
+            suite, algorithm, variant = (place.split() + ["", "", ""])[:3]
+            if not place:
                 cells.append("–")
-                continue
-            suite, algorithm, variant = place
-            if kind == "robots":
-                cells.append(_robots_cell(robots[suite], algorithm, variant))
+            elif kind == "robots":
+                cells.append(_robots_cell(suite, algorithm, variant))
             elif kind == "spread":
-                found = [r for tier in TIERS for r in of(data[suite], tier, algorithm, variant)]
-                cells.append(_spread_cell(found))
+                cells.append(_spread_cell([r for tier in TIERS for r in of(data[suite], tier, algorithm, variant)]))
             else:
                 cells.append(_crossing_cell(data[suite].get(("crossing-hasty", algorithm, variant), [])))
-        lines.append(f"| {words} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        lines.append((words, *cells))
+    return markdown(("method", "Simple Spread", "robots", "Crossing"), lines).replace("|  |", "| |")
 
 
 def _spread_cell(rows: list[dict]) -> str:
@@ -255,11 +230,10 @@ def _spread_cell(rows: list[dict]) -> str:
     return f"{earned:.2f} / {cost:.3f}" + _seeds(seeds)
 
 
-def _robots_cell(shown: dict, algorithm: str, variant: str) -> str:
-    wanted = f"default{variant}" if variant.startswith("+") else variant or "default"
-    found = [
-        r for rows in shown.values() for r in rows if (r.method.algorithm, r.method.variant) == (algorithm, wanted)
-    ]
+def _robots_cell(suite: str, algorithm: str, variant: str) -> str:
+    wanted = algorithm, f"default{variant}" if variant.startswith("+") else variant or "default"
+    shown = standings.standings(board.read(RESULTS / suite)).values()
+    found = [r for rows in shown for r in rows if (r.method.algorithm, r.method.variant) == wanted]
     kept, seeds = sum(r.safe for r in found), min(len(r.seeds) for r in found)
     return f"{kept} of {len(found)}, {np.mean([r.returns_norm for r in found]):.2f}" + _seeds(seeds)
 
@@ -278,30 +252,33 @@ def _seeds(count: int) -> str:
 def grouped(suite: str) -> dict:
     """Rows of a suite's table by (task, algorithm, variant)."""
     groups = defaultdict(list)
-    for row in stored.table(RESULTS / suite / "table.csv"):
+    for row in read(f"{suite}/table.csv"):
         if row["task"]:
             groups[row["task"], row["algorithm"], row["variant"]].append(row)
     return groups
 
 
-def robots_short(groups: dict, ending: str) -> str:
+def robots_short(ending: str) -> str:
     """One line per task, one column per method: return / cost, and how many seeds they are of where that is not the
     usual number."""
-    lines = ["| | " + " | ".join(label for *_, label in SHORT) + " |", "|---|" + "---|" * len(SHORT)]
-    names = [f"{robot}-{level}{ending}" for robot in ROBOTS for level in LEVELS]
-    found = {(n, a, v): groups.get((n, a, v), []) for n in names for a, v, _ in SHORT}
+    groups = grouped("mujoco")
+    robots, levels = ("halfcheetah_2x3", "ant_2x4", "ant_4x2"), ("good", "medium", "poor")
+    names = [f"{robot}-{level}{ending}" for robot in robots for level in levels]
+    found = {(n, *way): groups.get((n, *way), []) for n in names for way in SHORT.values()}
     counts = [len(rows) for (_, _, variant), rows in found.items() if rows and variant != "reference"]
     usual = max(set(counts), key=counts.count)
+    lines = []
     for name in names:
         cells = []
-        for algorithm, variant, _ in SHORT:
-            rows = found[name, algorithm, variant]
-            numbers = " / ".join(f"{mean(rows, key):.{d}f}" for key, d in BRIEF) if rows else "–"
-            unusual = rows and variant != "reference" and len(rows) != usual
-            cells.append(numbers + fallen(rows) + f" [{len(rows)}]" * bool(unusual))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        for way in SHORT.values():
+            rows = found[name, *way]
+            text = f"{mean(rows, 'return_mean'):.0f} / {mean(rows, 'cost_mean'):.1f}" if rows else "–"
+            unusual = rows and way[1] != "reference" and len(rows) != usual
+            cells.append(text + fallen(rows) + f" [{len(rows)}]" * bool(unusual))
+        lines.append((name, *cells))
     others = " [n]: of n." if len(set(counts)) > 1 else ""
-    return "\n".join([*lines, "", f"Methods' cells are of {usual} seed{'s' * (usual > 1)}.{others}"])
+    table = markdown(("", *SHORT), lines).replace("|  |", "| |", 1)
+    return f"{table}\n\nMethods' cells are of {usual} seed{'s' * (usual > 1)}.{others}"
 
 
 def costs() -> str:
@@ -354,28 +331,25 @@ def of(groups: dict, tier: str, algorithm: str, variant: str) -> list[dict]:
     return next((rows for (t, a, v), rows in groups.items() if (t, a) == (task, algorithm) and "+" not in v), [])
 
 
-def spread(groups: dict) -> str:
-    """One line per method, one column per tier."""
-    lines = ["| | " + " | ".join(TIERS) + " |", "|---|" + "---|" * len(TIERS)]
-    for algorithm, variant, name in ROWS:
-        found = [of(groups, tier, algorithm, variant) for tier in TIERS]
+def spread() -> str:
+    """One line per method, one column per tier: return (normalised) / cost of safe starts."""
+    groups, lines = grouped("simple_spread"), []
+    for name, way in ROWS.items():
+        found = [of(groups, tier, *way) for tier in TIERS]
         if any(found):
-            lines.append(f"| {name} | " + " | ".join(cell(rows) if rows else "–" for rows in found) + " |")
-    for name, values in PUBLISHED.items():
-        lines.append(f"| *{name}* | " + " | ".join(f"*({v:.2f})*" for v in values) + " |")
-    return "\n".join(lines)
+            lines.append((name, *(cell(rows) if rows else "–" for rows in found)))
+    lines += [(f"*{name}*", *(f"*({v:.2f})*" for v in values)) for name, values in PUBLISHED.items()]
+    return markdown(("", *TIERS), lines).replace("|  |", "| |", 1)
 
 
 def mean(rows: list[dict], key: str) -> float:
     return float(np.mean([float(r[key]) for r in rows]))
 
 
-def cell(rows: list[dict], cost: str = "cost_safe_start", digits: int = 3) -> str:
-    """Return (normalised) / cost."""
-    made = sum(r["variant"] != "reference" for r in rows)
-    seeds = f" [{made}]" if 0 < made < SEEDS else ""
-    text = f"{mean(rows, 'return_mean'):.0f}{seeds} ({mean(rows, 'return_norm'):.2f}) / {mean(rows, cost):.{digits}f}"
-    return text + fallen(rows)
+def cell(rows: list[dict]) -> str:
+    seeds = _seeds(sum(r["variant"] != "reference" for r in rows))
+    text = f"{mean(rows, 'return_mean'):.0f}{seeds} ({mean(rows, 'return_norm'):.2f})"
+    return f"{text} / {mean(rows, 'cost_safe_start'):.3f}{fallen(rows)}"
 
 
 def fallen(rows: list[dict]) -> str:
@@ -385,15 +359,22 @@ def fallen(rows: list[dict]) -> str:
     return f" ({max(share, 1):.0f} %)" if share else ""
 
 
-def put(file: str, name: str, text: str) -> None:
-    path = ROOT / file
-    begin, end = f"<!-- {name} -->", f"<!-- /{name} -->"
-    old = path.read_text()
-    if begin not in old or end not in old:
-        raise SystemExit(f"{file} lacks the markers {begin} and {end}; put them back.")
-    path.write_text(old[: old.index(begin) + len(begin)] + "\n" + text + "\n" + old[old.index(end) :])
-    print(f"{file}: {name}")
-
+TABLES: dict[tuple[str, str], Callable[[], str]] = {
+    ("README.md", "front"): front,
+    ("docs/replay-results.md", "drivers"): replayed_drivers,
+    ("docs/replay-results.md", "recordings"): lambda: replayed_recordings(RECORDINGS),
+    ("docs/replay-results.md", "machines"): lambda: replayed_recordings(MACHINES),
+    ("docs/tables.md", "summary"): summary,
+    ("docs/tables.md", "table"): spread,
+    ("docs/tables.md", "robots-native"): lambda: robots_short(""),
+    ("docs/tables.md", "robots-quantile"): lambda: robots_short("-quantile"),
+    ("docs/benchmark.md", "cost"): costs,
+    ("docs/benchmark.md", "paper"): lambda: paper.markdown(paper.lines(RESULTS / name for name in paper.FOLDERS)),
+    ("docs/performance.md", "performance"): speeds,
+    **guards_tables.TABLES,
+    **planner_tables.TABLES,
+    **study_tables.TABLES,
+}
 
 if __name__ == "__main__":
     main()
