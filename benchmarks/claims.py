@@ -19,7 +19,7 @@ import numpy as np
 import planner_tables
 import pooled
 from ablations import adjusted
-from common import put
+from common import put, read
 from evidence import LEVEL, difference, evaluations, mean, of, proven, tasks_of, variant
 from guards_tables import FULL, QUESTIONS, SHIELD, Question, answers
 from scipy.stats import fisher_exact, spearmanr
@@ -27,7 +27,6 @@ from scipy.stats import fisher_exact, spearmanr
 from ringfence.datasets.registry import TASKS
 from ringfence.evaluation.statistics import mean_of_runs
 from ringfence.report import board, standings
-from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parent.parent
 RESULTS = ROOT / "results"
@@ -186,7 +185,7 @@ def _violated(row: dict[str, str]) -> list[int]:
 
 def of_late_actions() -> tuple[bool, str]:
     """Episodes with contact of a guard that knows of late actions, and of one that does not."""
-    rows = {(r["faults"], r["guard"], r["compensated"]): r for r in stored.table(ROOT / STRESS)}
+    rows = {(r["faults"], r["guard"], r["compensated"]): r for r in read(ROOT / STRESS)}
     known = [float(rows[f"delay{k}", "shield", "True"]["violation_rate"]) for k in (1, 2, 3)]
     unknown = [float(rows[f"delay{k}", "shield", "False"]["violation_rate"]) for k in (1, 2, 3)]
     holds = all(a < 0.1 * b for a, b in zip(known, unknown)) and max(known) <= 0.02 and 0.93 <= max(unknown) < 0.95
@@ -204,7 +203,7 @@ def of_trackers() -> tuple[bool, str]:
 
 def of_late_systems() -> tuple[bool, str]:
     """Unsafe steps behind late actions, of a guard that knows of them."""
-    rows = stored.table(ROOT / SYSTEMS)
+    rows = read(ROOT / SYSTEMS)
     known = {
         (r["task"], r["faults"]): float(r["cost"])
         for r in rows
@@ -215,13 +214,13 @@ def of_late_systems() -> tuple[bool, str]:
 
 def of_a_robot_behind_faults() -> tuple[bool, str]:
     """Unsafe steps of a guarded robot behind faults."""
-    costs = [float(r["cost"]) for r in stored.table(ROOT / SYSTEMS) if r["guard"].startswith("adapt")]
+    costs = [float(r["cost"]) for r in read(ROOT / SYSTEMS) if r["guard"].startswith("adapt")]
     return len(costs) > 20 and max(costs) <= 25, f"{max(costs):.1f} at most, of {len(costs)}"
 
 
 def of_pedestrians() -> tuple[bool, str]:
     """Contacts of pedestrians that a guard leaves which knows of late or lost steps, of those of one that does not."""
-    rows = stored.table(ROOT / PEDESTRIANS)
+    rows = read(ROOT / PEDESTRIANS)
 
     def left(faults: str, guard: str) -> int:
         return sum(int(r["contacts"]) for r in rows if (r["faults"], r["guard"]) == (faults, guard))
@@ -466,7 +465,7 @@ def crossing_rare() -> tuple[bool, str]:
 
 def rows_of(file: str, **where: str) -> list[dict[str, str]]:
     """Rows of a table in results/ with these entries."""
-    rows = stored.table(RESULTS / file)
+    rows = read(file)
     return [r for r in rows if all(r[k] == v for k, v in where.items())]
 
 

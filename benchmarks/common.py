@@ -17,7 +17,6 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ringfence.utils import stored
 from ringfence.utils.files import whole
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -26,20 +25,17 @@ T, R = TypeVar("T"), TypeVar("R")
 
 
 def read(file: str | Path) -> list[dict[str, str]]:
-    """All rows of a table under today's names, none if there is no file yet."""
-    return stored.table(RESULTS / file) if (RESULTS / file).exists() else []
+    """All rows of a table of `results/`, none if there is no file yet."""
+    path = RESULTS / file
+    return list(csv.DictReader(path.open(newline=""))) if path.exists() else []
 
 
 def append(file: Path, row: dict[str, Any], fields: Sequence[str] | None = None) -> None:
-    """Add a row and print it, so that nothing is lost when a study is cut short; a file under older names gets
-    today's."""
-    fields = tuple(fields or row)
+    """Add a row and print it, so that nothing is lost when a study is cut short."""
     fresh = not file.exists()
-    if not fresh and tuple(csv.DictReader(file.open()).fieldnames or ()) != fields:
-        write(file, read(file))
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("a", newline="") as f:
-        writer = csv.DictWriter(f, fields, lineterminator="\n")
+        writer = csv.DictWriter(f, fields or row, lineterminator="\n")
         if fresh:
             writer.writeheader()
         writer.writerow(row)

@@ -26,7 +26,6 @@ from ringfence import algos
 from ringfence.bench import paper, unpack
 from ringfence.datasets import registry
 from ringfence.report import board, standings
-from ringfence.utils import stored
 from ringfence.utils.config import build_config
 
 SEEDS = 5  # fewer are said in the cell
@@ -317,7 +316,7 @@ def spent(folder: Path) -> dict[tuple[str, str], list[float]]:
 
 
 def _reads_danger(cell: Path) -> bool:
-    config = stored.config(json.loads((cell / "config.json").read_text()))
+    config = json.loads((cell / "config.json").read_text())
     algorithm = algos.get(config["algorithm"])
     known = {k: v for k, v in config["config"].items() if hasattr(algorithm.Config, k)}  # cells outlive fields
     return algorithm.cost_source(build_config(algorithm.Config, known, config["algorithm"])) != "nothing"
