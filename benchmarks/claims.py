@@ -775,9 +775,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "Guided by danger `flow` costs nothing from safe starts and earns no less": GUIDED_POOL,
         "Under a shield none costs anything from safe starts**, and none loses 0.01 of its return": of_shielded_pool,
     },
-    "docs/export.md": {
-        "which is no slower": exported_in_time,
-    },
+    "docs/export.md": {"which is no slower": exported_in_time},
     "docs/frontiers.md": {
         "safety costs next to nothing": guards_price,
         "keeps 9 of 10 limits on Simple Spread": limits_learned,
@@ -792,9 +790,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "keep all 18 limits under `adapt`": robots_kept("default+adapt-learned-decentralized", 18, "own-sight-mujoco"),
         "intervals included, by learned danger and by the formula": robots_kept("default+adapt-learned", 17),
     },
-    "docs/ope.md": {
-        "Danger is ranked well": danger_is_ranked,
-    },
+    "docs/ope.md": {"Danger is ranked well": danger_is_ranked},
     "docs/planner-results.md": {
         "which is what the paper prints": planner_reaches(FIVE, 1.1, 0.005),
         "Guidance takes the cost and adds return": guidance_takes_cost,
@@ -816,9 +812,7 @@ CLAIMS: dict[str, dict[str, Check]] = {
         "With naive drivers it leaves more violations than the shield on eight of thirteen systems, fewer on "
         "three": of_filters,
     },
-    "docs/replay-results.md": {
-        "The shield prevents three quarters there, beyond the logs less than half": of_a_crowd,
-    },
+    "docs/replay-results.md": {"The shield prevents three quarters there, beyond the logs less than half": of_a_crowd},
     "docs/stress-results.md": {
         "Undelayed logs leave contact in at most 1 of 300 episodes, and earn more": undelayed_logs_leave_little,
         "A guard that knows of late or lost steps leaves half of the contacts, or fewer": of_pedestrians,

@@ -118,11 +118,11 @@ class Rows(list):
 
 
 def record(file: Path, rows: list[dict[str, Any]]) -> None:
-    """Write rows {name, value, unit} with the command and the machine as a list of JSON."""
-    common = {"command": command(), "machine": machine()}
-    print(common["machine"])
+    """Write rows {name, value, unit} with the command and the machine as a list of JSON; others of the file stay."""
+    made = {row["name"]: row | {"command": command(), "machine": machine()} for row in rows}
+    kept = [made.pop(old["name"], old) for old in (json.loads(file.read_text()) if file.exists() else [])]
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(json.dumps([row | common for row in rows], indent=2) + "\n")
+    file.write_text(json.dumps([*kept, *made.values()], indent=2) + "\n")
 
 
 def _pin(free: Any) -> None:

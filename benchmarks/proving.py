@@ -42,11 +42,7 @@ from ringfence.training import worlds
 COLUMNS = ("return_mean", "violation_rate", "cost_mean", "infeasible_rate")
 LEARNED = {"guard": "shield", "anyway": True}
 # What a clone and the naive driver are played by.
-ROWS = {
-    "none": {},
-    "shield learned": LEARNED,
-    "shield oracle": {"guard": "shield", "barrier": "oracle"},
-}
+ROWS = {"none": {}, "shield learned": LEARNED, "shield oracle": {"guard": "shield", "barrier": "oracle"}}
 # What differs in one thing; the World of `all` is fitted without a search for causes.
 ALL = "shield learned, networks on all entries"
 BESIDE = {

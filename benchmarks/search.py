@@ -147,10 +147,7 @@ STUDIES = {
 
 
 # What won on medium, each tried beside its preset where nothing was chosen.
-_WINNERS = {
-    ("ma-td3bc", ""): [{"alpha": 5.0}],
-    ("ma-td3bc-lag", ""): [{"multiplier_max": 3.0}],
-}
+_WINNERS = {("ma-td3bc", ""): [{"alpha": 5.0}], ("ma-td3bc-lag", ""): [{"multiplier_max": 3.0}]}
 STUDIES |= {
     tier: replace(STUDIES["simple_spread"], task=f"simple_spread-{tier}-pooled", settings=_WINNERS)
     for tier in ("expert", "random")

@@ -5,7 +5,7 @@
 simulator     env-steps/s of Simple Spread, a jitted scan over whole episodes, and of mpe2's own loop in the same run
 robots        env-steps/s of MuJoCo's robots, and what `ringfence data make` takes; five substeps are one env-step
 collect       1 M transitions of Simple Spread's medium tier, compilation included
-actor_critic  updates/s of ma-td3bc and omar, beside a straightforward PyTorch loop over agents (`pip install torch`)
+actor_critic  updates/s of ma-td3bc and omar; a PyTorch loop over agents was measured beside them by revision cac628af
 planning      an update of the planner, and one joint action under guards, as teams grow; untrained networks
 guard         fitting a World, and one joint action of a clone under guards
 crossing      the same of Crossing, 8, 64 and 256 agents who guard themselves
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
 import os
 import resource
 import subprocess
@@ -27,6 +26,7 @@ import tempfile
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -234,64 +234,28 @@ def collect(rows: Rows, brief: bool) -> None:
 
 
 def actor_critic(rows: Rows, brief: bool) -> None:
-    """Three agents, batch 1024, two layers of 64. On one core, as the grid's workers run, and on two: a run on each
-    against the better of one loop with two threads and two loops with one."""
-    updates, (first, second) = 3 if brief else 100, cores()[:2]
-    each = [{first}, {second}]
-    for name in ("ma-td3bc", "omar"):
-        alone, compiling = together("ours", name, updates, each[:1])[0]
-        pair = sum(rate for rate, _ in together("ours", name, updates, each))
-        sets = {"on one core": each[:1], "on two cores": [{first, second}], "two processes": each}
-        loops = {where: sum(together("loop", name, updates, some)) for where, some in sets.items()}
-        rows(f"{name}, 3 agents, batch 1024, one core", alone, "updates/s")
-        rows(f"{name}, two cores, a run on each", pair, "updates/s")
-        rows(f"{name}, compile time", compiling, "s")
-        for where, value in loops.items():
-            rows(f"{name}, PyTorch loop {where}", value, "updates/s")
-        rows(f"{name}, over the loop, one core", alone / loops["on one core"], "x")
-        rows(f"{name}, over the best loop, two cores", pair / max(loops.values()), "x")
-
-
-def together(kind: str, name: str, updates: int, sets: list[set[int]]) -> list:
-    """What processes side by side measure, one for each set of cores."""
-    spawn = multiprocessing.get_context("spawn")
-    start, out = spawn.Barrier(len(sets)), spawn.Queue()
-    processes = [spawn.Process(target=_pinned, args=(c, (kind, name, updates), start, out)) for c in sets]
-    for process in processes:
-        process.start()
-    found = [out.get() for _ in processes]
-    for process in processes:
-        process.join()
-    return found
-
-
-def _pinned(own: set[int], job: tuple[str, str, int], start: Any, out: Any) -> None:
-    """Measure in a process that owns these cores, once everybody is ready."""
-    os.sched_setaffinity(0, own)
-    kind, name, updates = job
+    """Three agents, batch 1024, two layers of 64, on one core, as the grid's workers run."""
     store, _ = make(registry.get("simple_spread-expert"))
-    if kind == "loop":
-        import torch
-        from torch_loop import updating
+    os.sched_setaffinity(0, cores()[:1])
+    updates = 3 if brief else 100
+    for name in ("ma-td3bc", "omar"):
+        go = updating(name, store)
+        rows(f"{name}, compile time", clock(partial(go, 1)), "s")
+        rows(f"{name}, 3 agents, batch 1024, one core", rate(partial(go, updates), updates, 3), "updates/s")
 
-        torch.set_num_threads(len(own))
-        update = updating(name, store)
-        start.wait()
-        update()
-        out.put(rate(lambda: [update() for _ in range(updates)] and None, updates, 3))
-    else:
-        job_of, data, state, _ = prepared(name, registry.from_store(store), store)
-        advance, _ = loop.make_program(job_of)
-        roots, scores = jax.vmap(jax.random.key)(jnp.arange(1)), data.arrays["scores"][None]
-        start.wait()
-        held = [state]
 
-        def go(count: int) -> Any:
-            held[0], metrics = advance(held[0], roots, data.arrays, scores, count)
-            return metrics
+def updating(name: str, store: EpisodeStore) -> Callable[[int], Any]:
+    """What makes so many updates."""
+    job, data, state, _ = prepared(name, registry.from_store(store), store)
+    advance, _ = loop.make_program(job)
+    fixed = jax.vmap(jax.random.key)(jnp.arange(1)), data.arrays, data.arrays["scores"][None]
 
-        compiling = clock(lambda: go(1))
-        out.put((rate(lambda: go(updates), updates, 3), compiling))
+    def go(count: int) -> Any:
+        nonlocal state
+        state, metrics = advance(state, *fixed, count)
+        return metrics
+
+    return go
 
 
 def prepared(name: str, task: Task, store: EpisodeStore) -> tuple[Any, Any, Any, Any]:
