@@ -85,6 +85,7 @@ def test_uneven_times_are_put_on_one_clock():
     run, who = np.zeros(sum(sizes), int), np.repeat([0, 1], sizes)
     time, state = np.concatenate(clocks), rng.normal(size=(sum(sizes), 2))
     action, reward, cost = (rng.normal(size=(sum(sizes), k)) for k in (3, 1, 1))
+    cost = np.maximum(cost, 0)
     got = resample(run, who, time, state, action, reward[:, 0], cost, np.zeros(len(time), bool), 0.25, 10.0)
     seen, late = 0, 0.499 * min(0.25, np.median(np.concatenate([np.diff(c) for c in clocks])))
     for agent in (0, 1):
@@ -97,11 +98,14 @@ def test_uneven_times_are_put_on_one_clock():
             last = mine[time[mine] <= at + late][-1]
             for c in range(2):
                 np.testing.assert_allclose(got.state[row, c], np.interp(at, time[mine], state[mine, c]))
-            np.testing.assert_array_equal(got.action[row], action[last])
+            if row != rows[-1]:  # which nobody follows
+                np.testing.assert_array_equal(got.action[row], action[last])
             since = mine[(time[mine] > before + late) & (time[mine] <= at + late)]
-            np.testing.assert_allclose(got.earned[row], reward[since].sum() if len(since) else 0.0, atol=1e-12)
-            np.testing.assert_allclose(got.cost[row], cost[since].max() if len(since) else cost[last])
+            if row == rows[-1]:  # and what comes after the last step
+                since = mine[time[mine] > before + late]
+            np.testing.assert_allclose(got.earned[row], reward[since].sum(), atol=1e-12)
             before, seen = at, seen + 1
+        np.testing.assert_allclose(got.cost[rows].sum(0), cost[mine].sum(0))
     assert seen == len(got.step) > 25
 
 
@@ -588,3 +592,96 @@ def test_dates_that_are_written_as_text_are_dates():
         np.testing.assert_allclose(store.observations, plain.observations, atol=1e-5)
     with pytest.raises(UserError, match="row 0: t is '2026-01-01T12:00:00Z', no number"):  # of which zone is the rest?
         EpisodeStore.from_table(table | {"t": [text[0] + "Z", *text[1:]]}, **NAMES)
+
+
+def test_an_end_inside_a_track_ends_an_episode():
+    """Trips that follow each other, the next from where the first began: no speed is of the way back."""
+    steps = 20
+    t = np.arange(2 * steps) * 0.1
+    table = {"t": np.tile(t, 2), "id": np.repeat([0, 1], 2 * steps), "y": np.repeat([0.0, 3.0], 2 * steps)}
+    table |= {"x": np.tile(np.linspace(0, 95, steps), 4), "end": np.tile(np.arange(2 * steps) % steps == steps - 1, 2)}
+    table |= {"hit": np.zeros(4 * steps), "a": np.r_[np.ones(4 * steps - 1), np.nan]}
+    table["a"][steps - 1] = np.nan  # nobody follows the command with which an episode ends
+    options = dict(time="t", agent="id", state=["x", "y"], cost="hit", terminated="end", action=["a"])
+    for dt, ends in ((None, [19, 38]), (0.3, [6, 12])):
+        store = EpisodeStore.from_table(table, **options, dt=dt)
+        assert np.array_equal(store.episode_ends, ends) and store.episode_terminated.all()
+        assert np.ptp(entry(store, "own.vx")) < 1e-3  # never -950 m/s, which a seam would be
+    one = EpisodeStore.from_table(table, **options, neighbours=1)
+    assert one.episodes == 4 and one.episode_terminated.all()
+    with pytest.raises(StoreError, match="moved at"):
+        EpisodeStore.from_table(table, **options | {"terminated": None, "action": ()})
+
+
+def clocked(t: np.ndarray, agents: int = 1, **options) -> tuple[EpisodeStore, int]:
+    """A store of agents whose rows come at these times, and how many steps have another row's command."""
+    k = np.tile(np.arange(len(t)), agents)
+    who = np.repeat(np.arange(agents), len(t))
+    table = {
+        "t": np.tile(t, agents),
+        "id": who,
+        "x": np.sin(k * 0.01),
+        "y": 1.0 * who,
+        "a": k % 7 - 3.0,
+        "hit": 0.0 * k,
+    }
+    options = {"max_speed": 1000.0} | options
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], action=["a"], cost="hit", **options)
+    wanted = np.arange(store.steps) % 7 - 3.0
+    return store, int((store.actions[:, :, 0] != wanted[:, None]).sum())
+
+
+ROWS = np.arange(30_000)
+WOBBLE = 0.3 * np.sin(ROWS / 9000)
+
+
+@pytest.mark.parametrize(
+    ("times", "options", "dt"),
+    [
+        (np.arange(250_000) / 60, {}, 1 / 60),  # six digits of which are a step too long in an hour
+        (1.7e9 + ROWS / 10, {}, 0.1),  # single numbers of such times are 2e-7 s apart
+        (ROWS / 59.94, {"dt": 1 / 60}, 1 / 60),
+        (ROWS / 60, {"dt": 0.0167}, 0.0167),
+        (ROWS * 0.1 + WOBBLE, {}, None),
+        (ROWS * 0.1 + WOBBLE, {"agents": 3}, None),
+        (ROWS * 0.1 + WOBBLE + np.random.default_rng(0).uniform(-0.02, 0.02, len(ROWS)), {}, None),
+        (np.where(ROWS == 0, 0.04, ROWS * 0.1), {}, 0.1),
+        (np.arange(100) * 0.752, {}, 0.752),
+    ],
+)
+def test_no_row_slips_however_long_or_wrong_the_clock(times, options, dt):
+    store, slipped = clocked(times, **options)
+    assert slipped == 0 and abs(store.steps - len(times)) <= 2
+    assert store.card.dt == dt if dt else abs(store.card.dt - 0.1) < 1e-4
+    seen = entry(store, "own.x")[:, 0]
+    np.testing.assert_allclose(seen, np.sin(np.arange(len(seen)) * 0.01), atol=4e-3)
+    drifts = [note for note in store.card.warnings if "drifts" in note]
+    assert len(drifts) == (dt is None or "dt" in options)
+
+
+def test_times_without_a_clock_are_not_counted_by_rows():
+    """Two rates that are far apart, and none: states are where they were at that time."""
+    two = np.cumsum(np.where(ROWS[:4000] < 2000, 0.1, 0.115))
+    none = np.cumsum(np.random.default_rng(1).exponential(0.1, 4000))
+    for times in (two, none):
+        store, _ = clocked(times, gap=10.0)
+        assert not any("drifts" in note for note in store.card.warnings)
+        at = np.arange(store.steps + 1) * store.card.dt
+        expected = np.interp(at, times - times[0], np.sin(ROWS[:4000] * 0.01))
+        np.testing.assert_allclose(entry(store, "own.x")[:, 0], expected, atol=1e-5)
+
+
+def test_events_keep_their_sum_whatever_the_steps():
+    t = np.delete(np.arange(50) * 0.1, [11, 12, 13, 14])
+    table = {"t": t, "id": 0 * t, "x": np.sin(t), "y": t, "hit": np.isclose(t, 1.0) * 1.0, "paid": 1.0 + 0 * t}
+    options = dict(time="t", agent="id", state=["x", "y"], cost="hit", reward="paid")
+    for dt, at in ((None, 1.0), (0.05, 1.0), (0.3, 1.2)):
+        store = EpisodeStore.from_table(table, **options, dt=dt)
+        assert store.costs.sum() == 1 and store.rewards.sum() == len(t) - 1
+        assert np.isclose((np.flatnonzero(store.costs)[0] + 1) * store.card.dt, at)
+    lasts = table | {"hit": ((t > 0.85) & (t < 2.05)) * 1.0}
+    store = EpisodeStore.from_table(lasts, **options)
+    assert store.costs.sum() == lasts["hit"].sum()  # danger on both sides of the hole is danger in it
+    np.testing.assert_array_equal(store.costs > 0, [0.85 < 0.1 * k < 2.05 for k in range(1, 50)])
+    halves = EpisodeStore.from_table(lasts, **options, dt=0.05)
+    assert np.isclose(halves.costs.sum(), lasts["hit"].sum()) and (np.diff(halves.costs > 0) != 0).sum() == 2

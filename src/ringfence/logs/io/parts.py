@@ -22,7 +22,7 @@ def parted(rows: Rows, values: Values, share: float) -> tuple[Rows, Values]:
         )
     recording = rows.recording + late * (rows.recording.max() + 1)
     order = np.lexsort((np.arange(len(late)), rows.agent, recording))
-    part = Rows(rows.order[order], recording[order], rows.agent[order], rows.time[order], rows.agents)
+    part = Rows(*(x[order] for x in (rows.order, recording, rows.agent, rows.time)), rows.agents, rows.ended[order])
     return part, values.chosen(order)
 
 

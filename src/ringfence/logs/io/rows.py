@@ -8,13 +8,12 @@ from functools import cached_property
 
 import numpy as np
 
-from ringfence.errors import StoreError, UserError
+from ringfence.errors import StoreError
 from ringfence.logs.io.columns import Columns, is_missing, numbers, seconds, words
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.utils.natural import numbered
 
 COARSE = 0.01  # of what a column changes by in a row: the distance of neighbouring numbers above which it is coarse
-GAP = 5.0  # steps without a row that end an episode
 LONG = 5.0  # s, a step that hardly any controller has
 FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
 MANY_MOVED = 0.05  # of the rows, that are not dropped for having jumped: the unit is another
@@ -30,11 +29,12 @@ class Rows:
     agent: np.ndarray  # (M,)
     time: np.ndarray  # (M,) s
     agents: np.ndarray  # names, by number, in natural order
+    ended: np.ndarray  # (M,) whether an episode ended by itself with the row
 
     @cached_property
     def follows(self) -> np.ndarray:
-        """(M-1,) whether a row is of the same agent and recording as the one before."""
-        return (np.diff(self.recording) == 0) & (np.diff(self.agent) == 0)
+        """(M-1,) whether a row is of the same agent and episode as the one before."""
+        return (np.diff(self.recording) == 0) & (np.diff(self.agent) == 0) & ~self.ended[:-1]
 
     @cached_property
     def step(self) -> float:
@@ -49,24 +49,15 @@ class Values:
     columns: Columns  # (M,) each of state, action and goal
     reward: np.ndarray  # (M,)
     cost: np.ndarray  # (M, K)
-    ended: np.ndarray  # (M,) whether an episode ended by itself with the row
     single: tuple[str, ...] = ()  # columns that the table holds in single precision
 
     def chosen(self, kept: np.ndarray) -> Values:
         columns = {name: column[kept] for name, column in self.columns.items()}
-        return Values(columns, self.reward[kept], self.cost[kept], self.ended[kept], self.single)
+        return Values(columns, self.reward[kept], self.cost[kept], self.single)
 
     def stacked(self, names: tuple[str, ...]) -> np.ndarray:
         """(M, columns)"""
         return np.stack([self.columns[name] for name in names], 1)
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Steps that rows are put on."""
-
-    dt: float  # s
-    gap: float  # s without a row, after which an agent was away
 
 
 def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
@@ -78,7 +69,8 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     if schema.episode is not None:
         recording = numbered(words(columns, schema.episode))[1]
     order = np.lexsort((np.arange(len(clock)), owner, recording))  # an agent's rows in the order of the table
-    rows = Rows(order, recording[order], owner[order], clock[order], agents)
+    ended = _ends(columns, schema, len(clock))
+    rows = Rows(order, recording[order], owner[order], clock[order], agents, ended[order])
     _refuse_disorder(rows, columns, schema)
     if not rows.follows.any():
         raise StoreError(
@@ -89,8 +81,9 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
 
 def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
     passed = np.diff(rows.time)
-    backwards = rows.follows & (passed < 0)
-    twice = rows.follows & (passed == 0)
+    same = (np.diff(rows.recording) == 0) & (np.diff(rows.agent) == 0)
+    backwards = same & (passed < 0)
+    twice = same & (passed == 0)
     where = "." if schema.episode is not None else ", or name the column that tells episodes apart."
     for wrong, what, remedy in (
         (backwards, "is earlier than", "sort each agent's rows by time"),
@@ -116,7 +109,7 @@ def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
     reward = numbers(columns, schema.reward)[rows.order] if schema.reward else zero
     costs = [numbers(columns, name)[rows.order] for name in schema.cost]
     single = tuple(name for name in read if columns[name].dtype == np.float32)
-    return Values(read, reward, np.stack(costs or [zero], 1), _ends(columns, rows, schema), single)
+    return Values(read, reward, np.stack(costs or [zero], 1), single)
 
 
 def _until_the_last(column: np.ndarray, rows: Rows) -> np.ndarray:
@@ -145,26 +138,16 @@ def _since_the_first(column: np.ndarray, rows: Rows) -> np.ndarray:
     return filled
 
 
-def _ends(columns: Columns, rows: Rows, schema: TableSchema) -> np.ndarray:
-    """(M,) flags."""
+def _ends(columns: Columns, schema: TableSchema, count: int) -> np.ndarray:
+    """(M,) flags of `count` rows of the table."""
     if schema.terminated is None:
-        return np.zeros(len(rows.time), bool)
+        return np.zeros(count, bool)
     flags = numbers(columns, schema.terminated)
     others = ~np.isin(flags, (0.0, 1.0))
     if others.any():
         row = int(np.flatnonzero(others)[0])
         raise StoreError(f"row {row}: {schema.terminated} is {flags[row]:g}, no flag; write 0 or 1.")
-    return flags[rows.order] > 0
-
-
-def clock_of(rows: Rows, schema: TableSchema) -> Clock:
-    dt = schema.dt or float(f"{rows.step:.6g}")
-    gap = schema.gap or GAP * max(dt, rows.step)
-    if gap < rows.step:
-        raise UserError(
-            f"gap={gap:g} is less than the {rows.step:g} s between an agent's rows; every row would be cut off."
-        )
-    return Clock(dt, gap)
+    return flags > 0
 
 
 # --- units ---
@@ -215,19 +198,18 @@ def _that_jumped(rows: Rows, beyond: np.ndarray) -> np.ndarray:
 
 
 def _chosen(rows: Rows, kept: np.ndarray) -> Rows:
-    return Rows(rows.order[kept], rows.recording[kept], rows.agent[kept], rows.time[kept], rows.agents)
+    columns = (rows.order, rows.recording, rows.agent, rows.time)
+    return Rows(*(column[kept] for column in columns), rows.agents, rows.ended[kept])
 
 
-def doubts(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Iterator[str]:
-    """What is odd about the numbers, in sentences."""
+def doubts(rows: Rows, values: Values, dt: float, schema: TableSchema) -> Iterator[str]:
+    """What is odd about the numbers, which are to be put on steps of `dt` s, in sentences."""
     if schema.position:
         yield from _doubtful_velocities(rows, values, schema)
         yield from _jumps(rows, values, schema)
     yield from blurred(rows, values)
-    if clock.dt >= LONG:
-        yield f"a step is {clock.dt:g} s: if times are in ms, µs or frames, say how long one is (time_unit)"
-    if schema.dt is None:
-        yield from _off_the_clock(rows, clock)
+    if dt >= LONG:
+        yield f"a step is {dt:g} s: if times are in ms, µs or frames, say how long one is (time_unit)"
     if schema.action:
         yield from _large_actions(values, schema)
     if not schema.position:
@@ -291,19 +273,6 @@ def _jumps(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
         yield (
             f"row {int(rows.order[jumps[0] + 1])} and {jumps.size - 1} others moved more than {what}: positions jump "
             f"there, or no column tells recordings apart; --max-speed {limit:.3g} drops such rows"
-        )
-
-
-def _off_the_clock(rows: Rows, clock: Clock) -> Iterator[str]:
-    begins = np.flatnonzero(np.diff(rows.recording, prepend=-1))
-    first = np.minimum.reduceat(rows.time, begins)
-    which = np.unique(rows.recording, return_inverse=True)[1]
-    steps = (rows.time - first[which]) / clock.dt
-    far = float(np.quantile(np.abs(steps - np.round(steps)), 0.99))
-    if far > 0.01:
-        yield (
-            f"rows are up to {far:.2g} of a step of {clock.dt:g} s off the clock: states are interpolated, actions, "
-            "costs and rewards are those nearest to a step"
         )
 
 

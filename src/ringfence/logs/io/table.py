@@ -15,17 +15,16 @@ import numpy as np
 
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.angles import without_angles
+from ringfence.logs.io.clock import Clock, clock_of, off_the_clock, on_whole_steps
 from ringfence.logs.io.columns import Columns, Table, Tables, dates, numbers, read_columns, seconds, words
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.lists import expanded
 from ringfence.logs.io.parts import parted
 from ringfence.logs.io.rows import (
-    Clock,
     Rows,
     Values,
     blurred,
-    clock_of,
     doubts,
     refuse_jumps,
     sorted_rows,
@@ -115,15 +114,18 @@ def _read(
     rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
     clock = clock_of(rows, schema)
-    doubtful = list(doubts(rows, values, clock, schema))
+    doubtful = list(doubts(rows, values, clock.dt, schema))
     lost = any(blurred(rows, values))
     recordings = int(rows.recording.max()) + 1
     if share is not None:
         rows, values = parted(rows, values, share)
+    rows, drifts = on_whole_steps(rows, clock)
+    if schema.dt is None:
+        drifts += off_the_clock(rows, clock)
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
-    warnings = [*notes, *angles, *dropped, *doubtful, *_made_of(schema), *episodes.notes]
+    warnings = [*notes, *angles, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
     steps = _steps(motion, episodes, warnings, card or {})
     if lost:  # what the table has lost is not found again by moving it
         steps |= {name: steps[name].astype(np.float32) for name in ("observations", "final_observations")}
@@ -212,7 +214,7 @@ def _on_clock(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> 
         action,
         values.reward,
         values.cost,
-        values.ended,
+        rows.ended,
         clock.dt,
         clock.gap,
     )

@@ -20,7 +20,7 @@ CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
 class Tracks:
     """R rows on one clock, sorted by segment and step: a segment is one agent without a hole.
 
-    What adds up or holds (`earned`, `cost`) is of the time since the row before.
+    What adds up (`earned`, `cost`) is of the time since the row before.
     """
 
     recording: np.ndarray  # (R,) int, whose rows share a clock
@@ -30,7 +30,7 @@ class Tracks:
     state: np.ndarray  # (R, C)
     action: np.ndarray  # (R, A): the last one at that time
     earned: np.ndarray  # (R,): the sum of rewards
-    cost: np.ndarray  # (R, K): the largest of each kind
+    cost: np.ndarray  # (R, K): the sum of each kind
     ended: np.ndarray  # (R,) whether an episode ended by itself
     dt: float  # s
 
@@ -48,15 +48,15 @@ def resample(
     gap: float,
 ) -> Tracks:
     """Rows sorted by (recording, agent, time), (M,) each and (M, C), (M, A), (M, K) costs, onto steps of `dt` s.
-    States are interpolated; actions, rewards and costs belong to the step that they are nearest to, and actions
-    are held. A hole of more than `gap` s ends a segment."""
-    segments = _Segments.of(recording, agent, time, gap)
+    States are interpolated, actions held. Rewards and costs belong to the step that they are nearest to and keep their
+    sum. A hole of more than `gap` s ends a segment, and so does a row that an episode `ended` with."""
+    segments = _Segments.of(recording, agent, time, ended, gap)
     segment, step = segments.grid(dt)
     at, row = segments.placed(segment, step, dt)
     fresh = np.ones(len(row), bool)
     fresh[1:] = segment[1:] != segment[:-1]
+    row = np.where(np.append(fresh[1:], True), segments.last[segment], row)  # what comes after the last step is of it
     before = np.where(fresh, segments.first[segment] - 1, np.concatenate([[0], row[:-1]]))
-    sums = np.concatenate([[0.0], np.cumsum(reward)])
     return Tracks(
         recording[segments.first][segment],
         agent[segments.first][segment],
@@ -64,9 +64,9 @@ def resample(
         step,
         np.stack([np.interp(at, segments.axis, column) for column in state.T], 1),
         action[row],
-        sums[row + 1] - sums[before + 1],
-        _largest_between(cost, before, row),
-        _largest_between(ended[:, None].astype(float), before, row)[:, 0] > 0,
+        _between(np.add, reward, before, row),
+        _lasting(_between(np.add, cost, before, row), row > before, fresh),
+        _between(np.logical_or, ended, before, row),
         dt,
     )
 
@@ -82,9 +82,9 @@ class _Segments:
     origin: np.ndarray  # (S,) s: when the segment's recording begins
 
     @classmethod
-    def of(cls, recording: np.ndarray, agent: np.ndarray, time: np.ndarray, gap: float) -> _Segments:
+    def of(cls, recording: np.ndarray, agent: np.ndarray, time: np.ndarray, ended: np.ndarray, gap: float) -> _Segments:
         begins = np.ones(len(time), bool)
-        begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap)
+        begins[1:] = (np.diff(recording) != 0) | (np.diff(agent) != 0) | (np.diff(time) > gap) | ended[:-1]
         first = np.flatnonzero(begins)
         zero = np.full(recording.max() + 1, np.inf)
         np.minimum.at(zero, recording, time)
@@ -131,10 +131,22 @@ class _Segments:
         return at, np.clip(row, self.first[segment], self.last[segment])
 
 
-def _largest_between(cost: np.ndarray, before: np.ndarray, row: np.ndarray) -> np.ndarray:
-    """(R, K) the largest cost (M, K) of the rows after `before` and up to `row`."""
+def _between(sum_of: np.ufunc, values: np.ndarray, before: np.ndarray, row: np.ndarray) -> np.ndarray:
+    """(R, ...) what `sum_of` makes of the `values` (M, ...) of the rows after `before` and up to `row`; 0 of no row."""
     bounds = np.stack([np.minimum(before + 1, row), row + 1], 1).ravel()
-    return np.maximum.reduceat(np.concatenate([cost, np.zeros((1, cost.shape[1]))]), bounds)[::2]
+    found = sum_of.reduceat(np.concatenate([values, np.zeros_like(values[:1])]), bounds)[::2]
+    found[row <= before] = 0
+    return found
+
+
+def _lasting(cost: np.ndarray, own: np.ndarray, fresh: np.ndarray) -> np.ndarray:
+    """Costs (R, K) of which steps without a row of their `own` have a share where danger lasts: where the rows before
+    and after both cost something, what the later one costs is shared by the steps since. Segments begin with a row."""
+    owners = np.flatnonzero(own)
+    later = np.minimum(np.searchsorted(owners, np.arange(len(own))), len(owners) - 1)
+    here, before = owners[later], owners[np.maximum(later - 1, 0)]
+    lasts = (cost[here] > 0) & (cost[before] > 0) & ~fresh[here, None]
+    return np.where(lasts, cost[here] / np.maximum(here - before, 1)[:, None], cost)
 
 
 def teams(tracks: Tracks, size: int | None) -> tuple[np.ndarray, np.ndarray, int]:
