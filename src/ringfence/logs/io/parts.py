@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from ringfence.errors import StoreError, UserError
@@ -22,7 +24,7 @@ def parted(rows: Rows, values: Values, share: float) -> tuple[Rows, Values]:
         )
     recording = rows.recording + late * (rows.recording.max() + 1)
     order = np.lexsort((np.arange(len(late)), rows.agent, recording))
-    part = Rows(*(x[order] for x in (rows.order, recording, rows.agent, rows.time)), rows.agents, rows.ended[order])
+    part = dataclasses.replace(rows.chosen(order), recording=recording[order])
     return part, values.chosen(order)
 
 

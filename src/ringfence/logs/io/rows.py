@@ -31,6 +31,11 @@ class Rows:
     agents: np.ndarray  # names, by number, in natural order
     ended: np.ndarray  # (M,) whether an episode ended by itself with the row
 
+    def chosen(self, kept: np.ndarray) -> Rows:
+        return Rows(
+            self.order[kept], self.recording[kept], self.agent[kept], self.time[kept], self.agents, self.ended[kept]
+        )
+
     @cached_property
     def follows(self) -> np.ndarray:
         """(M-1,) whether a row is of the same agent and episode as the one before."""
@@ -175,7 +180,7 @@ def without_jumps(rows: Rows, values: Values, schema: TableSchema) -> tuple[Rows
         return rows, values, []
     kept = np.arange(len(rows.time))
     while len(kept) > (1 - MANY_MOVED) * len(rows.time):
-        some = _chosen(rows, kept)
+        some = rows.chosen(kept)
         beyond = _speeds(some, values.chosen(kept), schema) > schema.max_speed
         if not beyond.any():
             dropped = len(rows.time) - len(kept)
@@ -195,11 +200,6 @@ def _that_jumped(rows: Rows, beyond: np.ndarray) -> np.ndarray:
     first_is_apart = beyond & begins & goes_on & ~after
     later = beyond & ~first_is_apart & (~before | begins)
     return np.concatenate([np.flatnonzero(first_is_apart), np.flatnonzero(later) + 1])
-
-
-def _chosen(rows: Rows, kept: np.ndarray) -> Rows:
-    columns = (rows.order, rows.recording, rows.agent, rows.time)
-    return Rows(*(column[kept] for column in columns), rows.agents, rows.ended[kept])
 
 
 def doubts(rows: Rows, values: Values, dt: float, schema: TableSchema) -> Iterator[str]:
