@@ -23,6 +23,7 @@ from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import draw
 from ringfence.proposals.base import act_with
+from ringfence.proposals.options import WIDE
 from ringfence.training import loop
 from ringfence.training.job import make_job
 from ringfence.training.runs import Run
@@ -214,6 +215,23 @@ def test_planner_options(trained, options):
     result = evaluate(run, **QUICK, num_recorded=2, **options)
     assert result["episodes"] == 4 and np.isfinite(result["return_mean"])
     assert len(run.results) >= 1
+
+
+def test_several_plans_are_drawn_as_far_apart_as_is_asked(trained, small_store):
+    """One plan has the noise of `temperature`, each of several that times `spread`, and drawing starts nowhere else."""
+    seen, state = jnp.asarray(small_store.observations[:2]), jnp.asarray(small_store.state[:2])
+
+    def drawn(count: int, **options) -> np.ndarray:
+        policy = load(trained["icbf"], sampling_steps=1, barrier_guidance=0.0, **options)[1]
+        past, present = policy._context(policy.initial_state(2), seen, state)
+        driver = jnp.zeros(2 * count, jnp.int32) if policy.drivers else None
+        return np.asarray(eqx.filter_jit(policy.plans)(past, present, jax.random.key(0), count, driver))
+
+    apart, usual = {"temperature": 0.5, "spread": 4.0}, {"temperature": 2.0, "spread": 1.0}
+    np.testing.assert_array_equal(drawn(3, **apart), drawn(3, **usual))
+    np.testing.assert_array_equal(drawn(1, **apart), drawn(1, temperature=0.5))
+    assert drawn(3, spread=0.0).std(1).max() < 1e-5 < drawn(3).std(1).max()
+    assert load(trained["icbf"])[1].options.spread == WIDE
 
 
 def test_a_controller_acts_like_the_policy(trained, small_store):

@@ -98,14 +98,15 @@ class FlowPolicy(eqx.Module):
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
 
         def act(x: Array) -> Array:
-            return self.draw(x, driver, key, guides if x is seen else None)  # what is foreseen is proposed unguided
+            # what is foreseen is proposed unguided
+            return self.draw(x, driver, key, guides if x is seen else None, self.options.spread if count > 1 else 1.0)
 
         actions = rolled(act, self.feature_map, world, seen, present, rows)
         return carry, actions.reshape(batch, count, *actions.shape[2:]), {}
 
-    def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None) -> Array:
-        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,); guided from `present` (B, N, D'), the
-        same in the World's view."""
+    def draw(self, x: Array, driver: Array, key: Key, present: Array | None = None, spread: float = 1.0) -> Array:
+        """Actions (B, N, A) in [−1, 1] at features (B, N, D), of drivers (B,), that far apart; guided from `present`
+        (B, N, D'), the same in the World's view."""
         o, s = self.options, self.spec
         batch = x.shape[0]
         seen = self._seen(x)
@@ -117,7 +118,7 @@ class FlowPolicy(eqx.Module):
 
             return self._guided(answer, batch)
 
-        action = o.temperature * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
+        action = o.temperature * spread * jax.random.normal(key, (batch, s.n_agents * s.action_dim))
         for k in range(o.sampling_steps):
             aim = clean(action, jnp.full(batch, k / o.sampling_steps))
             if present is not None:

@@ -19,6 +19,7 @@ class PlanOptions:
     cfg_scale: float = 1.2  # ω of classifier-free guidance; 1 switches it off
     target_return: float = 1.5  # return condition, as a normal score: 1.5 asks for the best 7 %; of the largest, if raw
     temperature: NonNegative = 1.0  # scale of the first noise
+    spread: NonNegative = 1.0  # by which it is multiplied where several plans are drawn, to choose from or to refine
     value_guidance: NonNegative = 0.0  # steps of x̂0 up the plan's value, in units of its deviation; 0: none
     persist: NonNegative = 1.0  # gradient guidance fades as (1 − ᾱ)^persist: 1 trusts the denoiser, 0 the gradient
     reconcile: bool = True  # make the agents of a joint plan agree on where everybody will be
@@ -41,10 +42,16 @@ class TakesPlanOptions(Protocol):
     options: PlanOptions
 
 
+# Plans around a learned mean are nearly one plan where the logs had one driver; wider apart, there is a choice.
+WIDE = 3.0
+
+
 def plan_defaults(config) -> dict:
     """Choices that follow from how a model was trained (its Config): who knew one agent alone plans alone, a flow needs
-    few steps, and of a raw return nine tenths of the largest are asked for at every step, as MADIFF does."""
+    few steps, of a raw return nine tenths of the largest are asked for at every step, as MADIFF does, and several plans
+    around a learned mean are drawn wide apart."""
     chosen: dict = {"target_return": 0.9} if getattr(config, "condition", "none") == "raw" else {}
+    chosen |= {"spread": WIDE} if getattr(config, "around", "nothing") == "mean" else {}
     if hasattr(config, "drivers") and not hasattr(config, "diffusion_steps"):
         return chosen | {"sampling_steps": 2}
     return chosen | ({"execution": "decentralized"} if getattr(config, "observe", "all") == "single" else {})
@@ -61,5 +68,5 @@ PLANNERS: dict[str, dict] = {
     "published": {"temperature": 0.5},
     # For robots. Samples begin with less noise, since every outlier of a thousand steps throws the robot off; and no
     # gradient on value, which rises with the very speed that is limited.
-    "low_temperature": {"temperature": 0.3},
+    "low_temperature": {"temperature": 0.3, "spread": 1.0},
 }

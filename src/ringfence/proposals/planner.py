@@ -204,14 +204,21 @@ class Planner(HadStart, eqx.Module):
         if local:
             visible = jnp.broadcast_to(jnp.repeat(jnp.eye(n, dtype=bool), count, 0), visible.shape)
         judged = None if judged is None else jnp.repeat(judged, copies, 0)
-        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, driver, judged)
+        heat = self.options.temperature * (self.options.spread if count > 1 else 1.0)
+        x = self.sample(jnp.repeat(context, copies, 0), visible.reshape(-1, n), key, heat, driver, judged)
         if not local:
             return x.reshape(b, count, rows, n, d)
         own = x.reshape(b, n, count, rows, n, d)
         return jnp.stack([own[:, i, :, :, i] for i in range(n)], -2)
 
     def sample(
-        self, context: Array, visible: Array, key: Key, driver: Array | None = None, judged: Array | None = None
+        self,
+        context: Array,
+        visible: Array,
+        key: Key,
+        temperature: float,
+        driver: Array | None = None,
+        judged: Array | None = None,
     ) -> Array:
         """Plans (B, rows, N, D) in physical units, given the known rows (B, history + 1, N, D), of drivers (B,), guided
         from the present as a World sees it (B, N, D')."""
@@ -240,7 +247,7 @@ class Planner(HadStart, eqx.Module):
                 clean = self.normaliser.apply(self.agreed(self.normaliser.invert(clean)))
             return made.rest(clean)
 
-        how = (o.sampling_steps, o.sampler, o.temperature)
+        how = (o.sampling_steps, o.sampler, temperature)
         z = diffusion.sample(steered, made.inpaint, (b, rows, n, d), bar, key, *how)
         return self.agreed(self.normaliser.invert(made.plan(z)))
 
