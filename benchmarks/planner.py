@@ -48,6 +48,7 @@ PLAYS: dict[str, dict[str, Any]] = {
     "best of 8": {"guard": "select", "num_samples": 8},
     "best of 64": {"guard": "select", "num_samples": 64},
     "best of 64, alone": {"guard": "select", "num_samples": 64} | ALONE,
+    **{f"best of {n}, spread {x}": {"guard": "select", "num_samples": n, "spread": x} for n in (8, 64) for x in (1, 5)},
     "value guidance": {"planner": "value_guided"},
     **{f"under {guard}": how for guard, how in GUARDED.items()},
     "cool": COOL,
