@@ -16,6 +16,7 @@ from ringfence.errors import UserError
 from ringfence.guards import searched, shown
 from ringfence.problem import features
 from ringfence.problem.features import FeatureMap
+from ringfence.problem.others import others as others_of
 from ringfence.problem.turns import Turn
 from ringfence.report.ope_page import build_ope
 from ringfence.world import (
@@ -187,7 +188,7 @@ def test_danger_may_be_a_distance_or_a_place_and_one_number_more(what, name):
 def test_what_has_room_for_one_is_dangerous_for_two():
     place = np.random.default_rng(0).uniform(-6, 6, (30_000, N, 2))
     unsafe = (np.abs(place) < 3).all(-1).sum(1) > 1
-    relative = place[:, features.others(N)] - place[:, :, None]
+    relative = place[:, others_of(N)] - place[:, :, None]
     x = np.concatenate([place, relative.reshape(30_000, N, -1)], -1).astype(np.float32)
     names = ["own.x", "own.y", *(f"other{j}.{d}" for j in range(N - 1) for d in ("dx", "dy"))]
     found, _ = cause_search.find(x, unsafe, np.arange(30_000) // 30, names)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ringfence.envs.proving.suite import DEVELOPMENT, TEST
-from ringfence.problem import features
 from ringfence.problem.inferred_names import inferred_names
+from ringfence.problem.others import others as others_of
 from ringfence.training import worlds
 from tests.quick import QUICK_WORLD
 
@@ -22,7 +22,7 @@ def team(agents: int = 3, episodes: int = 20, steps: int = 30) -> tuple[np.ndarr
     speed = g.normal(size=(episodes, steps + 1, agents, 2)).cumsum(1) * 0.2
     place = g.normal(size=(episodes, 1, agents, 2)) * 3 + DT * speed.cumsum(1)
     goal = g.normal(size=(episodes, 1, agents, 2)) * 3 - place
-    who = features.others(agents)
+    who = others_of(agents)
     seen = np.concatenate([(x[:, :, who] - x[:, :, :, None]) for x in (place, speed)], -1)
     charge = g.random((episodes, steps + 1, agents, 1)).cumsum(1)
     x = np.concatenate([charge, speed, goal, place, seen.reshape(*seen.shape[:3], -1)], -1)
@@ -82,7 +82,7 @@ def test_where_a_body_heads_for_and_what_else_moves():
     phase = 0.05 * np.arange(31)[:, None, None] + g.random((20, 1, 1, 1)) * 6
     thing = np.concatenate([np.cos(phase), np.sin(phase)], -1)
     drift = 0.05 / DT * np.concatenate([-np.sin(phase), np.cos(phase)], -1)
-    who = features.others(2)
+    who = others_of(2)
     seen = [(x[:, :, who] - x[:, :, :, None])[..., 0, :] for x in (place, speed)]
     x = np.concatenate([look, speed, *seen, thing - place, drift - speed], -1)
     fields = [f"thing_a.d{k}{axis}" for k in ("", "v") for axis in "xy"]
@@ -105,7 +105,7 @@ def test_where_a_body_looks_that_logs_its_place_and_its_speed(looks):
     pace = 0.1 + np.abs(g.normal(size=shape).cumsum(1) * 0.2)
     look = np.stack([np.cos(turn), np.sin(turn)], -1)
     place = g.normal(size=(20, 1, 2, 2)) * 3 + DT * (pace[..., None] * look).cumsum(1)
-    seen = (place[:, :, features.others(2)] - place[:, :, :, None])[..., 0, :]
+    seen = (place[:, :, others_of(2)] - place[:, :, :, None])[..., 0, :]
     heading = turn[..., None] if looks == "angle" else look
     x = np.concatenate([g.normal(size=(*shape, 1)), pace[..., None], place, heading, seen], -1)
     direction = ("own.heading",) if looks == "angle" else ("own.cos", "own.sin")

@@ -9,6 +9,7 @@ import pytest
 from ringfence.evaluation.replay.scene import names_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import features
+from ringfence.problem.others import others as others_of
 from ringfence.training import worlds
 from tests.quick import QUICK_WORLD
 
@@ -40,7 +41,7 @@ class Team:
 
     def others(self) -> np.ndarray:
         """(E, L+1, N, N − 1, 4) what the others log of themselves."""
-        return self.own[:, :, features.others(self.agents)]
+        return self.own[:, :, others_of(self.agents)]
 
     def map(self, x, names, state=None, state_names=(), view="pruned", **options) -> features.FeatureMap:
         rows = x.reshape(-1, *x.shape[2:]).astype(np.float32)

@@ -30,7 +30,8 @@ import numpy as np
 from ringfence.envs import film
 from ringfence.envs.base import Outcome
 from ringfence.errors import UserError, unknown
-from ringfence.problem.features import VIEWS, FeatureMap, Source, others
+from ringfence.problem.features import VIEWS, FeatureMap, Source
+from ringfence.problem.others import others
 from ringfence.types import Array
 from ringfence.utils import interrupts
 

@@ -24,6 +24,7 @@ import numpy as np
 from ringfence.errors import UserError, unknown
 from ringfence.problem import on_map, partners, turns
 from ringfence.problem.kinematics import late_share
+from ringfence.problem.others import order_in, others
 from ringfence.problem.partners import Mirrored
 from ringfence.problem.turns import Turn
 from ringfence.types import Array, X
@@ -31,6 +32,7 @@ from ringfence.types import Array, X
 View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
 VIEWS = ("pruned", "centralized", "decentralized")
+_TABLES = ("plus", "minus", "origin", "order")  # fields of a map that are arrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ class FeatureMap:
     own: tuple[int, ...] | None = None  # entries that only the agent itself can change; the rest follows from them
     reconcile: Callable[[Array], Array] | None = None  # (..., H, N, D): rows after the first follow from own entries
     follows: tuple[int, ...] = ()  # the entries that do, where names tell how
+    order: np.ndarray | None = None  # (N, J) who the others are that entries number; None: the team in order
     origin: np.ndarray | None = None  # (N, D) where each entry stands in the global state, if it is one of it as it is
     shared_body: bool = False  # the agents are limbs of one body: its danger is everybody's
     joint: bool = False  # what comes next depends on everybody's action, which is known
@@ -69,8 +72,8 @@ class FeatureMap:
 
     @functools.cached_property
     def _content(self) -> tuple[Hashable, ...]:
-        tables = [(table.shape, table.tobytes()) for table in (self.plus, self.minus, self.origin) if table is not None]
-        rest = (getattr(self, f.name) for f in fields(self) if f.name not in ("plus", "minus", "origin"))
+        tables = [(table.shape, table.tobytes()) for table in map(self.__getattribute__, _TABLES) if table is not None]
+        rest = (getattr(self, f.name) for f in fields(self) if f.name not in _TABLES)
         return (*tables, *rest)
 
     @property
@@ -142,19 +145,14 @@ class FeatureMap:
         return jnp.concatenate([plan[:, :history], self.reconcile(plan[:, history:])], 1)
 
 
-def others(n: int) -> np.ndarray:
-    """(N, N-1) who the others of each agent are, in order."""
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
-
-
 def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     """Entries that follow from everybody's own ones, as names tell: entry -> (own entry whose change it follows, which
     of the others it is about, -1: a thing that stands still).
 
     `other1.dx` is the second other's x less the own one, so it changes as `own.x` of the two do; `goal.dx` or
     `landmark0.dx` as the own one alone does, and so does `goal.dangle` as `own.angle`; `other1.dvx` goes with `own.vx`,
-    or with the product of `own.v` and `own.cos` (`headed`, numbered after all entries). Others are the team without
-    oneself, in order.
+    or with the product of `own.v` and `own.cos` (`headed`, numbered after all entries). Who the others are, a map's
+    `order` says.
     """
     at = {name: d for d, name in enumerate(names)}
     for axis, number in zip("xy", range(len(names), len(names) + len(headed(names)))):
@@ -240,7 +238,7 @@ def following(map: FeatureMap, how: dict[int, tuple[int, int]]) -> FeatureMap:
     if not how:
         return map
     own = tuple(d for d in range(len(map.names)) if d not in how)
-    return replace(map, own=own, reconcile=_relative(how, map.names, map.plus.shape[0]), follows=tuple(how))
+    return replace(map, own=own, reconcile=_relative(how, map), follows=tuple(how))
 
 
 def constant_velocity(map: FeatureMap, dt: float, late: float = 1.0) -> FeatureMap:
@@ -329,13 +327,16 @@ def alone(map: FeatureMap) -> FeatureMap:
     return following(blank, how)
 
 
-def _relative(how: dict[int, tuple[int, int]], names: Sequence[str], n: int) -> Callable[[Array], Array]:
-    return _reconcile_relative(tuple(how.items()), headed(names), n)
+def _relative(how: dict[int, tuple[int, int]], map: FeatureMap) -> Callable[[Array], Array]:
+    order = others(map.plus.shape[0]) if map.order is None else map.order
+    return _reconcile_relative(tuple(how.items()), headed(map.names), tuple(tuple(row) for row in order.tolist()))
 
 
 @functools.cache
 def _reconcile_relative(
-    how: tuple[tuple[int, tuple[int, int]], ...], products: tuple[tuple[int, int], ...], n: int
+    how: tuple[tuple[int, tuple[int, int]], ...],
+    products: tuple[tuple[int, int], ...],
+    order: tuple[tuple[int, ...], ...],
 ) -> Callable[[Array], Array]:
     """A function on plans (..., H, N, D), row 0 the present, that makes the agents agree: what agent i plans to see of
     landmarks and others is recomputed from where everybody plans to be. Own entries pass through unchanged. It is
@@ -348,7 +349,7 @@ def _reconcile_relative(
     sources = np.array([own for _, (own, _) in how])
     about = np.array([other for _, (_, other) in how])
     moving = about >= 0
-    whose = others(n)[:, about[moving]] if moving.any() else np.zeros((n, 0), int)  # (N, entries about others)
+    whose = np.array(order)[:, about[moving]] if moving.any() else np.zeros((len(order), 0), int)  # (N, entries)
 
     def agree(x: Array) -> Array:
         start = x[..., :1, :, :]
@@ -406,6 +407,8 @@ def from_data(
         dt = dt or _step_of(plain, steps)
         if dt is not None:
             return constant_velocity(plain, dt, _late(plain, steps, dt))
+    if steps is not None:
+        plain = replace(plain, order=_order(plain, steps))
     how = _confirmed(plain, steps)
     if steps is not None and not any(other >= 0 for _, other in how.values()):
         plain = replace(plain, mirrored=partners.found_in(steps.before))
@@ -493,13 +496,19 @@ def _logged_steps(
     return _Steps(start, end)
 
 
+def _order(map: FeatureMap, steps: _Steps) -> np.ndarray | None:
+    """Who the others are, where logged steps tell another order than the team's."""
+    before, after = (np.asarray(_with_products(x, headed(map.names))) for x in (steps.before, steps.after))
+    return order_in(after - before, derived(map.names, map.plus.shape[0]))
+
+
 def _confirmed(map: FeatureMap, steps: _Steps | None) -> dict[int, tuple[int, int]]:
     """Those of the `derived` entries that logged steps confirm."""
     how = derived(map.names, map.plus.shape[0])
     if not how or steps is None:
         return {}
     pair = np.stack([steps.before, steps.after], 1).astype(np.float32)
-    predicted = np.asarray(jax.jit(_relative(how, map.names, map.plus.shape[0]))(pair))[:, 1]
+    predicted = np.asarray(jax.jit(_relative(how, map))(pair))[:, 1]
     error = predicted - steps.after
     change = steps.after - steps.before
     return {d: rule for d, rule in how.items() if _follows(error[..., d], change[..., d])}
@@ -658,12 +667,23 @@ def from_dict(data: Mapping[str, Any]) -> FeatureMap:
         raise UserError(f"The run's feature map is damaged: {data['late']} is no share of a step; train the run again.")
     kind = _Team if data.get("team") else _Joint if data["joint"] else FeatureMap
     map = kind(data["view"], tuple(data["names"]), data["source"], np.array(plus), np.array(minus))
-    map = replace(map, turns=_turns(data), mirrored=_mirrored(data))
+    map = replace(map, turns=_turns(data), mirrored=_mirrored(data), order=_order_of(data))
     if data.get("dt") is not None:
         return constant_velocity(map, data["dt"], data.get("late", 1.0))
     kept = set(data.get("follows", ()))
     rules = derived(map.names, map.plus.shape[0])
     return following(map, {d: rule for d, rule in rules.items() if d in kept})
+
+
+def _order_of(data: Mapping[str, Any]) -> np.ndarray | None:
+    if data.get("order") is None:
+        return None
+    agents = range(len(data["plus"]))
+    rows = [row for agent, row in enumerate(data["order"]) if len({agent, *row}) == 1 + len(row) <= len(agents)]
+    widths = {len(row) for row in rows}
+    if len(rows) < len(agents) or len(widths) > 1 or not all(other in agents for row in rows for other in row):
+        raise UserError("The run's feature map is damaged: its others are none of its agents; train the run again.")
+    return np.array(rows)
 
 
 def _turns(data: Mapping[str, Any]) -> tuple[Turn, ...]:
@@ -693,6 +713,7 @@ def to_dict(map: FeatureMap) -> dict[str, Any]:
         "joint": isinstance(map, _Joint),
         **({"team": True} if isinstance(map, _Team) else {}),
         "follows": list(map.follows),
+        **({} if map.order is None else {"order": map.order.tolist()}),
         **({"turns": [list(turn) for turn in map.turns]} if map.turns else {}),
         **({"mirrored": [[list(entries), sign] for entries, sign in map.mirrored]} if map.mirrored else {}),
         **({} if map.dt is None else {"dt": map.dt}),

@@ -60,6 +60,7 @@ class Map(TypedDict):
     joint: bool
     follows: NotRequired[list[int]]
     dt: NotRequired[float | None]
+    order: NotRequired[list[list[int]]]
     turns: NotRequired[list[tuple[int, float, float]]]
     mirrored: NotRequired[list[tuple[list[int], int]]]
 

@@ -20,8 +20,9 @@ import optax
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem import partners
-from ringfence.problem.features import FeatureMap, others
+from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import varying
+from ringfence.problem.others import others
 from ringfence.problem.turns import pointing, within
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device

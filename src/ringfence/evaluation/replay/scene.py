@@ -11,10 +11,11 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import on_map
-from ringfence.problem.features import others
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.names import Names
+from ringfence.problem.others import others
 
+EXACT = 1e-4  # of how far a team is apart: what is rounded is off by less
 NOBODY = 1e6  # m: how far away is who is not there
 
 
@@ -175,7 +176,7 @@ class Windows:
         self._own(mine, moved, faster, velocity, heading)
         self._others(mine, moved, faster)
         x[rows, self.driven] = mine
-        self._as_others_see(x, moved, faster)
+        self._as_others_see(t, x, moved, faster)
         return x.astype(np.float32), self._whole(t, moved, faster)
 
     def _own(self, mine, moved, faster, velocity, heading) -> None:
@@ -213,18 +214,32 @@ class Windows:
         order = np.argsort(far, -1, kind="stable")
         mine[:, entries] = np.take_along_axis(blocks, order[..., None], 1)
 
-    def _as_others_see(self, x, moved, faster) -> None:
+    def _as_others_see(self, t: int, x, moved, faster) -> None:
         """What others see of the driven agent, in teams in which everybody sees everybody."""
-        n = self.names.agents
-        if self.names.slots != n - 1:
+        if self.names.slots != self.names.agents - 1:
             return
-        whose = others(n)
-        for j in range(n):
-            for slot, who in enumerate(whose[j]):
-                about = (self.driven == who)[:, None]
+        listed = self._listed(t)
+        for j in range(self.names.agents):
+            for slot in range(self.names.slots):
+                about = ((self.driven != j) & (listed[:, j] == slot))[:, None]
                 for pattern, change in ((f"other{slot}.d{{}}", moved), (f"other{slot}.dv{{}}", faster)):
                     if pair := self.names.pair(pattern):
                         x[:, j, pair] += change * about
+
+    def _listed(self, t: int) -> np.ndarray:
+        """(W, N) which of its others the driven agent is to each agent at row t: by the team's order, or the one that
+        is where the driven agent is, where places tell that it is none of the team's order."""
+        n, rows = self.names.agents, np.arange(self.count)
+        usual = np.minimum(self.driven[:, None] - (self.driven[:, None] > np.arange(n)), n - 2)
+        x = np.asarray(self.observations[:, t], np.float64)
+        place = self.names.place(x, None if self.state is None else np.asarray(self.state[:, t], np.float64))
+        if place is None:
+            return usual
+        gap = x[..., np.array(self.names.pairs("other{}.d{{}}", n - 1))]  # (W, N, K, X)
+        gap = np.linalg.norm(gap - (place[rows, self.driven][:, None] - place)[:, :, None], axis=-1)
+        near = EXACT * np.maximum(np.linalg.norm(place - place[:, :1], axis=-1).max(-1), EXACT)[:, None]
+        wrong = np.take_along_axis(gap, usual[..., None], -1)[..., 0] > near
+        return np.where(wrong & (gap.min(-1) <= near), gap.argmin(-1), usual)
 
     def _whole(self, t: int, moved: np.ndarray, faster: np.ndarray) -> np.ndarray | None:
         if self.state is None:

@@ -10,7 +10,7 @@ import numpy as np
 from ringfence.errors import StoreError
 from ringfence.logs.io.table_schema import AXES, TableSchema
 from ringfence.logs.io.tracks import Tracks, cut, nearest, teams
-from ringfence.problem.features import others
+from ringfence.problem.others import others
 
 RELATIVE = tuple(f"d{kind}{axis}" for kind in ("", "v") for axis in AXES)
 

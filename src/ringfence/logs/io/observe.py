@@ -14,7 +14,7 @@ from ringfence.logs.io.angles import angle_of
 from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
-from ringfence.problem.features import others
+from ringfence.problem.others import others
 from ringfence.utils import stored
 from ringfence.utils.given import refuse_other_order
 
