@@ -100,7 +100,7 @@ class Way:
     other: Callable[[World], World] = lambda world: world  # what is put in the place of a part
 
 
-ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"rows": k}) for k in (1, 3, 5, 7)}
+ROWS = {f"{k} row{'s' * (k > 1)} foreseen": Way({"horizon": k}) for k in (1, 3, 5, 7)}
 MEMBERS = {f"an ensemble of {k}": Way(world={"num_ensemble": k}) for k in (1, 5)}
 RETAIN = {"condition (3), not a margin": Way({"condition": "retain"})}
 FORMULA = {"danger by the true formula": Way({"barrier": "analytic"})}
@@ -119,8 +119,8 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **MEMBERS,
         **FORMULA,
         **TRUE,
-        **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
-        **{f"{k} steps of climbing": Way({"refine": k}) for k in (5, 10, 40)},
+        **{f"climbed from {k} starts": Way({"num_restarts": k}) for k in (4, 16)},
+        **{f"{k} steps of climbing": Way({"optimizer_steps": k}) for k in (5, 10, 40)},
         "no shield after it": Way({"correction_steps": 0, "adapt": 0.0}),
     },
     ("crossing-hasty", "bc", "shield"): {
@@ -141,7 +141,7 @@ STUDIES: dict[tuple[str, str, str], dict[str, Way]] = {
         **ROWS,
         **MEMBERS,
         **FORMULA,
-        **{f"climbed from {k} starts": Way({"starts": k}) for k in (4, 16)},
+        **{f"climbed from {k} starts": Way({"num_restarts": k}) for k in (4, 16)},
         "climbing anywhere": Way({"trust_radius": 2.0}),
     },
 }

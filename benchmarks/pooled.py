@@ -10,11 +10,9 @@ each row says its own. tables.py writes the page.
 import argparse
 import json
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from common import command, machine
 
@@ -26,10 +24,8 @@ from ringfence.datasets.task import Task
 from ringfence.envs import SafeMuJoCo
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.statistics import mean_of_runs
-from ringfence.loading import run_worlds
-from ringfence.loading.resolve import load_job
 from ringfence.logs.store import EpisodeStore
-from ringfence.training import loop, worlds
+from ringfence.training import worlds
 from ringfence.training.runs import Run
 
 RESULTS = Path(__file__).resolve().parent.parent / "results" / "pooled"
@@ -100,51 +96,6 @@ UNTOLD = {
 }
 # Rows that are compared with another of the same runs, on the same resets.
 PAIRED = {"flow, guided by danger": "flow"} | {f"flow, {n} steps, guided by danger": f"flow, {n} steps" for n in (2, 8)}
-
-
-@dataclass(frozen=True)
-class Drivers:
-    """What a run found in the first episodes of a log whose card says whose they are."""
-
-    store: EpisodeStore  # those episodes
-    clones: np.ndarray  # (T, C, N·A) what each driver's clone does at every step
-    found: np.ndarray  # (E,) driver of every episode
-    counts: np.ndarray  # (C, L) episodes of each driver and learner
-
-    @property
-    def purity(self) -> float:
-        """Share of episodes whose driver is mostly their learner."""
-        return round(float(self.counts.max(1).sum() / self.store.episodes), 4)
-
-
-def drivers_of(run: Run, store: EpisodeStore, episodes: int = 2000) -> Drivers | None:
-    """None of a run that looks for no drivers, or of a log that does not say whose its episodes are."""
-    if run.config["config"].get("drivers", 0) == 0 or store.card.extra.get("driver_of_episode") != TURNS:
-        return None
-    job = load_job(run)
-    a = job.algorithm
-    read = {"world": run_worlds.of_run(run)} if job.reads_world else {}
-    about = (job.spec, job.config, None, job.feature_map, job.hazard)
-    blank = lambda: loop.learned(a.init(jax.random.key(0), *about, **read))  # noqa: E731
-    _, state = run.load_checkpoint(jax.eval_shape(blank))
-    some = store.select(np.arange(store.episodes) < episodes)
-    row = np.arange(some.steps) + some.episode_of_step
-    x = job.feature_map(some.observations[row], some.state[row])
-    actions = some.actions.reshape(some.steps, 1, -1)
-    clones = state["ema"]["clones"](state["frozen"]["normaliser"].state(x).reshape(some.steps, -1))
-    clones = np.asarray(clones).reshape(some.steps, -1, actions.shape[-1])
-    errors = ((clones - actions) ** 2).sum(-1)
-    found = np.add.reduceat(errors, np.concatenate([[0], some.episode_ends[:-1]])).argmin(1)
-    learners = len(some.card.extra["drivers"])
-    learner = np.arange(some.episodes) % learners
-    counts = np.array([np.bincount(learner[found == c], minlength=learners) for c in range(errors.shape[-1])])
-    return Drivers(some, clones, found, counts)
-
-
-def purity(run: Run, store: EpisodeStore) -> float | None:
-    """Of the drivers that a run found, where that can be said."""
-    drivers = drivers_of(run, store)
-    return None if drivers is None else drivers.purity
 
 
 def milliseconds(run: Run, store: EpisodeStore, options: dict) -> float:
@@ -242,7 +193,6 @@ def row(name: str, store: EpisodeStore, task: Task, runs: Path, seeds: int) -> d
         "cost_interval": [round(x, 4) for x in mean_of_runs(per_episode(results, "cost"), least=0.0)],
         **few(results),
         **paired,
-        "drivers_purity": purity(trained[0], store),
         "milliseconds": milliseconds(trained[0], store, given),
         "command": command(),
         "machine": machine(),

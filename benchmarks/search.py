@@ -24,27 +24,12 @@ import json
 import tempfile
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 
-from common import append, finished, read
+from common import RESULTS, append, finished, read
 
-ROOT = Path(__file__).resolve().parent.parent / "results" / "tuning"
 SEED = 100
-FIELDS = (
-    "algorithm",
-    "preset",
-    "setting",
-    "changes",
-    "task",
-    "seed",
-    "split",
-    "episodes",
-    "return",
-    "return_norm",
-    "cost",
-    "cost_safe_start",
-    "train_seconds",
-)
+FIELDS = tuple("algorithm preset setting changes task seed split episodes return return_norm cost".split())
+FIELDS += ("cost_safe_start", "train_seconds")
 SAFE = ("bc-safe", "ma-td3bc-lag", "fisor", "icbf")
 
 
@@ -187,21 +172,9 @@ def one(job: tuple) -> dict:
         )
         seconds = time.perf_counter() - begun
         r = evaluate(run, episodes=study.episodes, split="validation", planner=played, **guard)
-    return {
-        "algorithm": algorithm,
-        "preset": preset,
-        "setting": number,
-        "changes": json.dumps(changes),
-        "task": study.name,
-        "seed": SEED,
-        "split": r["split"],
-        "episodes": r["episodes"],
-        "return": round(r["return_mean"], 2),
-        "return_norm": round(r["return_norm"], 4),
-        "cost": round(r["cost_mean"], 4),
-        "cost_safe_start": round(r["cost_safe_start"], 4),
-        "train_seconds": round(seconds, 1),
-    }
+    told = (algorithm, preset, number, json.dumps(changes), study.name, SEED, r["split"], r["episodes"])
+    numbers = (round(r["return_mean"], 2), *(round(r[k], 4) for k in ("return_norm", "cost_mean", "cost_safe_start")))
+    return dict(zip(FIELDS, (*told, *numbers, round(seconds, 1))))
 
 
 def ranked(study: Study, rows: list[dict]) -> dict[tuple, list[dict]]:
@@ -226,7 +199,7 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true")
     a = parser.parse_args()
     study = STUDIES[a.study]
-    out = ROOT / study.file
+    out = RESULTS / "tuning" / study.file
     done = {(r["algorithm"], r["preset"], int(r["setting"]), r["task"]) for r in read(out)}
     if not a.summary:
         jobs = [
@@ -238,7 +211,6 @@ def main() -> None:
         ]
         for row in finished(one, jobs):
             append(out, row, FIELDS)
-            print(*(f"{k}={row[k]}" for k in FIELDS[:5] + FIELDS[8:]), flush=True)
     for (name, preset), rows in ranked(study, read(out)).items():
         print(f"\n{name} {preset}")
         for r in rows:

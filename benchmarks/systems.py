@@ -101,6 +101,21 @@ def placed(s: Moment) -> None:
             return
 
 
+def and_at_random(
+    apart: bool = True, **what: tuple[float | tuple[float, ...], tuple[int, ...]]
+) -> Callable[[Moment], None]:
+    """Likewise, and then what else there is, in a box of that half width: (width, shape), in this order."""
+
+    def begin(s: Moment) -> None:
+        if apart:
+            placed(s)
+        for name, (width, shape) in what.items():
+            setattr(s, name, s.rng.uniform(-np.array(width), width, shape))
+        s.v = np.zeros_like(s.p)
+
+    return begin
+
+
 def pushed(s: Moment, actions: Array) -> float:
     k = s.kind
     before = length(s.goal - s.p)
@@ -435,11 +450,6 @@ def before_walkway(k: Kind, seen: Array) -> Array:
     return walkway(x, y) | walkway(x + 0.5 * vx, y + 0.5 * vy)
 
 
-def persons_begin(s: Moment) -> None:
-    placed(s)
-    s.persons = s.rng.uniform(-4, 4, (3, 2))
-
-
 def people_begin(s: Moment) -> None:
     placed(s)
     angle = s.rng.uniform(0, 2 * np.pi, 2)
@@ -454,11 +464,6 @@ def people_move(s: Moment, actions: Array) -> float:
     return pushed(s, actions)
 
 
-def posts_begin(s: Moment) -> None:
-    placed(s)
-    s.posts = s.rng.uniform(-3, 3, (2, 2))
-
-
 def crowd_careful(k: Kind, seen: Array, care: float) -> Array:
     """Away from the middle of the two nearest, where the second is near."""
     offset = offsets(k, seen)
@@ -466,11 +471,6 @@ def crowd_careful(k: Kind, seen: Array, care: float) -> Array:
     two = np.take_along_axis(offset, np.argsort(far, 1)[:, :2, None], 1).mean(1)
     crowded = np.sort(far, 1)[:, 1:2] < 1.0 + 0.5
     return k.naive(seen) - care * np.where(crowded, 2.5 * two / np.maximum(length(two)[:, None], 0.1), 0)
-
-
-def boats_begin(s: Moment) -> None:
-    placed(s)
-    s.p = s.rng.uniform(-1.5, 1.5, (4, 2))
 
 
 def junction_begin(s: Moment) -> None:
@@ -519,12 +519,6 @@ def rays_careful(k: Kind, seen: Array, care: float) -> Array:
     return k.naive(seen) - care * weight @ RAYS
 
 
-def hall_begin(s: Moment) -> None:
-    room = np.array(s.kind.room)
-    s.p, s.goal = s.rng.uniform(-room, s.kind.room, (2, 4, 3))
-    s.v = np.zeros((4, 3))
-
-
 def hall_careful(k: Kind, seen: Array, care: float) -> Array:
     """Aside, from whom it is over or under."""
     offset = offsets(k, seen)
@@ -534,11 +528,6 @@ def hall_careful(k: Kind, seen: Array, care: float) -> Array:
     action = k.naive(seen)
     action[:, :2] += care * np.where(near, away, 0.0).sum(1)
     return action
-
-
-def swarm_begin(s: Moment) -> None:
-    s.p, s.goal = s.rng.uniform(-1.5, 1.5, (5, 3)), s.rng.uniform(-3.0, 3.0, (5, 3))
-    s.v = np.zeros((5, 3))
 
 
 def with_things(things: Callable[[Moment], Array]) -> Callable[[Moment], list[Array]]:
@@ -620,7 +609,7 @@ SHAPED = (
         slower(near_thing(slice(6, 12), (3, 2), 1.3 + 0.5), 0.3, 1.1, 1.4),
         entries(" ".join(entries("x y vx vy target_dx target_dy", "person", 3, "dx dy")), "truck", 2, MOVES),
         with_things(lambda s: (s.persons[None] - s.p[:, None]).reshape(s.kind.n, -1)),
-        persons_begin,
+        and_at_random(persons=(4.0, (3, 2))),
         body=Body(n=3, noise=(0.9, 0.25), push=2.0, fastest=1.6),
     ),
     Kind(
@@ -639,7 +628,7 @@ SHAPED = (
         spring,
         towards(0, 1.5),
         entries("x y vx vy waypoint_dx waypoint_dy", "boat", 3, MOVES),
-        begin=boats_begin,
+        begin=and_at_random(p=(1.5, (4, 2))),
         body=Body(fastest=1.2),
     ),
     Kind(
@@ -687,7 +676,7 @@ SHAPED = (
         spring,
         hall_careful,
         entries("x y z vx vy vz goal_x goal_y goal_z", "drone", 3, "rel_x rel_y rel_z rel_vx rel_vy rel_vz"),
-        begin=hall_begin,
+        begin=and_at_random(False, p=((3.0, 3.0, 1.5), (4, 3)), goal=((3.0, 3.0, 1.5), (4, 3))),
         body=Body(actions=3, push=2.0, room=(3.0, 3.0, 1.5)),
     ),
     Kind(
@@ -709,7 +698,7 @@ SHAPED = (
         spring,
         towards(1, 2.0),
         [f"obs{d}" for d in range(9 + 4 * 6)],
-        begin=swarm_begin,
+        begin=and_at_random(False, p=(1.5, (5, 3)), goal=(3.0, (5, 3))),
         body=Body(n=5, actions=3, fastest=1.0),
     ),
 )
@@ -800,7 +789,7 @@ MAPPED = (
         takes_care=aside((2, 2)),
         names=entries(PLACED, "post", 2, "x y"),
         seen=on_map(lambda s: np.repeat(s.posts.reshape(1, -1), s.kind.n, 0)),
-        begin=posts_begin,
+        begin=and_at_random(posts=(3.0, (2, 2))),
     ),
     replace(
         _MAPPED,
