@@ -24,7 +24,7 @@ from scipy.stats import fisher_exact, spearmanr
 
 from ringfence.datasets.registry import TASKS
 from ringfence.evaluation.statistics import mean_of_runs
-from ringfence.report import board, standings
+from ringfence.report import board
 
 Check = Callable[[], tuple[bool, str]]  # whether it holds, and what was found
 LEARNER, FIVE = "simple_spread-expert", "simple_spread-expert-pooled"  # one learner's logs, five learners'
@@ -132,7 +132,7 @@ def shielded_all() -> tuple[bool, str]:
 
 def limits(suite: str, algorithm: str, variant: str) -> int:
     """Tasks on which the upper end of the cost's interval is within the limit."""
-    shown = standings.standings(board.read(RESULTS / suite)).values()
+    shown = board.read(RESULTS / suite).lines.values()
     wanted = (algorithm, variant)
     return sum(r.safe for rows in shown for r in rows if (r.method.algorithm, r.method.variant) == wanted)
 

@@ -273,13 +273,13 @@ def of_archives(place: Path, times: int) -> Iterator[Case]:
 
 def of_words(place: Path, times: int) -> Iterator[Case]:
     """Words of results that a page shows, and that commands to copy are made of."""
-    from ringfence.report import build_report, made
+    from ringfence.report import build_report, provenance
 
     folder = corpus.one_cell(place / "words")
     run = Run(next((folder / "cells" / TASK / "bc").iterdir()))
 
     def commands(run: Run) -> list[str]:
-        return [line for section in sections([run]) for line in made.commands(section, place / "r.html")]
+        return [line for section in sections([run]) for line in provenance.commands(section, place / "r.html")]
 
     words = random.Random(times).sample(strange.WORDS, 8 * times)
     yield from strange.words_of_results(run, lambda run, out: build_report([run], out), commands, words)

@@ -25,7 +25,7 @@ from evidence import proven
 from ringfence import algos
 from ringfence.bench import paper, unpack
 from ringfence.datasets import registry
-from ringfence.report import board, standings
+from ringfence.report import board
 from ringfence.utils.config import build_config
 
 SEEDS = 5  # fewer are said in the cell
@@ -231,7 +231,7 @@ def _spread_cell(rows: list[dict]) -> str:
 
 def _robots_cell(suite: str, algorithm: str, variant: str) -> str:
     wanted = algorithm, f"default{variant}" if variant.startswith("+") else variant or "default"
-    shown = standings.standings(board.read(RESULTS / suite)).values()
+    shown = board.read(RESULTS / suite).lines.values()
     found = [r for rows in shown for r in rows if (r.method.algorithm, r.method.variant) == wanted]
     kept, seeds = sum(r.safe for r in found), min(len(r.seeds) for r in found)
     return f"{kept} of {len(found)}, {np.mean([r.returns_norm for r in found]):.2f}" + _seeds(seeds)

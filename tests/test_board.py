@@ -19,11 +19,12 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation import protocol
 from ringfence.report import board_csv, board_latex, board_markdown, board_markdown_short, build_board, export_board
-from ringfence.report.board import Method, read
+from ringfence.report.board import read
 from ringfence.report.board_page import published, rankings
 from ringfence.report.headline import danger
 from ringfence.report.published import PUBLISHED, matches
-from ringfence.report.standings import aggregate, aggregates, contests, references, standings
+from ringfence.report.standings import aggregate, aggregates, contests
+from ringfence.report.table import Method
 from ringfence.utils.escape import latex, markdown, shell, spreadsheet, terminal
 
 EXPERT, MEDIUM = "simple_spread-expert", "simple_spread-medium"
@@ -62,7 +63,8 @@ def cell(root: Path, results: dict | None, algorithm="bc", preset="default", see
     }
     write(path / "config.json", config)
     if results is not None:
-        write(path / "results.json", results)
+        specs = {name: name.removeprefix(preset).removeprefix("+").split("@")[0] or "default" for name in results}
+        write(path / "results.json", {name: {"spec": specs[name], **result} for name, result in results.items()})
         write(path / "env.json", {"python": "3.11"})
     return path
 
@@ -84,12 +86,17 @@ def folder(tmp_path) -> Path:
         cell(root, {"default": summary([250] * 4, [0, 0, 0, 0], MEDIUM)}, seed=seed, task=MEDIUM)
     data = summary([530] * 4, [4, 4, 3, 3], split="data", episodes=40)
     del data["per_episode"]
-    write(root / "reference" / f"{EXPERT}.json", {"behaviour data": data, "do nothing": summary([180] * 4, [0] * 4)})
+    write(root / "reference" / EXPERT / "reference.json", {"behaviour data": data, "do nothing": summary([180] * 4, [0] * 4)})
     return root
 
 
+def entries(board) -> list:
+    """Every evaluation of a board."""
+    return [row for lines in board.lines.values() for line in lines for row in line.rows]
+
+
 def row(folder: Path, label: str, task: str = EXPERT):
-    return next(r for r in standings(read(folder))[task] if r.label == label)
+    return next(r for r in read(folder).lines[task] if r.label == label)
 
 
 # --- reading ---
@@ -99,11 +106,11 @@ def test_rows_are_read_with_their_folders(folder):
     board = read(folder)
     assert (board.suite, board.episodes, board.split, board.protocol) == ("simple_spread", 4, "test", 1)
     assert board.tasks == [EXPERT, MEDIUM] and board.seeds == (0, 1)
-    assert len(board.entries) == 6  # BC 2 + 2, ICBF two variants
-    guarded = next(e for e in board.entries if e.variant == "default+guarded")
+    assert len(entries(board)) == 6  # BC 2 + 2, ICBF two variants
+    guarded = next(e for e in entries(board) if e.variant == "default+guarded")
     assert (guarded.task, guarded.algorithm, guarded.seed) == (EXPERT, "icbf", 0)
-    assert guarded.path == folder / "cells" / EXPERT / "icbf" / "seed-0-a1"
-    assert guarded.summary["return_mean"] == 410.0
+    assert guarded.file == folder / "cells" / EXPERT / "icbf" / "seed-0-a1" / "results.json"
+    assert guarded.result["return_mean"] == 410.0
 
 
 def test_cells_without_results_are_named_with_the_reason(folder):
@@ -137,7 +144,7 @@ def test_a_cell_that_failed_after_an_evaluation_keeps_its_row_and_is_named(folde
     assert ("icbf", 0, "not every evaluation is there, one failed: KeyError: 'x'") in {
         (m.job, m.seed, m.why) for m in board.missing
     }
-    assert len(board.entries) == 6
+    assert len(entries(board)) == 6
 
 
 def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
@@ -146,11 +153,11 @@ def test_the_preset_of_the_tier_is_the_default_of_its_task(folder):
         for seed in (0, 1):
             cell(folder, results, "omar", preset, seed, task)
     board = read(folder)
-    labels = {e.method.label for e in board.entries if e.algorithm == "omar"}
+    labels = {m.label for m in board.methods if m.algorithm == "omar"}
     assert labels == {"OMAR", "OMAR num_samples8"}
     assert {m.label for m in aggregate(board).methods} == {"BC"} | labels
     assert not [m for m in board.missing if "omar" in m.job]
-    assert {e.variant for e in board.entries if e.algorithm == "omar" and e.task == EXPERT} == {
+    assert {e.name for e in entries(board) if e.algorithm == "omar" and e.task == EXPERT} == {
         "expert",
         "expert+num_samples8",
     }
@@ -164,11 +171,11 @@ def test_fields_younger_than_a_run_do_not_set_it_apart(folder):
     assert [m.label for m in read(folder).methods if m.algorithm == "bc"] == ["BC"]
 
 
-def test_references_lie_in_a_file_or_in_a_folder_of_the_task(folder):
+def test_references_lie_in_a_folder_of_the_task(folder):
     write(folder / "reference" / MEDIUM / "reference.json", {"do nothing": summary([170] * 4, [0] * 4, MEDIUM)})
-    found = references(read(folder))
-    assert [r.name for r in found[EXPERT]] == ["behaviour data", "do nothing"]
-    assert [r.returns for r in found[MEDIUM]] == [170.0]
+    found = read(folder).sections
+    assert [r.name for r in found[EXPERT].references] == ["behaviour data", "do nothing"]
+    assert [r.returns for r in found[MEDIUM].references] == [170.0]
 
 
 def test_settings_that_differ_between_tasks_are_one_method_within_a_task_two(folder):
@@ -177,16 +184,15 @@ def test_settings_that_differ_between_tasks_are_one_method_within_a_task_two(fol
     assert [m.label for m in read(folder).methods if m.algorithm == "omar"] == ["OMAR"]
     cell(folder, {"default": summary([2] * 4, [0] * 4)}, "omar", mark="b2", alpha=2.0)
     assert {m.label for m in read(folder).methods if m.algorithm == "omar"} == {"OMAR [alpha=1.0]", "OMAR [alpha=2.0]"}
-    assert {e.method.apart for e in read(folder).entries if e.task == MEDIUM and e.algorithm == "omar"} == {
-        "[alpha=2.0]"
-    }
+    medium = [line.method for line in read(folder).lines[MEDIUM]]
+    assert {m.apart for m in medium if m.algorithm == "omar"} == {"[alpha=2.0]"}
 
 
 ODD = {
-    "protocol": ({"protocol": 2}, "protocol 2.*bench.json' declares 1"),
-    "split": ({"split": "validation"}, "split validation.*bench.json.*declares test"),
+    "protocol": ({"protocol": 2}, "protocol 2.*bench.json' has 1"),
+    "split": ({"split": "validation"}, "split validation.*bench.json.*has test"),
     "task": ({"task": MEDIUM}, "of task 'simple_spread-medium'"),
-    "old version": ({"per_episode": None}, "per_episode"),
+    "another version": ({"per_episode": None}, "per_episode"),
 }
 
 
@@ -200,7 +206,7 @@ def test_results_that_do_not_belong_are_refused_with_their_file(folder, change, 
 
 def test_another_number_of_episodes_is_refused(folder):
     cell(folder, {"default": summary([1] * 5, [0] * 5, unsafe=[0] * 5)}, "omar")
-    with pytest.raises(UserError, match="omar/seed-0-a1/results.json.*episodes 5.*bench.json' declares 4"):
+    with pytest.raises(UserError, match="omar/seed-0-a1/results.json.*episodes 5.*bench.json' has 4"):
         build_board(folder, folder / "page.html")
     assert not (folder / "page.html").exists()
 
@@ -209,14 +215,14 @@ def test_other_constants_are_refused_and_both_files_named(folder):
     odd = summary([1] * 4, [0] * 4)
     odd["constants"] = odd["constants"] | {"cost_limit": 2.0}
     cell(folder, {"default": odd}, "omar")
-    with pytest.raises(UserError, match=r"omar/seed-0-a1/results\.json.*normalised.*bc/seed-0-a1/results\.json"):
+    with pytest.raises(UserError, match=r"omar/seed-0-a1/results\.json.*constants.*bc/seed-0-a1/results\.json"):
         read(folder)
 
 
 def test_reference_rows_are_held_to_the_same_rules(folder):
-    file = folder / "reference" / f"{EXPERT}.json"
+    file = folder / "reference" / EXPERT / "reference.json"
     write(file, {"do nothing": summary([1] * 4, [0] * 4, protocol=3)})
-    with pytest.raises(UserError, match="reference/simple_spread-expert.json' row 'do nothing'.*protocol 3"):
+    with pytest.raises(UserError, match="reference/simple_spread-expert/reference.json' row 'do nothing'.*protocol 3"):
         read(folder)
     write(file, {"do nothing": summary([1] * 4, [0] * 4, split="validation")})
     with pytest.raises(UserError, match="row 'do nothing'.*split validation"):
@@ -261,7 +267,7 @@ def test_a_folder_of_validation_results_is_refused(tmp_path):
 
 def test_the_same_cell_twice_a_moved_cell_and_other_data_are_refused(folder):
     copied = cell(folder, {"default": summary([1] * 4, [0] * 4)}, mark="b2")
-    with pytest.raises(UserError, match="seed-0-a1' and .*seed-0-b2' are the same cell"):
+    with pytest.raises(UserError, match="seed-0-a1' and .*seed-0-b2' are the same job with the same seed 0"):
         read(folder)
     config = json.loads((copied / "config.json").read_text())
     write(copied / "config.json", config | {"seed": 5})
@@ -292,7 +298,7 @@ def test_numbers_of_a_row_by_hand(folder):
 
 
 def test_ranks_are_lexicographic(folder):
-    rows = standings(read(folder))[EXPERT]
+    rows = read(folder).lines[EXPERT]
     # guarded alone is within the limit; plain costs 2 and BC 2.5, although BC earns more
     assert [(r.label, r.rank, r.safe, r.best) for r in rows] == [
         ("ICBF-Diffuser guarded", 1, True, True),
@@ -300,13 +306,13 @@ def test_ranks_are_lexicographic(folder):
         ("BC", 3, False, False),
     ]
     cell(folder, {"default": summary([405] * 4, [0] * 4)}, "omar")
-    rows = standings(read(folder))[EXPERT]
+    rows = read(folder).lines[EXPERT]
     assert [(r.label, r.rank) for r in rows[:2]] == [("ICBF-Diffuser guarded", 1), ("OMAR", 2)]
 
 
 def test_equal_methods_share_a_place(folder):
     cell(folder, {"default": summary([400, 420, 410, 410], [0, 0, 0, 1])}, "omar")
-    rows = standings(read(folder))[EXPERT]
+    rows = read(folder).lines[EXPERT]
     assert [(r.label, r.rank, r.best) for r in rows] == [
         ("OMAR", 1, True),
         ("ICBF-Diffuser guarded", 1, True),
@@ -319,7 +325,7 @@ def test_settings_chosen_on_validation_stay_off_the_table(folder):
     path = folder / "cells" / EXPERT / "bc" / "seed-0-a1" / "results.json"
     results = json.loads(path.read_text())
     write(path, results | {"default@validation": summary([999] * 4, [0] * 4, split="validation")})
-    assert len(read(folder).entries) == 6 and row(folder, "BC").returns == 310.0
+    assert len(entries(read(folder))) == 6 and row(folder, "BC").returns == 310.0
 
 
 def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(tmp_path):
@@ -330,7 +336,7 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
         cell(root, {"mujoco": summary([300] * 4, [3] * 4, task)}, preset="mujoco", task=task)
     cell(root, {"mujoco": summary([400] * 4, [0] * 4, names[0])}, "icbf", preset="mujoco", task=names[0])
     board = read(root)
-    first, second = rankings(board, standings(board))
+    first, second = rankings(board)
     assert [(r.name, r.mean) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
     assert second.tasks == names[2:] and [r.name for r in second.rows] == ["BC"]  # who has no result has no row
     native, quantile = aggregates(board)
@@ -360,7 +366,7 @@ def test_falls_are_shown(folder, tmp_path):
 def test_nobody_within_the_limit_means_no_best(folder):
     path = folder / "cells" / EXPERT / "icbf" / "seed-0-a1" / "results.json"
     write(path, {"default": summary([900] * 4, [2] * 4)})
-    assert not any(r.best for r in standings(read(folder))[EXPERT])
+    assert not any(r.best for r in read(folder).lines[EXPERT])
     assert (
         "★"
         not in build_board(folder, folder / "p.html")
@@ -371,7 +377,7 @@ def test_nobody_within_the_limit_means_no_best(folder):
 
 
 def test_references_keep_their_own_numbers(folder):
-    data, idle = references(read(folder))[EXPERT]
+    data, idle = read(folder).sections[EXPERT].references
     assert (data.name, data.returns, data.episodes, data.reference) == ("behaviour data", 530.0, 40, True)
     assert idle.cost == 0.0 and idle.rank == 0 and idle.seeds == ()
 
@@ -401,14 +407,14 @@ def test_aggregate_takes_methods_with_every_task(folder):
 
 
 def test_the_first_is_tested_against_the_rest_on_the_same_resets(folder):
-    against = {c.other.label: c for c in contests(standings(read(folder))[EXPERT])}
+    against = {c.other.label: c for c in contests(read(folder).lines[EXPERT])}
     assert list(against) == ["ICBF-Diffuser", "BC"]  # the first is ICBF-Diffuser guarded
     assert against["BC"].returns == 100.0 and against["BC"].cost == 0.25 - 2.5
     assert against["BC"].cost_interval[0] <= -2.25 <= against["BC"].cost_interval[1]
     # 400 420 410 410 against 310 each: four differences of one sign have p = 2/2^4 or, with ties, nearly so; the
     # smallest of four tests counts four times
     assert 0.2 <= against["BC"].returns_p <= 1.0
-    assert contests(standings(read(folder))[MEDIUM]) == []
+    assert contests(read(folder).lines[MEDIUM]) == []
 
 
 def test_probability_of_improvement_has_the_row_ahead(folder):
@@ -517,7 +523,7 @@ def test_ranking_puts_methods_with_every_task_first(folder, tmp_path):
 
 def test_published_values_stand_beside_ours_and_apart(folder, tmp_path):
     board = read(folder)
-    table = published(board, standings(board))
+    table = published(board)
     assert table is not None
     bc = next(row for row in table.rows if row.name == "BC")
     assert table.tasks == ["expert", "medium"] and bc.numbers == [35.0, 31.6]

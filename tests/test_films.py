@@ -16,7 +16,7 @@ from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.problem import constraints
 from ringfence.problem.names import Names
-from ringfence.report import animation, build_report
+from ringfence.report import build_report
 from ringfence.report.video import recorded
 from ringfence.training import loop
 
@@ -92,7 +92,7 @@ def test_a_report_shows_where_agents_were_in_a_simulator_of_ones_own(tmp_path):
     film = shown(page)
     assert film["speeds"] == {"slow": 1.25, "real time": 5.0, "fast": 20.0} and film["radius"] is None
     for e, (episode, steps) in enumerate(zip(film["episodes"], lengths)):
-        places = animation.unpack(episode["positions"]).reshape(8, 3, 2) * 1000 * episode["unit"]
+        places = np.array(episode["positions"]) * episode["unit"]
         apart = kept["places"][e, :steps] - kept["places"][e, :1, :1]
         np.testing.assert_allclose(places[:steps] - places[:1, :1], apart[:steps], atol=2 * episode["unit"])
         assert episode["steps"] == steps == len(episode["charged"]) - 1
@@ -109,7 +109,7 @@ def test_an_end_that_is_not_shown_is_left_where_it_was_seen_last(tmp_path):
     kept = recordings.read(run.path, "default")["places"][0]
     assert np.isnan(kept[-1]).all() and np.isfinite(kept[:-1]).all()
     (episode,) = shown(build_report([run], tmp_path / "page.html").read_text())["episodes"]
-    places = animation.unpack(episode["positions"]).reshape(-1, 6)
+    places = np.array(episode["positions"])
     np.testing.assert_array_equal(places[-1], places[-2])
 
 

@@ -14,7 +14,7 @@ import pytest
 from ringfence.algos import ICBF
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
-from ringfence.report import animation, build_report, made
+from ringfence.report import build_report, player, provenance
 from ringfence.report.table import sections
 from ringfence.training.runs import Run
 
@@ -44,6 +44,7 @@ def result(returns, costs, unsafe=None, **more) -> dict:
         "task": TASK,
         "split": "test",
         "options": {},
+        "command": ["eval", "--episodes", str(len(returns))],
         "parameters": 12345,
         "train_seconds": 60.0,
     } | more
@@ -154,10 +155,10 @@ def test_what_was_played_before_training_went_on_is_dated(runs):
     results["split"]["step"] = 10
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
-    seeds = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
+    seeds = {r.variant: r.seeds for r in section.tables["test"] if r.method.algorithm == "icbf"}
     assert seeds["split@step10"] == (0,) and seeds["split"] == (1,)
     assert any(
-        "--checkpoint 10" in line and str(runs[0].path) in line for line in made.commands(section, Path("r.html"))
+        "--checkpoint 10" in line and str(runs[0].path) in line for line in provenance.commands(section, Path("r.html"))
     )
 
 
@@ -189,24 +190,28 @@ def test_seeds_are_pooled(runs):
     assert [r.variant for r in section.tables["validation"]] == ["split"]
 
 
-def test_the_commands_name_another_number_of_agents(runs):
+def test_commands_are_those_that_made_the_results(runs):
+    """Runs that were played in the same words share a line."""
     results = runs[0].results
-    results["split"]["agents"] = 5
+    results["split"]["command"] = ["play", "--env", "yard.py:Yard", "--agents", "5"]
+    del results["split+num_samples4"]["command"]
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
-    lines = made.commands(section, Path("r.html"))
-    assert sum("--agents 5" in line for line in lines) == 1 and not any("--agents 3" in line for line in lines)
+    lines = provenance.commands(section, Path("r.html"))
+    assert f"ringfence play {runs[0].path} --env yard.py:Yard --agents 5" in lines
+    assert f"ringfence eval {runs[1].path} --episodes 20" in lines
+    assert sum(line.startswith("# of ") and "split+num_samples4" in line for line in lines) == 1
+    results["split"]["command"] = ["data", "make", "x", "--out", "/etc/passwd"]
+    (runs[0].path / "results.json").write_text(json.dumps(results))
+    with pytest.raises(UserError, match="made by 'data', which plays nothing"):
+        provenance.commands(sections(runs)[0], Path("r.html"))
 
 
-def test_the_commands_of_own_data_give_the_guard_its_world(runs):
+def test_training_is_a_line_for_seeds_that_follow_each_other(runs):
     (section,) = sections(runs)
-    result = {**runs[0].results["split"], "guard": "shield", "barrier": "learned", "execution": "centralized"}
-    result["guard_options"] = {"horizon": 7}
-    config = json.loads((runs[0].path / "config.json").read_text())
-    assert "--world" not in made._how(result, runs[0])
-    (runs[0].path / "config.json").write_text(json.dumps(config | {"task": "harbour"}))
-    words = made._how(result, runs[0])
-    assert words[words.index("--world") + 1] == "DATA.world"
+    trained = [line for line in provenance.commands(section, Path("r.html")) if line.startswith("ringfence train")]
+    assert "ringfence train icbf DATA.h5 --preset split --seeds 2" in " ".join(trained)
+    assert len(trained) == 2
 
 
 def test_headline_names_the_best_safe_method(runs, tmp_path):
@@ -221,7 +226,7 @@ def test_revisions_get_rows_of_their_own(runs):
     config = json.loads((runs[1].path / "config.json").read_text())
     (runs[1].path / "config.json").write_text(json.dumps(config | {"revision": 2}))
     (section,) = sections(runs)
-    rows = {r.variant: r.seeds for r in section.tables["test"] if r.algorithm == "icbf"}
+    rows = {r.variant: r.seeds for r in section.tables["test"] if r.method.algorithm == "icbf"}
     assert rows["split [revision=1]"] == (0,) and rows["split [revision=2]"] == (1,)
 
 
@@ -259,8 +264,8 @@ def test_tasks_are_kept_apart(tmp_path):
         folder(tmp_path, results={"split": result([1.0, 2.0], [0, 1])}),
         folder(tmp_path, task=other, results={"split": result([3.0, 4.0], [0, 1], task=other)}),
     ]
-    assert [(s.task, len(s.rows)) for s in sections(runs)] == [(TASK, 1), (other, 1)]
-    assert build_report(runs, tmp_path).read_text().count("<h2") == 2
+    assert [(s.task, len(s.lines)) for s in sections(runs)] == [(TASK, 1), (other, 1)]
+    assert build_report(runs, tmp_path).read_text().count("<h2") == 3  # how it was made is the third
 
 
 @pytest.mark.parametrize(
@@ -301,7 +306,7 @@ def test_other_data_and_a_seed_given_twice_are_refused(tmp_path):
         build_report([one, folder(tmp_path / "b", seed=1, results=results, provenance="public")], tmp_path)
     with pytest.raises(UserError, match="same seed 0"):
         build_report([one, folder(tmp_path / "c", results=results)], tmp_path)
-    assert sections([one, one])[0].rows[0].seeds == (0,)  # the same folder twice is one run
+    assert sections([one, one])[0].lines[0].seeds == (0,)  # the same folder twice is one run
 
 
 def test_runs_without_results_are_refused(tmp_path):
@@ -314,31 +319,29 @@ def test_runs_without_results_are_refused(tmp_path):
 
 def test_players_keep_the_chosen_plan_first(runs):
     (section,) = sections(runs)
-    many, one = animation.players(section)
+    many, one = player.players(section)
     assert (many["label"], one["label"]) == ("ICBF-Diffuser split+num_samples4", "ICBF-Diffuser split")
     kept = np.load(runs[0].path / "rollout-split+plans4.npz")
-    steps, shown, rows, agents = many["episodes"][1]["shape"]
-    packed = animation.unpack(many["episodes"][1]["plans"]).reshape(steps, shown, rows, agents, 2)
+    shown = np.array(many["episodes"][1]["plans"]) / 1000
     step = 3
     expected = kept["plans"][1, step, kept["chosen"][1, step], ..., 2:4]
-    assert shown == 4 and np.allclose(packed[step, 0], expected, atol=5.1e-4)
-    positions = animation.unpack(many["episodes"][0]["positions"]).reshape(steps + 1, agents, 2)
-    assert np.allclose(positions.reshape(steps + 1, -1), kept["states"][0, :, :4], atol=5.1e-4)
+    assert shown.shape[1] == 4 and np.allclose(shown[step, 0], expected, atol=5.1e-4)
+    positions = np.array(many["episodes"][0]["positions"]) * many["episodes"][0]["unit"]
+    assert np.allclose(positions.reshape(len(positions), -1), kept["states"][0, :, :4], atol=5.1e-4)
 
 
 def test_many_plans_are_cut_to_the_budget(monkeypatch):
     plans = np.arange(2 * 6 * 3 * 2 * 2, dtype=float).reshape(2, 6, 3, 2, 2) / 1000
-    monkeypatch.setattr(animation, "NUMBERS", 2 * 3 * 2 * 2 * 2)
-    packed = animation.few(plans, np.array([5, 0]))
-    assert packed["shape"] == [2, 2, 3, 2]
-    assert np.allclose(animation.unpack(packed["plans"]).reshape(2, 2, 3, 2, 2)[0, 0], plans[0, 5])
+    monkeypatch.setattr(player, "NUMBERS", 2 * 3 * 2 * 2 * 2)
+    shown = np.array(player.few(plans, np.array([5, 0])))
+    assert shown.shape == (2, 2, 3, 2, 2) and np.allclose(shown[0, 0] / 1000, plans[0, 5])
 
 
 def test_a_plan_is_repeated_while_it_is_followed():
     plans = np.zeros((1, 3, 1, 2, 1, 4))
     plans[0, 0, ..., 2] = 0.5
     plans[0, 2, ..., 2] = 0.7
-    xy = animation.tracks({"plans": plans}, NAMES, 1, 0)
+    xy = player.tracks({"plans": plans}, NAMES, 1, 0)
     assert np.allclose(xy[0, :, 0, 0, 0, 0], [0.5, 0.5, 0.7])
 
 
@@ -359,28 +362,6 @@ def test_damaged_recording_is_an_error_that_helps(runs, tmp_path, damage):
         build_report(runs, tmp_path)
 
 
-PLANNED = {"planner": "default", "guard": "shield", "barrier": "learned", "execution": "centralized"}
-STRANGE_CHOICES = [
-    {"planner": "default; touch x"},
-    {"guard": "$(touch x)"},
-    {"barrier": "learned\ntouch x"},
-    {"execution": "`touch x`"},
-    {"guard_options": {"horizon; touch x": 3}},
-    {"options": {"$(touch x)": 3}},
-]
-
-
-@pytest.mark.parametrize("strange", STRANGE_CHOICES, ids=str)
-def test_choices_that_nobody_knows_are_refused(runs, strange, tmp_path):
-    """They stand in commands that readers copy."""
-    results = runs[0].results
-    results["split"] |= {**PLANNED, "guard_options": {"horizon": 3}} | strange
-    (runs[0].path / "results.json").write_text(json.dumps(results))
-    with pytest.raises(UserError, match=r"Unknown (planner|guard|barrier|execution|entry of \w+) '.*touch x"):
-        build_report(runs, tmp_path / "r.html")
-    assert not (tmp_path / "r.html").exists()
-
-
 def test_a_shell_reads_every_word_of_a_command_as_it_was(runs, tmp_path):
     """Whoever wrote the run folders chose these words."""
     evil = 'x\'; touch "$HOME"/y & `z` $(z) | > \n # ~'
@@ -388,11 +369,10 @@ def test_a_shell_reads_every_word_of_a_command_as_it_was(runs, tmp_path):
     config |= {"config": config["config"] | {"history": evil}}
     (runs[0].path / "config.json").write_text(json.dumps(config))
     results = runs[0].results
-    settings = {"guard_options": {"horizon": evil}, "options": {"temperature": evil}, "simulator": evil}
-    results["split"] |= PLANNED | settings
+    results["split"]["command"] = ["play", "--env", evil, "--set", f"horizon={evil}", f"temperature={evil}"]
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
-    lines = made.commands(section, tmp_path / evil.replace("/", ""))
+    lines = provenance.commands(section, tmp_path / evil.replace("/", ""))
     shown = evil.replace("\n", "\\n")
     words = [word for line in lines for word in shlex.split(line)]
     for word in (f"history={shown}", f"horizon={shown}", f"temperature={shown}", shown):

@@ -146,10 +146,11 @@ class Cell:
 
     def status(self, out: Path) -> schemas.Status:
         """What its folder says of making it; nothing before it was begun."""
-        return _status(self.folder(out)) or schemas.Status()
+        return cell_status(self.folder(out)) or schemas.Status()
 
 
-def _status(folder: Path) -> schemas.Status | None:
+def cell_status(folder: Path) -> schemas.Status | None:
+    """What a cell's folder says of making it; None before it says anything."""
     file = folder / "status.json"
     return schemas.read(file, schemas.Status, DAMAGED) if file.exists() else None
 
@@ -280,7 +281,7 @@ def statuses(out: str | Path) -> list[dict[str, Any]]:
     found = []
     begun = {f.parent for name in ("config", "status") for f in (Path(out) / "cells").glob(f"*/*/[!.]*/{name}.json")}
     for folder in sorted(begun):
-        status = _status(folder) or {"state": "under way"}
+        status = cell_status(folder) or {"state": "under way"}
         task, algorithm, seed = folder.parts[-3:]
         found.append({**status, "task": task, "run": f"{algorithm}/{seed}"})
     return found

@@ -17,9 +17,10 @@ import numpy as np
 
 from ringfence.bench.cells import Grid, make_grids, narrowed
 from ringfence.bench.suites import SUITES
-from ringfence.bench.table import Row, rows
+from ringfence.bench.table import read
 from ringfence.datasets import registry
 from ringfence.errors import UserError
+from ringfence.evaluation.table import Result
 from ringfence.utils.files import whole
 
 FOLDERS = ("simple_spread", "mujoco")  # of results, one per suite
@@ -97,15 +98,15 @@ class Line:
 def lines(folders: Iterable[str | Path]) -> list[Line]:
     """The table from results folders; a task or method that they lack has no measured values."""
     folders = [Path(f) for f in folders]
-    found: dict[tuple[str, str, str], list[Row]] = {}
+    found: dict[tuple[str, str, str], list[Result]] = {}
     if not any((f / "bench.json").exists() for f in folders):
         names = " nor ".join(f"'{f}'" for f in folders)
         raise UserError(
             f"Neither {names} is a results folder; run `ringfence bench paper`, or name the folder it wrote."
         )
     for folder in folders:
-        for r in rows(folder, may_be_empty=True) if (folder / "bench.json").exists() else ():
-            found.setdefault((r["task"], r["algorithm"], r["variant"]), []).append(r)
+        for row in read(folder) if (folder / "bench.json").exists() else ():
+            found.setdefault((row.task, row.algorithm, row.variant), []).append(row.result)
     table = []
     for task, (_, values) in PRINTED.items():
         presets = (*registry.get(task).presets, "default")  # of rows that may stand there
@@ -118,7 +119,7 @@ def lines(folders: Iterable[str | Path]) -> list[Line]:
     return table
 
 
-def _summary(runs: list[Row]) -> tuple[float, float | None, float, float | None]:
+def _summary(runs: list[Result]) -> tuple[float, float | None, float, float | None]:
     reward = np.array([r["return_norm"] for r in runs])
     cost = np.array([r["cost_norm"] for r in runs])
     return float(reward.mean()), _deviation(reward), float(cost.mean()), _deviation(cost)

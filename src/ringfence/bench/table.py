@@ -1,22 +1,22 @@
-"""The flat table of a results folder: one row per evaluation and reference, traceable to its run folder.
+"""The table of a results folder: its rows, which must all be of the protocol that bench.json declares, and as CSV.
 
 Ranks, intervals and comparisons are made by `report/board.py` and its neighbours.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ringfence.bench.cells import read_about
 from ringfence.errors import UserError
-from ringfence.evaluation import reference
-from ringfence.evaluation.protocol import of_last_step
+from ringfence.evaluation.table import Row, check, of_references, of_run
 from ringfence.training.runs import Run
 from ringfence.utils import csvs
 
-NEEDED = ("split", "protocol", "episodes", "task", "algorithm", "seed", "variant", "constants")  # of every evaluation
 COLUMNS = (
     "task, algorithm, variant, guard, barrier, execution, agents, seed, episodes, return_mean, return_std, "
     "return_norm, cost_mean, cost_norm, cost_safe_start, violation_rate, violation_upper, agent_violation_rate, "
@@ -25,70 +25,81 @@ COLUMNS = (
 ).split(", ")
 UNGUARDED = {"guard": "none", "barrier": "none", "execution": "centralized"}  # where a result does not say
 
-Row = dict[str, Any]
+
+CELL = re.compile(r"seed-(\d+)(?:-(.+))?")
 
 
-def rows(out: str | Path, may_be_empty: bool = False) -> list[Row]:
-    """Every evaluation of every cell, and the reference rows; mixed protocols are refused, naming the files."""
+@dataclass(frozen=True)
+class Place:
+    """A cell's folder, whether results are there or not."""
+
+    path: Path
+    task: str
+    job: str  # algorithm[-preset]
+    seed: int
+
+
+def places(out: str | Path) -> list[Place]:
+    """The folders of a grid's cells."""
+    found = []
+    for path in sorted((Path(out) / "cells").glob("*/*/*/")):
+        if match := CELL.fullmatch(path.name):
+            found.append(Place(path, path.parent.parent.name, path.parent.name, int(match[1])))
+    return found
+
+
+def read(out: str | Path) -> list[Row]:
+    """Every evaluation of every cell on the declared resets and at its run's last step, after the reference rows."""
     out = Path(out)
     about = read_about(out)
-    references = list(_references(out))
-    evaluations = list(_evaluations(out, about))
-    if not may_be_empty and not evaluations:
-        raise UserError(f"'{out}' holds no finished cell yet; run `ringfence bench`.")
+    files = sorted((out / "reference").glob("*/reference.json"))
+    references = [row for file in files for row in of_references(file, file.parent.name)]
+    evaluations = [row for place in places(out) for row in _of_cell(place, about["split"])]
+    check([*evaluations, *references], about, f"'{out / 'bench.json'}'")
     return references + evaluations
 
 
-def _references(out: Path) -> Iterator[Row]:
-    for file in sorted((out / "reference").glob("*/reference.json")):
-        where = {"variant": "reference", "seed": 0, "run": str(file.relative_to(out))}
-        for name, result in reference.read(file).items():
-            yield {**UNGUARDED, **result, "algorithm": name, **where}
+def _of_cell(place: Place, split: str) -> list[Row]:
+    """A cell's rows. Settings were chosen on other resets, and of an earlier step training went on: no table is made of
+    either."""
+    found = of_run(Run(place.path))
+    for row in found[:1]:
+        for name, here, there in (("task", row.task, place.task), ("seed", row.seed, place.seed)):
+            if here != there:
+                raise UserError(
+                    f"'{place.path / 'config.json'}' names {name} {here}, its folder {there}; a cell was moved: put it "
+                    "back or delete it."
+                )
+    return [row for row in found if row.last and ("@" not in row.name or row.result.get("split") == split)]
 
 
-def _evaluations(out: Path, about: Row) -> Iterator[Row]:
-    constants: dict[str, tuple[Path, dict]] = {}  # by task: the first file, and what it was normalised with
-    seen: dict[tuple, Path] = {}
-    for file in sorted((out / "cells").glob("*/*/[!.]*/results.json")):
-        run = Run(file.parent)
-        config = run.config
-        for variant, result in run.results.items():
-            if lacking := [name for name in NEEDED if name not in result]:
-                raise UserError(f"'{file}' tells no {lacking[0]} of {variant}; evaluate that run again.")
-            if result["split"] != about["split"] or not of_last_step(result, config["config"]):
-                continue  # settings were chosen there, or training went on; no table is made of it
-            _check_protocol(file, result, about, out)
-            _check_run(file, result, config)
-            first, others = constants.setdefault(result["task"], (file, result["constants"]))
-            if others != result["constants"]:
-                raise UserError(f"'{file}' and '{first}' normalise {result['task']} differently; evaluate one again.")
-            _check_once(file.parent, result, seen)
-            yield {**UNGUARDED, **result, "run": str(file.parent.relative_to(out))}
+def rows(out: str | Path) -> list[dict[str, Any]]:
+    """The same as flat rows: a result's fields, and `run`, the folder or file it is from. Of one method and seed there
+    may be one."""
+    out = Path(out)
+    found = read(out)
+    if all(row.run is None for row in found):
+        raise UserError(f"'{out}' holds no finished cell yet; run `ringfence bench`.")
+    _check_once(row for row in found if row.run is not None)
+    return [_flat(row, out) for row in found]
 
 
-def _check_protocol(file: Path, result: Row, about: Row, out: Path) -> None:
-    for name in ("protocol", "episodes"):
-        if result[name] != about[name]:
+def _flat(row: Row, out: Path) -> dict[str, Any]:
+    of_row = {"algorithm": row.algorithm, "variant": row.variant, "seed": row.seed}
+    place = row.file if row.run is None else row.run.path
+    return {**UNGUARDED, **row.result, **of_row, "run": str(place.relative_to(out))}
+
+
+def _check_once(rows: Iterable[Row]) -> None:
+    seen: dict[tuple[str, str, str, int], Row] = {}
+    for row in rows:
+        key = (row.task, row.algorithm, row.variant, row.seed)
+        other = seen.setdefault(key, row)
+        if other is not row:
             raise UserError(
-                f"'{file}' has {name}={result[name]}, '{out / 'bench.json'}' {about[name]}; one table takes one "
-                "protocol: evaluate that run again or move it away."
+                f"'{row.file.parent}' and '{other.file.parent}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, "
+                "with other settings; delete the one that is not meant."
             )
-
-
-def _check_run(file: Path, result: Row, config: Row) -> None:
-    for name in ("task", "algorithm", "seed"):
-        if result[name] != config[name]:
-            raise UserError(f"'{file}' is of {name} {result[name]!r}, its run of {config[name]!r}; evaluate it again.")
-
-
-def _check_once(folder: Path, result: Row, seen: dict[tuple, Path]) -> None:
-    key = (result["task"], result["algorithm"], result["variant"], result["seed"])
-    other = seen.setdefault(key, folder)
-    if other != folder:
-        raise UserError(
-            f"'{folder}' and '{other}' are both {' '.join(map(str, key[:3]))} seed {key[3]}, with other "
-            "settings; delete the one that is not meant."
-        )
 
 
 def write_csv(out: str | Path) -> Path:

@@ -171,11 +171,11 @@ def results(folder: Positional[Path], certificate: Path | None = None) -> None:
     """
     from ringfence.bench import stressed, write_csv
     from ringfence.bench.cells import read_about
-    from ringfence.report import board, standings
+    from ringfence.report import board
 
     promise = None if certificate is None else _load_certificate(certificate, read_about(folder)["suite"])
 
-    for task, rows in standings.standings(board.read(folder)).items():
+    for task, rows in board.read(folder).lines.items():
         table = Table(
             "", "method", "seeds", "return", "norm", "cost", "safe starts", "unsafe (95 % ≤)", title=terminal(task)
         )

@@ -79,10 +79,16 @@ def evaluate_spec(
     seed = run.config["seed"]
     label = f"{job.algorithm.name} {variant} {job.task.name} seed {seed}"
     result, played = evaluate_policy(resolved.team, job.task, episodes, split, seed, num_recorded, label, quiet)
-    result |= {"variant": variant, "step": resolved.step} | about(resolved)
+    command = ["eval", "--episodes", str(episodes), *split_words(split), *resolved.spec.words]
+    result |= {"variant": variant, "command": command, "step": resolved.step} | about(resolved)
     run.add_result(variant, result)
     recordings.write(run.path, variant, played, num_recorded)
     return result
+
+
+def split_words(split: str) -> list[str]:
+    """The split as options of a command, where it is not the usual one."""
+    return [] if split == "test" else ["--split", split]
 
 
 def about(resolved: Resolved) -> dict[str, Any]:
@@ -93,6 +99,7 @@ def about(resolved: Resolved) -> dict[str, Any]:
     options = resolved.plan_options
     return {
         "algorithm": resolved.job.algorithm.name,
+        "spec": spec.name,
         "provenance": run.config["data"]["provenance"],
         "planner": spec.planner,
         "options": {} if options is None else dataclasses.asdict(options),

@@ -14,6 +14,7 @@ import numpy as np
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, recordings, rollout
+from ringfence.evaluation.evaluate import split_words
 from ringfence.evaluation.places import recording, watching
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
@@ -106,9 +107,12 @@ def play(
     about = {"task": player.task.name, "seed": seed, "eval_seconds": time.perf_counter() - begun} | player.about
     about |= {"compensated": compensate} if faults.given else {}
     if keep and isinstance(player, RunPlayer):
-        of_file = {"split": split, "simulator": name_of(make_env, envs[0])}
-        of_file |= {"num_envs": num_envs, "early_ends": early_ends}
-        _add_to_run(player, summary | about | of_file)
+        simulator = name_of(make_env, envs[0])
+        of_file = {"split": split, "simulator": simulator, "num_envs": num_envs, "early_ends": early_ends}
+        words = ["--env", simulator, "--episodes", episodes, "--num-envs", num_envs]
+        words += [] if early_ends == "refuse" else ["--early-ends", early_ends]
+        words += [*split_words(split), *player.spec.words]
+        _add_to_run(player, summary | about | of_file | {"command": ["play", *map(str, words)]})
         film = recording(watches, [episode for table in tables for episode in table.episodes])
         recordings.write(player.run.path, player.variant, film, len(film.get("places", ())))
     shown = {name: value for name, value in summary.items() if name not in OF_A_BENCHMARK}

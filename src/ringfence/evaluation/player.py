@@ -57,6 +57,7 @@ class Player:
 class RunPlayer(Player):
     """A run, whose folder can keep the result under the variant's name."""
 
+    spec: PolicySpec
     run: Run
     variant: str
 
@@ -107,6 +108,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         unsafe=_unsafe_by_formula(job.hazard, job.feature_map, job.task.homogeneous),
         about={"step": resolved.step} | evaluate.about(resolved),
         limits=resolved.run.config["data"].get("constraints") or {},
+        spec=resolved.spec,
         run=resolved.run,
         variant=resolved.variant(split),
     )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ringfence.datasets.registry import TASKS
 from ringfence.errors import UserError, unknown, whole_number
 from ringfence.guards import BARRIERS, GUARDS, GuardOptions
 from ringfence.loading.oracle import ORACLE
@@ -122,6 +123,25 @@ class PolicySpec:
         if self.agents is not None:
             parts.append(f"agents{self.agents}")
         return "+".join(parts) or DEFAULT
+
+    @property
+    def words(self) -> list[str]:
+        """The same as options of a command, without the run."""
+        words: list[Any] = [] if self.checkpoint is None else ["--checkpoint", self.checkpoint]
+        words += [] if self.planner == DEFAULT else ["--planner", self.planner]
+        words += [] if self.agents is None else ["--agents", self.agents]
+        words += ["--guard", self.guard, "--barrier", self.barrier] if self.guarded else []
+        plan_options = dict(self.plan_options)
+        execution = self.execution if self.guarded else plan_options.pop("execution", None)
+        words += ["--execution", execution] if execution else []
+        if isinstance(self.world, Path):
+            words += ["--world", self.world]
+        elif self.world is not None and self.world.card.data.task not in TASKS:  # whoever plays has to have it
+            words += ["--world", "DATA.world"]
+        words += ["--anyway"] if self.anyway else []
+        settings = plan_options | dict(self.guard_options)
+        words += ["--set", *(f"{name}={value}" for name, value in settings.items())] if settings else []
+        return [str(word) for word in words]
 
     def variant(self, preset: str, split: str = "test") -> str:
         """The name of a result: whose preset it is, how it was played, and what is not as in every table."""

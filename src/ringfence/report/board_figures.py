@@ -8,29 +8,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.evaluation.statistics import Interval
-from ringfence.report.board import Method
-from ringfence.report.figures import FAR, INK, MARKERS, Ticks, figure, style, to_svg
-from ringfence.report.standings import Aggregate, Standing
+from ringfence.report.figures import FAR, INK, Ticks, colour, figure, marker, style, to_svg
+from ringfence.report.standings import Aggregate
+from ringfence.report.table import Line, Method, Style
 
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)), (0, (3, 1, 1, 1, 1, 1)))
 WIDTH = 9.2  # inches of a wide figure
 LIMIT = (0, (3, 3))  # line style
 LABEL = 0.075  # inches that a letter of a method's name takes
-
-Style = tuple[int, int]
-
-
-def _ink(of: Style) -> str:
-    return f"#0102{16 + of[0]:02x}"
-
-
-def _marker(of: Style) -> str:
-    return MARKERS[of[1] % len(MARKERS)]
 
 
 def _whiskers(ax: Axes, rows: list[tuple[float, Interval | None]], styles: list[Style], digits: int) -> None:
@@ -39,8 +30,8 @@ def _whiskers(ax: Axes, rows: list[tuple[float, Interval | None]], styles: list[
     where = {"xycoords": ("axes fraction", "data"), "ha": "right", "va": "center"}
     for y, ((value, interval), of) in enumerate(zip(rows, styles)):
         if interval:
-            ax.plot(interval, (y, y), color=_ink(of), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
-        ax.plot(value, y, _marker(of), color=_ink(of), markersize=7)
+            ax.plot(interval, (y, y), color=colour(of), linewidth=2.2, alpha=0.55, solid_capstyle="butt")
+        ax.plot(value, y, marker(of), color=colour(of), markersize=7)
         ax.annotate(f"{value:.{digits}f}", (0.99, y), **where, fontsize=8.5, color=INK)
     ax.set_ylim(len(rows) - 0.5, -0.5)
     ax.grid(axis="y", visible=False)
@@ -49,7 +40,7 @@ def _whiskers(ax: Axes, rows: list[tuple[float, Interval | None]], styles: list[
     ax.set_xlim(left, right + 0.16 * (right - left))
 
 
-def overall(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> str:
+def overall(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> Markup:
     """IQM of normalised return and of normalised cost over all tasks, the best return on top."""
     methods = sorted(aggregate.methods, key=lambda m: -aggregate.iqm_returns[m][0])
     with style():
@@ -71,7 +62,7 @@ def overall(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> str
         return to_svg(made, f"Interquartile means over all tasks. {'; '.join(each)}", name)
 
 
-def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> str:
+def duels(matrix: np.ndarray, methods: list[Method], what: str, name: str) -> Markup:
     """Heat map of the probability that the row beats the column, with every probability printed."""
     n = len(methods)
     longest = max(len(m.label) for m in methods)
@@ -110,7 +101,7 @@ def _shade(p: float) -> tuple[str, str]:
     return "#{:02x}{:02x}{:02x}".format(*rgb), "#101010" if light else "#fafafa"
 
 
-def profiles(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> str:
+def profiles(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> Markup:
     """Share of runs above a return and share of episodes within a cost, against the threshold."""
     methods = aggregate.methods
     columns = 2 if max(len(m.label) for m in methods) > 24 else 3
@@ -153,14 +144,14 @@ def _profile(
     """The line of the k-th method with its band, if it has one."""
     if band is not None:
         low, high = band
-        ax.fill_between(thresholds, low, high, color=_ink(of), alpha=0.12, linewidth=0, step="post")
+        ax.fill_between(thresholds, low, high, color=colour(of), alpha=0.12, linewidth=0, step="post")
     ax.plot(
         thresholds,
         shares,
-        color=_ink(of),
+        color=colour(of),
         linestyle=DASHES[k % len(DASHES)],
         linewidth=1.6,
-        marker=_marker(of),
+        marker=marker(of),
         markersize=5,
         markevery=(0.02 * (k % 8), 0.16),  # apart, so that markers of lines that coincide can be seen
         drawstyle="steps-post",
@@ -176,7 +167,7 @@ def _brief(x: float) -> str:
     return f"{x:g}"
 
 
-def expenses(rows: list[Standing], name: str) -> str:
+def expenses(rows: list[Line], name: str) -> Markup:
     """Training seconds, parameters and time to act of each method, on logarithmic scales; None is said in words."""
     panels = (
         ("training, s of one seed", [r.train_seconds for r in rows], "{:,.0f}"),
@@ -193,7 +184,7 @@ def expenses(rows: list[Standing], name: str) -> str:
         return to_svg(made, "Training time, parameters and time to act of each method", name)
 
 
-def _expense(ax: Axes, rows: list[Standing], values: Sequence[float | None], form: str) -> None:
+def _expense(ax: Axes, rows: list[Line], values: Sequence[float | None], form: str) -> None:
     """A bar and a number per row, the first on top."""
     measured = [v for v in values if v] or [1.0, 10.0]
     low = min(measured)
@@ -203,8 +194,8 @@ def _expense(ax: Axes, rows: list[Standing], values: Sequence[float | None], for
     ax.set_xlim(left, high * max(4.0, (high / low) ** 0.55))
     for y, (row, value) in enumerate(zip(rows, values)):
         if value:
-            ax.plot((left, value), (y, y), color=_ink(row.style), linewidth=1.2, alpha=0.5)
-            ax.plot(value, y, _marker(row.style), color=_ink(row.style), markersize=6)
+            ax.plot((left, value), (y, y), color=colour(row.style), linewidth=1.2, alpha=0.5)
+            ax.plot(value, y, marker(row.style), color=colour(row.style), markersize=6)
         text = form.format(value) if value else "not measured"
         where = (value or left, y)
         ax.annotate(text, where, (7, 0), textcoords="offset points", va="center", fontsize=8.5, color=INK)

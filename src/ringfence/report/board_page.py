@@ -9,30 +9,17 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from markupsafe import Markup
 
 from ringfence.algos import ALGORITHMS
 from ringfence.evaluation import statistics
 from ringfence.evaluation.statistics import Interval
-from ringfence.logs.provenance import regenerated
-from ringfence.report import board_figures, figures, html
-from ringfence.report.board import Board, Method, read
-from ringfence.report.board_figures import Style
-from ringfence.report.headline import danger, headline, words_of
-from ringfence.report.made import environments, facts
+from ringfence.report import board_figures, html
+from ringfence.report.board import Board, read
+from ringfence.report.page import TEMPLATE, of_section
+from ringfence.report.provenance import environments
 from ringfence.report.published import NOTE, PUBLISHED, matches
-from ringfence.report.standings import (
-    DRAWS,
-    Aggregate,
-    Standing,
-    aggregates,
-    by_protocol,
-    contests,
-    references,
-    standings,
-)
-from ringfence.report.table import Section
-from ringfence.training.runs import Run
+from ringfence.report.standings import DRAWS, Aggregate, aggregates, by_protocol, contests
+from ringfence.report.table import Line, Method, Style
 
 
 def build_board(folder: str | Path, out: str | Path, title: str | None = None) -> Path:
@@ -43,27 +30,27 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
     """
     board = read(folder)
     out = html.page_file(out)
-    return html.write(out, html.render("board.html.j2", _context(board, out, title)))
+    return html.write(out, html.render(TEMPLATE, _context(board, out, title)))
 
 
 def _context(board: Board, out: Path, title: str | None) -> dict[str, Any]:
-    tables = standings(board)
-    rows_to_beat = references(board)
-    styles = {r.method: r.style for rows in tables.values() for r in rows if r.method}
+    lines = [line for some in board.lines.values() for line in some]
+    styles = {line.method: line.style for line in lines if line.method}
     return {
         "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
+        "js": "",
         "board": board,
         "draws": DRAWS,
-        "rankings": rankings(board, tables),
-        "seeds": _seeds(tables),
-        "older": _older(tables),
-        "sections": [_section(board, t, k, tables[t], rows_to_beat[t], out) for k, t in enumerate(board.tasks)],
+        "rankings": rankings(board),
+        "seeds": _seeds(lines),
+        "older": _older(board),
+        "sections": [_section(board, task, k, out) for k, task in enumerate(board.tasks)],
         "aggregates": [_aggregate(board, a, k, styles) for k, a in enumerate(aggregates(board))],
-        "expenses": Markup(board_figures.expenses(_typical(board, tables), "expenses")),
-        "published": published(board, tables),
+        "expenses": board_figures.expenses(_typical(board), "expenses"),
+        "published": published(board),
         "note": NOTE,
         "missing": _missing(board),
-        "environments": environments(board.runs),
+        "environments": environments([run for each in board.sections.values() for run in each.runs]),
     }
 
 
@@ -81,7 +68,7 @@ class RankingRow:
 
     method: Method
     style: Style
-    cells: list[Standing | None]  # per task
+    cells: list[Line | None]  # per task
     mean: float | None  # of its ranks; None where a task is missing
     reference: bool = False
 
@@ -113,15 +100,15 @@ class Ranking:
     rows: list[RankingRow]
 
 
-def rankings(board: Board, tables: dict[str, list[Standing]]) -> list[Ranking]:
+def rankings(board: Board) -> list[Ranking]:
     """One per protocol: tasks that share data and policies under two limits are not two tasks."""
-    return [Ranking(p, tasks, _ranks(board, tasks, tables)) for p, tasks in by_protocol(board).items()]
+    return [Ranking(p, tasks, _ranks(board, tasks)) for p, tasks in by_protocol(board).items()]
 
 
-def _ranks(board: Board, tasks: list[str], tables: dict[str, list[Standing]]) -> list[RankingRow]:
+def _ranks(board: Board, tasks: list[str]) -> list[RankingRow]:
     """Mean ranks are counted among the methods that were measured on every task; the others come last, since they have
     none."""
-    cells = {m: [next((r for r in tables[t] if r.method == m), None) for t in tasks] for m in board.methods}
+    cells = {m: [board.line(t, m) for t in tasks] for m in board.methods}
     means = _mean_ranks(board, tasks, cells)
     rows = []
     for method, row in cells.items():
@@ -131,13 +118,13 @@ def _ranks(board: Board, tasks: list[str], tables: dict[str, list[Standing]]) ->
     return sorted(rows, key=lambda r: (r.mean is None, r.mean or 0.0))
 
 
-def _mean_ranks(board: Board, tasks: list[str], cells: dict[Method, list[Standing | None]]) -> dict[Method, float]:
+def _mean_ranks(board: Board, tasks: list[str], cells: dict[Method, list[Line | None]]) -> dict[Method, float]:
     """Of the methods that were measured on every task, among themselves."""
     complete = {m: [cell for cell in row if cell] for m, row in cells.items() if all(row)}
     places: list[np.ndarray] = []
     for k, task in enumerate(tasks):
         rows = [row[k] for row in complete.values()]
-        limit = board.constants.get(task, {}).get("cost_limit", 0.0)  # a task may have no result yet
+        limit = board.sections[task].constants.get("cost_limit", 0.0)  # a task may have no result yet
         places.append(statistics.places([r.returns for r in rows], [r.cost_interval[1] for r in rows], limit))
     return {m: float(np.mean([place[k] for place in places])) for k, m in enumerate(complete)}
 
@@ -145,9 +132,9 @@ def _mean_ranks(board: Board, tasks: list[str], cells: dict[Method, list[Standin
 # --- sections ---
 
 
-def _seeds(tables: dict[str, list[Standing]]) -> str:
-    """How many seeds the rows have, in words."""
-    counts = [len(r.seeds) for rows in tables.values() for r in rows]
+def _seeds(lines: list[Line]) -> str:
+    """How many seeds the lines have, in words."""
+    counts = [len(line.seeds) for line in lines]
     low = min(counts)
     high = max(counts)
     if low == high:
@@ -156,15 +143,15 @@ def _seeds(tables: dict[str, list[Standing]]) -> str:
     return f"{low} to {high} seeds, {counts.count(most)} of {len(counts)} rows with {most}"
 
 
-def _older(tables: dict[str, list[Standing]]) -> list[tuple[str, str, list[int]]]:
+def _older(board: Board) -> list[tuple[str, str, list[int]]]:
     """(task, method, seeds) trained by an older revision of their algorithm than this package has."""
     found = []
-    for task, rows in tables.items():
-        for row in rows:
-            known = ALGORITHMS.get(row.method.algorithm) if row.method else None
+    for task, lines in board.lines.items():
+        for line in lines:
+            known = ALGORITHMS.get(line.method.algorithm) if line.method else None
             revision = known.revision if known else 1
-            if seeds := [e.seed for e in row.entries if e.revision < revision]:
-                found.append((task, row.label, seeds))
+            if seeds := [row.seed for row in line.rows if row.config.get("revision", 1) < revision]:
+                found.append((task, line.label, seeds))
     return found
 
 
@@ -194,7 +181,7 @@ class PublishedTable:
     rows: list[PublishedRow]
 
 
-def published(board: Board, tables: dict[str, list[Standing]]) -> PublishedTable | None:
+def published(board: Board) -> PublishedTable | None:
     """For the tasks of this board; None where nothing was printed."""
     tasks = [t for t in board.tasks if any(t in p.values for p in PUBLISHED)]
     if not tasks:
@@ -205,58 +192,33 @@ def published(board: Board, tables: dict[str, list[Standing]]) -> PublishedTable
         again = any(entry.algorithms == later.algorithms for later in printed[k + 1 :])  # ours follow the last of them
         ours = [] if again else [m for m in board.methods if matches(entry, m.algorithm)]
         numbers = [entry.values.get(t) for t in tasks]
-        rows.append(PublishedRow(entry.name, entry.source, numbers, [_ours(m, tasks, tables) for m in ours]))
+        rows.append(PublishedRow(entry.name, entry.source, numbers, [_ours(board, m, tasks) for m in ours]))
     return PublishedTable([short(t, board.suite) for t in tasks], rows)
 
 
-def _ours(method: Method, tasks: list[str], tables: dict[str, list[Standing]]) -> Ours:
-    cells = [next((r for r in tables[t] if r.method == method), None) for t in tasks]
+def _ours(board: Board, method: Method, tasks: list[str]) -> Ours:
+    cells = [board.line(t, method) for t in tasks]
     return Ours(method.label, [None if cell is None else 100 * cell.returns_norm for cell in cells])
 
 
-def _section(
-    board: Board, task: str, k: int, rows: list[Standing], rows_to_beat: list[Standing], out: Path
-) -> dict[str, Any]:
+def _section(board: Board, task: str, k: int, out: Path) -> dict[str, Any]:
     """What the template shows of a task."""
-    config = Run(rows[0].entries[0].path).config if rows else {}
-    card = config.get("data") or {}
-    section = Section(
-        task=task,
-        hazard=config.get("hazard") or {},
-        card=card,
-        constants=board.constants.get(task, {}),
-        protocol=board.protocol,
-        runs=[],
-        tables={board.split: rows},
-        references=rows_to_beat,
-    )
-    unit, _ = words_of(section.hazard)
-    drawn = figures.scatter(section, rows, f"{unit} per episode", f"s{k}") if rows else None
-    return {
-        "id": f"task{k}",
-        "task": task,
+    section = board.sections[task]
+    lines = board.lines[task]
+    there = {line.method for line in lines}
+    more = {
         "short": short(task, board.suite),
-        "unit": unit,
-        "headline": headline(section) if rows else ["No method has been measured on this task yet."],
-        "rows": rows,
-        "references": rows_to_beat,
-        "absent": _absent(board, rows),
-        "contests": contests(rows),
-        "constants": section.constants,
-        "ceiling": card.get("return_ceiling"),
-        "danger": danger(section.hazard),
-        "ends": any(r.ended for r in (*rows, *rows_to_beat)),
-        "scatter": Markup(drawn) if drawn else None,
-        "files": [(r.label, e.seed, *_link(e.path / "config.json", out)) for r in rows for e in r.entries],
-        "card": facts(card),
-        "regenerated": regenerated(card),
+        "absent": [m for m in board.methods if m not in there],  # they get a row that says so
+        "contests": contests(lines),
+        "files": [
+            (line.label, row.seed, *_link(row.file.with_name("config.json"), out))
+            for line in lines
+            for row in line.rows
+        ],
     }
-
-
-def _absent(board: Board, rows: list[Standing]) -> list[Method]:
-    """Methods of the board that this task has no result of: they get a row that says so."""
-    there = {r.method for r in rows}
-    return [m for m in board.methods if m not in there]
+    if not lines:
+        more["headline"] = ["No method has been measured on this task yet."]
+    return of_section(section, k) | more
 
 
 def _link(file: Path, out: Path) -> tuple[str, str]:
@@ -314,24 +276,24 @@ def _aggregate(board: Board, aggregate: Aggregate, k: int, styles: dict[Method, 
     if len(best_first) > 1:
         order = [aggregate.methods.index(m) for m in best_first]
         pairs = np.ix_(order, order)
-        earns = Markup(board_figures.duels(aggregate.improves[pairs], best_first, "earns more", f"earns{k}"))
-        costs = Markup(board_figures.duels(aggregate.cheaper[pairs], best_first, "costs less", f"costs{k}"))
+        earns = board_figures.duels(aggregate.improves[pairs], best_first, "earns more", f"earns{k}")
+        costs = board_figures.duels(aggregate.cheaper[pairs], best_first, "costs less", f"costs{k}")
     seeds = aggregate.seeds
     return {
         "protocol": aggregate.protocol,
         "tasks": len(aggregate.tasks),
-        "overall": Markup(board_figures.overall(aggregate, styles, f"overall{k}")),
+        "overall": board_figures.overall(aggregate, styles, f"overall{k}"),
         "rows": rows,
         "alone": any(len(some) == 1 for some in seeds.values()),
         "earns": earns,
         "costs": costs,
-        "profiles": Markup(board_figures.profiles(aggregate, styles, f"profiles{k}")),
+        "profiles": board_figures.profiles(aggregate, styles, f"profiles{k}"),
         "left_out": [(m.label, [short(t, board.suite) for t in at]) for m, at in aggregate.left_out.items()],
         "fewer": [(m.label, seeds[m]) for m in aggregate.methods if len(seeds[m]) < len(board.seeds)],
     }
 
 
-def _typical(board: Board, tables: dict[str, list[Standing]]) -> list[Standing]:
-    """One row per method for the figure of time and size: that of the first task it was measured on."""
-    rows = {r.method: r for t in reversed(board.tasks) for r in tables[t]}
-    return [rows[m] for m in board.methods]
+def _typical(board: Board) -> list[Line]:
+    """One line per method for the figure of time and size: that of the first task it was measured on."""
+    found = ((board.line(task, method) for task in board.tasks) for method in board.methods)
+    return [line for lines in found if (line := next((x for x in lines if x), None))]

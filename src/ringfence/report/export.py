@@ -9,10 +9,10 @@ from typing import Any
 
 from ringfence.errors import plain, unknown
 from ringfence.report import html
-from ringfence.report.board import Board, Method, read
+from ringfence.report.board import Board, read
 from ringfence.report.board_page import rankings, short
 from ringfence.report.html import share
-from ringfence.report.standings import Standing, references, standings
+from ringfence.report.table import Line, Method
 from ringfence.utils.escape import latex, markdown, spreadsheet
 
 # CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
@@ -31,12 +31,10 @@ def export_board(folder: str | Path, form: str, out: str | Path) -> Path:
     return html.write(Path(out), FORMS[form](read(folder)))
 
 
-def _rows(board: Board) -> dict[str, list[Standing | Method]]:
-    """By task: standings by rank, then the methods that were not measured on it, then the references."""
-    tables = standings(board)
-    rows_to_beat = references(board)
-    absent = {t: [m for m in board.methods if not board.of(t, m)] for t in board.tasks}
-    return {t: [*tables[t], *absent[t], *rows_to_beat[t]] for t in board.tasks}
+def _rows(board: Board) -> dict[str, list[Line | Method]]:
+    """By task: lines by rank, then the methods that were not measured on it, then the references."""
+    absent = {t: [m for m in board.methods if not board.line(t, m)] for t in board.tasks}
+    return {t: [*board.lines[t], *absent[t], *each.references] for t, each in board.sections.items()}
 
 
 # --- CSV ---
@@ -59,7 +57,7 @@ def _absent(m: Method) -> dict[str, Any]:
     return {"algorithm": m.algorithm, "preset": m.preset, "variant": m.variant, "method": m.label, "seeds": 0}
 
 
-def _numbers(r: Standing) -> dict[str, Any]:
+def _numbers(r: Line) -> dict[str, Any]:
     method: dict[str, Any] = {"method": r.label, "variant": "reference"}
     if r.method:
         method = {"algorithm": r.method.algorithm, "preset": r.method.preset, "variant": r.method.variant}
@@ -103,7 +101,7 @@ def board_latex(board: Board) -> str:
     """A booktabs `tabular` per task: ± is the deviation between seeds, bold the best within the limit, † over it."""
     lines = ["% needs \\usepackage{booktabs}"]
     for task, rows in _rows(board).items():
-        c = board.constants.get(task)
+        c = board.sections[task].constants
         limit = f", cost limit {c['cost_limit']:g} per episode" if c else ""
         lines += [
             "",
@@ -116,7 +114,7 @@ def board_latex(board: Board) -> str:
         ]
         between = False
         for r in rows:
-            if isinstance(r, Standing) and r.reference and not between:
+            if isinstance(r, Line) and r.reference and not between:
                 between = True
                 lines.append(r"\midrule")
             lines.append(_latex(r))
@@ -124,7 +122,7 @@ def board_latex(board: Board) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _latex(r: Standing | Method) -> str:
+def _latex(r: Line | Method) -> str:
     name = latex(r.label)
     if isinstance(r, Method):
         return " & ".join([name, *["--"] * 5, "0"]) + r" \\"
@@ -153,8 +151,8 @@ def board_markdown(board: Board) -> str:
     head += ["training s", "plan ms", "parameters"]
     blocks = []
     for task, rows in _rows(board).items():
-        c = board.constants.get(task)
-        ends = any(isinstance(r, Standing) and r.ended for r in rows)
+        c = board.sections[task].constants
+        ends = any(isinstance(r, Line) and r.ended for r in rows)
         columns = [*head, "ended early"] if ends else head
         facts = (
             f", cost limit {c['cost_limit']:g}, normalised with {c['return_min']:g} → {c['return_max']:g}" if c else ""
@@ -165,10 +163,9 @@ def board_markdown(board: Board) -> str:
 
 def board_markdown_short(board: Board) -> str:
     """One table per protocol, methods by tasks: normalised return and the cost of safe starts, by mean rank."""
-    tables = standings(board)
-    rows_to_beat = references(board)
+    rows_to_beat = {task: each.references for task, each in board.sections.items()}
     blocks = []
-    for ranking in rankings(board, tables):
+    for ranking in rankings(board):
         head = ["norm. return (cost of safe starts)", *(short(t, board.suite) for t in ranking.tasks), "mean rank"]
         rows = []
         names = dict.fromkeys(r.name for t in ranking.tasks for r in rows_to_beat[t])
@@ -183,7 +180,7 @@ def board_markdown_short(board: Board) -> str:
     return "\n\n".join([*blocks, _legend(board)]) + "\n"
 
 
-def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
+def _markdown(r: Line | Method, board: Board, ends: bool) -> list[str]:
     if isinstance(r, Method):
         blank = ["–"] * (4 if ends else 3)
         return [r.label, "–", "not measured", *["–"] * 4, f"0 of {len(board.seeds)}", *blank]
@@ -206,7 +203,7 @@ def _markdown(r: Standing | Method, board: Board, ends: bool) -> list[str]:
     ]
 
 
-def _brief(r: Standing | None, most: int) -> str:
+def _brief(r: Line | None, most: int) -> str:
     """`most`: seeds of a whole row; fewer are said."""
     if r is None:
         return "not measured"

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,22 +13,14 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
-from matplotlib.text import Annotation
 from matplotlib.ticker import LogFormatter, MaxNLocator
-from matplotlib.transforms import Bbox
 
-from ringfence.errors import UserError
-from ringfence.report.pooling import Line
-from ringfence.report.table import LineT, Row, Section
-from ringfence.training.runs import Run
+from ringfence.report.table import COLOURS, Line, Section, Style
 
-COLOURS = 10  # series colours in style.css
 MARKERS = "osD^vPX*"
 FAR = 8.0  # times the limit: axes of cost that reach further are not linear
 INK, GRID = "#010203", "#010204"
@@ -101,38 +93,21 @@ PANELS = (
 
 
 @dataclass(frozen=True)
-class Panel:
-    """A small figure with a title."""
-
-    title: str
-    svg: Markup
-
-
-@dataclass(frozen=True)
 class Drawn:
     """A figure with a title, and what is said below it."""
 
     title: str
     svg: Markup
-    said: str
+    said: str = ""
 
 
-@dataclass(frozen=True)
-class BarrierField:
-    """A picture of a barrier around an agent, and what is said of it."""
-
-    svg: Markup
-    about: str  # what it shows of the other agent, in words
-    others: int  # further agents
-    radius: float  # of contact
+def colour(of: Style) -> str:
+    """The placeholder of a series colour."""
+    return f"#0102{16 + of[0] % COLOURS:02x}"
 
 
-def colour(row: Line) -> str:
-    return f"#0102{16 + row.style[0] % COLOURS:02x}"
-
-
-def marker(row: Line) -> str:
-    return MARKERS[row.style[1] % len(MARKERS)]
+def marker(of: Style) -> str:
+    return MARKERS[of[1] % len(MARKERS)]
 
 
 @contextmanager
@@ -150,7 +125,7 @@ def figure(width: float, height: float) -> Figure:
     return made
 
 
-def to_svg(made: Figure, label: str, name: str) -> str:
+def to_svg(made: Figure, label: str, name: str) -> Markup:
     """The figure as an accessible inline element without any address in it; `name` keeps ids apart on the page."""
     file = io.BytesIO()
     made.savefig(file, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
@@ -166,42 +141,37 @@ def to_svg(made: Figure, label: str, name: str) -> str:
     text = re.sub(r"font-family: [^;\"]*;?", "", text)
     text = text.replace(INK, "var(--ink)").replace(GRID, "var(--rule)")
     text = re.sub(r"#0102(1[0-9a-f])", lambda m: f"var(--c{int(m[1], 16) - 16})", text)
-    head = f'<svg role="img" aria-label="{_escape(label)}"'
+    head = f'<svg role="img" aria-label="{escape(label)}"'
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    return re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1).replace("<svg", head, 1)
+    return Markup(re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1).replace("<svg", head, 1))
 
 
-def _escape(text: str) -> str:
-    return text.replace("&", "&amp;").replace('"', "&quot;").replace("<", "&lt;")
-
-
-def scatter(section: Section[LineT], rows: Sequence[LineT], x_label: str, name: str) -> str:
-    """Return against the cost of safe starts with 95 % intervals, every point labelled in place."""
-    points = [*rows, *section.references]
+def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) -> Markup:
+    """Return against the cost of safe starts with 95 % intervals, in the colours and markers of the table."""
+    points = [*lines, *section.references]
     with style():
-        made = figure(8.2, 4.8)
+        made = figure(8.2, max(4.4, 0.9 + 0.22 * len(points)))
         ax = made.add_subplot()
-        for row in points:
-            _point(ax, row)
+        for line in points:
+            _point(ax, line)
         ax.margins(0.08, 0.1)
-        several = any(row.limits for row in points)  # one line is no limit of theirs
+        several = any(line.limits for line in points)  # one line is no limit of theirs
         _cost_axis(ax, section.constants["cost_limit"] if section.constants and not several else 0.0)
         ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
-        made.canvas.draw()
-        _label(ax, points)
+        made.legend(loc="outside right upper", frameon=False, fontsize=9)
         each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
         return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
 
 
-def _point(ax: Axes, row: Line) -> None:
-    ink = INK if row.reference else colour(row)
-    x = row.cost_safe_start
-    y = row.returns
-    ax.plot(row.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
-    ax.plot((x, x), row.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
-    face = "none" if row.reference else ink
-    ax.plot(x, y, marker="o" if row.reference else marker(row), color=ink, mfc=face, markersize=7, zorder=3)
+def _point(ax: Axes, line: Line) -> None:
+    ink = INK if line.reference else colour(line.style)
+    x = line.cost_safe_start
+    y = line.returns
+    ax.plot(line.cost_safe_start_interval, (y, y), color=ink, linewidth=1.4, alpha=0.55)
+    ax.plot((x, x), line.returns_interval, color=ink, linewidth=1.4, alpha=0.55)
+    look = {"color": ink, "mfc": "none" if line.reference else ink, "markersize": 7, "zorder": 3, "linestyle": "none"}
+    ax.plot(x, y, marker=marker(line.style), label=line.label, **look)
 
 
 def _cost_axis(ax: Axes, limit: float) -> None:
@@ -225,152 +195,40 @@ def _square(x: np.ndarray) -> np.ndarray:
     return np.sign(x) * x**2
 
 
-# --- names beside points ---
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a name may stand beside its point, and how much it would hide there."""
-
-    penalty: float
-    dx: float
-    dy: float
-    side: str
-    box: Bbox
-    lead: np.ndarray  # (20, 2) points of the line that leads from the point to the name
-
-    @property
-    def far(self) -> bool:
-        """Whether a line has to lead there."""
-        return abs(self.dx) + abs(self.dy) > 30
-
-
-def _label(ax: Axes, points: Sequence[Line]) -> None:
-    """Put every name beside its point where it hides nothing, else where it hides least."""
-    dots = [ax.transData.transform((r.cost_safe_start, r.returns)) for r in points]
-    bars = [(ax.transData.transform(a), ax.transData.transform(b)) for r in points for a, b in _bars(r)]
-    taken: list[Bbox] = []
-    leaders: list[np.ndarray] = []
-    for row, dot in zip(points, dots):
-        places = [_place(ax, row, dot, at, dots, bars, taken, leaders) for at in _around()]
-        best = min(places, key=lambda place: place.penalty)
-        leader = {"arrowstyle": "-", "color": INK, "lw": 0.6, "alpha": 0.6, "shrinkB": 5} if best.far else None
-        _write(ax, row, best.dx, best.dy, best.side, arrowprops=leader).set_in_layout(False)
-        taken.append(best.box)
-        if best.far:
-            leaders += list(best.lead)
-
-
-Segment = tuple[tuple[float, float], tuple[float, float]]
-
-
-def _bars(row: Line) -> tuple[Segment, Segment]:
-    """A point's intervals."""
-    x = row.cost_safe_start
-    y = row.returns
-    left, right = row.cost_safe_start_interval
-    low, high = row.returns_interval
-    return ((left, y), (right, y)), ((x, low), (x, high))
-
-
-def _around() -> list[tuple[float, float, str]]:
-    """(dx, dy, which side of the text is there) in points, the nearest first."""
-    sides = {1: "left", -1: "right", 0: "center"}
-    return [
-        (sign_x * x, sign_y * y, sides[sign_x])
-        for far in range(6)
-        for sign_x, x in ((1, 8 + 12 * far), (-1, 8 + 12 * far), (0, 0))
-        for sign_y, y in ((1, 8 + 14 * far), (-1, 8 + 14 * far))
-    ]
-
-
-def _place(
-    ax: Axes,
-    row: Line,
-    dot: np.ndarray,
-    at: tuple[float, float, str],
-    dots: list[np.ndarray],
-    bars: list[tuple[np.ndarray, np.ndarray]],
-    taken: list[Bbox],
-    leaders: list[np.ndarray],
-) -> Place:
-    """Try a place: other names weigh most, then lines that would cross, points, and intervals."""
-    dx, dy, side = at
-    text = _write(ax, row, dx, dy, side)
-    box = text.get_window_extent().padded(3)
-    text.remove()
-    lead = np.linspace(dot, ((box.x0 + box.x1) / 2, (box.y0 + box.y1) / 2), 20)
-    penalty = sum(2000 + _overlap(box, other) for other in taken if _overlap(box, other))
-    penalty += 400 * sum(box.contains(*other) for other in dots)
-    penalty += 120 * sum(_crosses(box, a, b) for a, b in bars)
-    penalty += 1000 * sum(other.contains(*p) for other in taken for p in lead[::2])
-    penalty += 1000 * sum(box.contains(*p) for p in leaders)
-    frame = ax.get_window_extent()
-    outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y0 < frame.y0 or box.y1 > frame.y1
-    return Place(penalty + 10_000 * outside + abs(dx) + abs(dy), dx, dy, side, box, lead)
-
-
-def _write(ax: Axes, row: Line, dx: float, dy: float, side: str, **more: Any) -> Annotation:
-    return ax.annotate(
-        row.label,
-        (row.cost_safe_start, row.returns),
-        (dx, dy),
-        textcoords="offset points",
-        ha=side,
-        va="center",
-        fontsize=9,
-        color=INK,
-        **more,
-    )
-
-
-def _overlap(a: Bbox, b: Bbox) -> float:
-    """The area that two boxes share."""
-    width = min(a.x1, b.x1) - max(a.x0, b.x0)
-    height = min(a.y1, b.y1) - max(a.y0, b.y0)
-    return width * height if width > 0 and height > 0 else 0.0
-
-
-def _crosses(box: Bbox, a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether a level or upright segment passes through the box."""
-    left, right = sorted((a[0], b[0]))
-    low, high = sorted((a[1], b[1]))
-    return left < box.x1 and right > box.x0 and low < box.y1 and high > box.y0
-
-
 # --- training ---
 
 
-def training_curves(rows: Sequence[Row], name: str) -> list[Panel]:
+Curve = tuple[Line, str, list[tuple[int, float]]]  # whose, line style, (step, value)
+
+
+def training_curves(lines: Sequence[Line], name: str) -> list[Drawn]:
     """One small panel per quantity that any run logged; seeds are thin lines."""
-    runs: dict[Path, tuple[Row, list[dict[str, Any]]]] = {}
-    for row in rows:
-        for run, _ in row.members:
-            runs.setdefault(run.path, (row, run.metrics))
+    runs: dict[Path, tuple[Line, list[dict[str, Any]]]] = {}
+    for line in lines:
+        for row in line.rows:
+            if row.run is not None and row.run.path not in runs:
+                runs[row.run.path] = (line, row.run.metrics)
     panels = []
-    for k, (title, y_label, logarithmic, lines) in enumerate(PANELS):
-        curves = [
-            (row, line_style, [(entry["step"], entry[key]) for entry in log if key in entry])
-            for row, log in runs.values()
-            for key, line_style, _ in lines
+    for k, (title, y_label, logarithmic, metrics) in enumerate(PANELS):
+        curves: list[Curve] = [
+            (line, line_style, points)
+            for line, log in runs.values()
+            for key, line_style, _ in metrics
+            if (points := [(entry["step"], entry[key]) for entry in log if key in entry])
         ]
-        curves = [curve for curve in curves if curve[2]]
         if curves:
-            panels.append(Panel(title, Markup(_curves(title, y_label, logarithmic, curves, f"{name}-{k}"))))
+            panels.append(Drawn(title, _curves(title, y_label, logarithmic, curves, f"{name}-{k}")))
     return panels
 
 
-Curve = tuple[Row, str, list[tuple[int, float]]]  # whose, line style, (step, value)
-
-
-def _curves(title: str, y_label: str, logarithmic: bool, curves: list[Curve], name: str) -> str:
+def _curves(title: str, y_label: str, logarithmic: bool, curves: list[Curve], name: str) -> Markup:
     with style(font_size=9):
         made = figure(3.5, 2.3)
         ax = made.add_subplot()
-        for row, line_style, points in curves:
+        for line, line_style, points in curves:
             points = points[:: -(-len(points) // 300)]  # at most 300 points a line
             steps, values = zip(*points)
-            ax.plot(steps, values, line_style, color=colour(row), linewidth=1.1)
+            ax.plot(steps, values, line_style, color=colour(line.style), linewidth=1.1)
         if logarithmic and all(value > 0 for _, _, points in curves for _, value in points):
             ax.set_yscale("log")
             ax.yaxis.set_major_formatter(Ticks())
@@ -381,160 +239,3 @@ def _curves(title: str, y_label: str, logarithmic: bool, curves: list[Curve], na
         ax.set_ylabel(y_label)
         ax.set_xlabel("update")
         return to_svg(made, f"{title} during training, one thin line per seed", name)
-
-
-# --- barriers ---
-
-AGENT = 0
-OTHER = 1  # who is moved around the agent
-SPEED = 1.0  # m/s at which it approaches
-GRID_SIDE = np.linspace(-1.0, 1.0, 81)  # m
-
-
-@dataclass(frozen=True)
-class Around:
-    """States in which one agent is moved over a grid around another."""
-
-    base: np.ndarray  # (N, D) features of the state that the others stay in
-    position: np.ndarray  # (N, 2)
-    velocity: np.ndarray  # (N, 2)
-    names: Sequence[str]  # of features
-
-    @property
-    def relative(self) -> bool:
-        """Whether features say where others are, seen from the agent; else they say where everybody is."""
-        return "other0.dx" in self.names
-
-    @property
-    def tells(self) -> bool:
-        """Whether features say where the other agent is."""
-        return self.relative or f"agent{OTHER}.x" in self.names
-
-    @property
-    def has_velocity(self) -> bool:
-        return ("other0.dvx" if self.relative else f"agent{OTHER}.vx") in self.names
-
-    @property
-    def rest(self) -> np.ndarray:
-        """(N − 2, 2) where the remaining agents are, seen from the agent."""
-        others = [j for j in range(len(self.position)) if j not in (AGENT, OTHER)]
-        return (self.position[others] - self.position[AGENT]).reshape(-1, 2)
-
-    def states(self, approach: float) -> np.ndarray:
-        """(81², N, D) features, the other agent approaching at this speed."""
-        dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
-        distance = np.maximum(np.hypot(dx, dy), 1e-6)
-        x = np.broadcast_to(self.base, (dx.size, *self.base.shape)).copy()
-        for c, (axis, away) in enumerate(zip("xy", (dx, dy))):
-            speed = approach * (-away / distance).ravel()
-            if self.relative:
-                x[:, AGENT, self.names.index(f"other0.d{axis}")] = away.ravel()
-                if self.has_velocity:
-                    x[:, AGENT, self.names.index(f"other0.dv{axis}")] = speed
-                continue
-            x[:, :, self.names.index(f"agent{OTHER}.{axis}")] = (self.position[AGENT, c] + away.ravel())[:, None]
-            if self.has_velocity:
-                x[:, :, self.names.index(f"agent{OTHER}.v{axis}")] = (self.velocity[AGENT, c] + speed)[:, None]
-        return x
-
-
-def barrier_field(run: Run, state: np.ndarray | None, name: str) -> BarrierField | None:
-    """h of one agent around it, one other agent moved over a grid; None where there is no barrier or the features do
-    not say where others are. `state` (S,) is a real state; None takes a reset."""
-    found = _barrier_around(run, state)
-    if found is None:
-        return None
-    around, barrier, radius = found
-    cases = [("at rest relative to the agent", 0.0)]
-    if around.has_velocity:
-        cases.append((f"approaching at {SPEED:g} m/s", SPEED))
-    shape = (len(GRID_SIDE), len(GRID_SIDE))
-    fields = {case: barrier(around.states(speed))[:, AGENT].reshape(shape) for case, speed in cases}
-    about = "; ".join(_agreement(case, h, radius) for case, h in fields.items())
-    label = f"Learned barrier of agent {AGENT} around it. With the other agent {about}."
-    svg = _draw_fields(fields, radius, around.rest, label, name)
-    return BarrierField(Markup(svg), about, len(around.rest), radius)
-
-
-Barrier = Callable[[np.ndarray], np.ndarray]  # of features (B, N, D), for each agent (B, N)
-
-
-def _barrier_around(run: Run, state: np.ndarray | None) -> tuple[Around, Barrier, float] | None:
-    """What a run knows danger by, where from, and the radius of contact."""
-    import jax
-    import jax.numpy as jnp
-
-    from ringfence.loading import run_worlds
-    from ringfence.loading.resolve import load
-    from ringfence.nets.heads import barrier_on
-
-    if not run.checkpoints():
-        raise UserError(f"'{run.path}' holds no checkpoint.")
-    job, loaded = load(run)
-    policy: Any = loaded  # whatever planner it is
-    networks = getattr(policy, "networks", {})
-    learned = run_worlds.of_run(run).barrier if "barrier" not in networks and job.reads_world else None
-    radius = getattr(job.hazard.hazard, "radius", None)
-    n = job.spec.n_agents
-    if ("barrier" not in networks and learned is None) or radius is None or job.task.env is None or n < 2:
-        return None
-    env: Any = job.task.env
-    reset = env.reset(jax.random.key(1), 1) if state is None else env.from_global_state(jnp.asarray(state)[None])
-    base = np.array(policy.feature_map(env.observe(reset), env.global_state(reset)))[0]
-    flat = np.asarray(env.global_state(reset))[0]
-    position = flat[: 2 * n].reshape(n, 2)
-    velocity = flat[2 * n : 4 * n].reshape(n, 2)
-    around = Around(base, position, velocity, job.spec.feature_names)
-
-    def barrier(features: np.ndarray) -> np.ndarray:
-        x = jnp.asarray(features)
-        h = barrier_on(networks["barrier"], policy.normaliser, x) if learned is None else learned.of_steps(x, x)
-        return np.asarray(h)
-
-    return (around, barrier, radius) if around.tells else None
-
-
-def _draw_fields(fields: dict[str, np.ndarray], radius: float, rest: np.ndarray, label: str, name: str) -> str:
-    most = max(np.abs(h).max() for h in fields.values()) or 1.0
-    near = rest[np.abs(rest).max(1) < 1] if len(rest) else rest
-    scale = TwoSlopeNorm(0.0, -most, most)
-    with style(axes_grid=False):
-        made = figure(4.1 * len(fields) + 0.7, 4.0)
-        axes = made.subplots(1, len(fields), squeeze=False, sharey=True)[0]
-        for ax, (case, h) in zip(axes, fields.items()):
-            _draw_field(ax, h, scale, radius, near)
-            ax.set(title=f"other agent {case}", xlabel="other agent's x − own x (m)", xlim=(-1, 1), ylim=(-1, 1))
-        axes[0].set_ylabel("other agent's y − own y (m)")
-        bar = made.colorbar(axes[-1].images[0], ax=list(axes), shrink=0.85)
-        bar.set_label("h  (negative: judged unsafe)")
-        return to_svg(made, label, name)
-
-
-def _draw_field(ax: Axes, h: np.ndarray, scale: TwoSlopeNorm, radius: float, near: np.ndarray) -> None:
-    extent = (-1.0125, 1.0125, -1.0125, 1.0125)
-    ax.imshow(h, origin="lower", extent=extent, cmap="RdBu", norm=scale, interpolation="bilinear")
-    if h.min() < 0 < h.max():
-        ax.contour(GRID_SIDE, GRID_SIDE, h, [0.0], colors="black", linewidths=1.8)
-    ax.add_patch(Circle((0, 0), radius, fill=False, linestyle="--", edgecolor="black", linewidth=1.2))
-    ax.plot(0, 0, "+", color="black")
-    if len(near):
-        ax.plot(near[:, 0], near[:, 1], "o", mfc="none", color="black", markersize=9)
-
-
-def _agreement(case: str, h: np.ndarray, radius: float) -> str:
-    """How well the sign of h tells contact, in words."""
-    dx, dy = np.meshgrid(GRID_SIDE, GRID_SIDE)
-    contact = np.maximum(np.hypot(dx, dy), 1e-6) < radius
-    inside = 100 * float((h[contact] < 0).mean())
-    outside = 100 * float((h[~contact] < 0).mean())
-    return f"{case}, h < 0 on {inside:.0f} % of the area in contact and on {outside:.0f} % of the rest"
-
-
-def lonely_state(states: np.ndarray, n: int) -> np.ndarray:
-    """Of recorded states (R, L+1, S), the one in which agent 0 is farthest from the agents 2, 3, ...: they must not
-    decide its barrier."""
-    flat = states.reshape(-1, states.shape[-1])
-    position = flat[:, : 2 * n].reshape(-1, n, 2)
-    if n < 3:
-        return flat[0]
-    return flat[np.linalg.norm(position[:, 2:] - position[:, :1], axis=-1).min(1).argmax()]

@@ -8,8 +8,7 @@ from typing import Any
 from ringfence.evaluation import reference, statistics
 from ringfence.evaluation.statistics import Interval
 from ringfence.report.html import share
-from ringfence.report.pooling import Line
-from ringfence.report.table import LineT, Section
+from ringfence.report.table import Line, Section
 
 WORDS = {  # constraint -> (what the cost counts, what a violation is)
     "Separation": ("collision steps", "a collision"),
@@ -29,7 +28,7 @@ def danger(hazard: dict[str, Any]) -> str:
     return f"a distance below {hazard['radius']:g} m" if hazard.get("kind") == "Separation" else ""
 
 
-def headline(section: Section[LineT], split: str = "test") -> list[str]:
+def headline(section: Section, split: str = "test") -> list[str]:
     """The outcome in plain sentences, from the numbers of a split."""
     rows = section.tables.get(split, [])
     if not rows:

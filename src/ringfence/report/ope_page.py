@@ -48,14 +48,14 @@ def _figures(card: Card, result: OPEResult | None) -> list[Drawn]:
     drawn = []
     barrier = card.barrier
     if barrier is not None and barrier.calibration:
-        drawn.append(Drawn("What a margin means", Markup(_calibration(barrier)), _said_of(barrier)))
+        drawn.append(Drawn("What a margin means", _calibration(barrier), _said_of(barrier)))
     if result is not None and result.safety is not None:
         said = (
             "The share of safe logged states whose smallest predicted margin is below a value. Below 0: danger is "
             "predicted. Below 1: the calibrated margin is not kept."
         )
         title = f"Margins predicted along {result.ahead} steps"
-        drawn.append(Drawn(title, Markup(_margins(result.safety)), said))
+        drawn.append(Drawn(title, _margins(result.safety), said))
     return drawn
 
 
@@ -64,7 +64,7 @@ def _rates(behaviour: Behaviour) -> list[tuple[str, float]]:
     return [(said, rate) for said, rate in rates if rate is not None]
 
 
-def _calibration(barrier: BarrierScores) -> str:
+def _calibration(barrier: BarrierScores) -> Markup:
     """Unsafe steps in 1000, and safe ones kept, by margin."""
     rows = barrier.calibration
     x = [row.margin for row in rows]
@@ -87,7 +87,7 @@ def _said_of(barrier: BarrierScores) -> str:
     return f"Dashed: the default margin, {barrier.margin:.2g}. Held-out steps, as often unsafe as in the logs."
 
 
-def _margins(safety: Safety) -> str:
+def _margins(safety: Safety) -> Markup:
     lines = {"policy": (safety.margins, "-"), "logs": (safety.margins_of_logs, (0, (4, 2)))}
     with style():
         made = figure(8.2, 3.0)

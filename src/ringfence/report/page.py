@@ -15,13 +15,16 @@ from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
+from ringfence.evaluation.table import Row
 from ringfence.logs.provenance import regenerated
 from ringfence.problem import constraints
-from ringfence.report import animation, figures, html, made
-from ringfence.report.headline import headline, words_of
+from ringfence.report import barrier, figures, html, player, provenance
+from ringfence.report.headline import danger, headline, words_of
 from ringfence.report.pooling import mean_of
-from ringfence.report.table import NAMES, Row, Section, sections
+from ringfence.report.table import Line, Method, Section, sections
 from ringfence.training.runs import Run
+
+TEMPLATE = "page.html.j2"
 
 
 def build_report(
@@ -36,28 +39,30 @@ def build_report(
     out = html.page_file(out)
     context = {
         "title": title or "Ringfence report: " + ", ".join(s.task for s in found),
+        "board": None,
         "js": Markup(html.asset("player.js")),
-        "sections": [_section(s, k, out) for k, s in enumerate(found)],
+        "sections": [of_section(s, k) | _of_runs(s, k, out) for k, s in enumerate(found)],
+        "environments": provenance.environments([run for s in found for run in s.runs]),
     }
-    return html.write(out, html.render("template.html.j2", context))
+    return html.write(out, html.render(TEMPLATE, context))
 
 
 @dataclass(frozen=True)
 class SplitTable:
-    """The rows of one split, and what stands below them."""
+    """The lines of one split, and what stands below them."""
 
     split: str
-    rows: list[Row]
-    references: list[Row]  # of the test split alone
+    lines: list[Line]
+    references: list[Line]  # of the first split alone
     constraints: list[ConstraintLine]
     guards: list[GuardLine]
 
 
 @dataclass(frozen=True)
 class GuardLine:
-    """What the guard of a row says of itself."""
+    """What the guard of a line says of itself."""
 
-    row: Row
+    line: Line
     verdict: str | None  # of its World; None of results of before
     infeasible: float  # share of the steps in which no action kept the margin
     ood: float | None  # share of the steps that the logs do not cover
@@ -65,9 +70,9 @@ class GuardLine:
 
 @dataclass(frozen=True)
 class ConstraintLine:
-    """What a named constraint cost a row, mean of its runs; None where the runs do not say."""
+    """What a named constraint cost a line, mean of its runs; None where the runs do not say."""
 
-    row: Row
+    line: Line
     name: str
     cost_mean: float | None
     violation_rate: float | None
@@ -75,132 +80,111 @@ class ConstraintLine:
     limit_satisfied_rate: float | None
 
 
-@dataclass(frozen=True)
-class Family:
-    """An algorithm and preset in the legend of the training curves."""
-
-    name: str
-    colour: int
-
-
-def _section(section: Section[Row], k: int, out: Path) -> dict[str, Any]:
-    """What the template shows of a task."""
+def of_section(section: Section, k: int) -> dict[str, Any]:
+    """What every page shows of a task."""
     unit, _ = words_of(section.hazard)
-    test = section.tables.get("test", [])
-    recorded = animation.players(section)
+    first = next(iter(section.tables), "")
+    shown = [*section.lines, *section.references]
+    tables = []
+    for split, lines in section.tables.items():
+        beside = [line for line in section.references if split == first and line.rows[0].split in (split, "data")]
+        tables.append(SplitTable(split, lines, beside, constraint_table(lines), guard_table(lines)))
     return {
         "id": f"task{k}",
         "task": section.task,
+        "short": section.task,
         "unit": unit,
         "headline": headline(section),
-        "tables": [
-            SplitTable(
-                split, rows, section.references if split == "test" else [], constraint_table(rows), guard_table(rows)
-            )
-            for split, rows in section.tables.items()
-        ],
+        "tables": tables,
+        # What a page of runs or of a board has beside it, or neither.
+        **dict.fromkeys(("absent", "contests", "files"), ()),
+        **dict.fromkeys(("curves", "fields", "players", "films", "simulated", "commands"), ()),
+        "ends": any(line.ended for line in shown),
+        "danger": danger(section.hazard),
         "constants": section.constants,
-        "limits": {name: limit for row in section.rows for name, limit in row.limits.items()},
+        "limits": {name: limit for line in section.lines for name, limit in line.limits.items()},
         "ceiling": section.card.get("return_ceiling"),
         "protocol": section.protocol,
-        "several_seeds": any(len(r.seeds) > 1 for r in section.rows),
-        "colours": figures.COLOURS,
-        "scatter": Markup(figures.scatter(section, test, f"{unit} per episode", f"s{k}")) if test else None,
-        "curves": figures.training_curves(section.rows, f"t{k}"),
-        "families": _families(section.rows),
-        "fields": _fields(section, k),
-        "players": recorded,
-        "films": animation.films(section),
-        "film_shows": _film_shows(section),
-        "simulated": _simulated(section) is not None,
-        "players_json": Markup(json.dumps(recorded).replace("<", "\\u003c")),
-        "commands": made.commands(section, out),
-        "differences": made.differences(section.runs),
-        "environments": made.environments(section.runs),
-        "card": made.facts(section.card),
+        "scatter": figures.scatter(section, tables[0].lines, f"{unit} per episode", f"s{k}") if tables else None,
+        "card": provenance.facts(section.card),
         "regenerated": regenerated(section.card),
     }
 
 
-def _simulated(section: Section[Row]) -> Task | None:
+def _of_runs(section: Section, k: int, out: Path) -> dict[str, Any]:
+    """What the page of runs shows beside that."""
+    recorded = player.players(section)
+    simulated = _simulated(section)
+    families = {_family_name(m): line.style[0] for line in section.lines if (m := line.method)}
+    return {
+        "curves": figures.training_curves(section.lines, f"t{k}"),
+        "families": families,
+        "fields": _fields(section, k),
+        "players": recorded,
+        "players_json": Markup(json.dumps(recorded, separators=(",", ":")).replace("<", "\\u003c")),
+        "films": player.films(section),
+        "film_shows": getattr(simulated.env, "film_shows", "") if simulated else "",
+        "simulated": simulated is not None,
+        "commands": provenance.commands(section, out),
+        "differences": provenance.differences(section.runs),
+    }
+
+
+def _simulated(section: Section) -> Task | None:
     """The task, where a simulator of this package plays it."""
     return registry.simulated(section.task, constraints.from_dict(section.hazard)) if section.hazard else None
 
 
-def _film_shows(section: Section[Row]) -> str:
-    """What films of a task show, in words; empty where its simulator draws none."""
-    task = _simulated(section)
-    return "" if task is None else getattr(task.env, "film_shows", "")
-
-
-def guard_table(rows: list[Row]) -> list[GuardLine]:
-    """A line for each row that was played under a guard."""
+def guard_table(lines: list[Line]) -> list[GuardLine]:
+    """What guards say, of each line that was played under one."""
     found = []
-    for row in rows:
-        results = [result for _, result in row.members]
+    for line in lines:
+        results = [row.result for row in line.rows]
         infeasible = mean_of(results, "infeasible_rate")
         if infeasible is None:
             continue
         verdicts = {result.get("verdict") for result in results}
         verdict = verdicts.pop() if len(verdicts) == 1 else None
-        found.append(GuardLine(row, verdict, infeasible, mean_of(results, "ood_rate")))
+        found.append(GuardLine(line, verdict, infeasible, mean_of(results, "ood_rate")))
     return found
 
 
-def constraint_table(rows: list[Row]) -> list[ConstraintLine]:
-    """A line for each named constraint of the rows whose simulator names them."""
+def constraint_table(lines: list[Line]) -> list[ConstraintLine]:
+    """Each named constraint of the lines whose simulator names them."""
     found = []
-    for row in rows:
-        costs = [result["constraints"] for _, result in row.members if "constraints" in result]
-        if not costs or len(costs) < len(row.members):
+    for line in lines:
+        costs = [row.result["constraints"] for row in line.rows if "constraints" in row.result]
+        if not costs or len(costs) < len(line.rows):
             continue
         for name in costs[0]:
             runs = [by_name[name] for by_name in costs if name in by_name]
-            line = ConstraintLine(
-                row=row,
-                name=name,
-                cost_mean=mean_of(runs, "cost_mean"),
-                violation_rate=mean_of(runs, "violation_rate"),
-                limit=mean_of(runs, "limit"),
-                limit_satisfied_rate=mean_of(runs, "limit_satisfied_rate"),
-            )
-            found.append(line)
+            keys = ("cost_mean", "violation_rate", "limit", "limit_satisfied_rate")
+            found.append(ConstraintLine(line, name, *(mean_of(runs, key) for key in keys)))
     return found
 
 
-def _families(rows: list[Row]) -> list[Family]:
-    """Algorithms and presets with their colours."""
-    found: dict[tuple[str, str], Family] = {}
-    for row in rows:
-        name = _family_name(NAMES.get(row.algorithm, row.algorithm), row.preset)
-        found.setdefault((row.algorithm, row.preset), Family(name, row.style[0] % figures.COLOURS))
-    return list(found.values())
+def _family_name(method: Method) -> str:
+    return method.name if method.preset == "default" else f"{method.name} {method.preset}"
 
 
-def _family_name(name: str, preset: str) -> str:
-    return name if preset == "default" else f"{name} {preset}"
-
-
-def _fields(section: Section[Row], k: int) -> list[dict[str, Any]]:
+def _fields(section: Section, k: int) -> list[dict[str, Any]]:
     """Pictures of learned barriers, one per algorithm and preset; what cannot be loaded is said, not hidden."""
+    first: dict[str, Row] = {}
+    for line in section.lines:
+        if line.method is not None and line.rows[0].config["config"].get("barrier"):
+            first.setdefault(_family_name(line.method), line.rows[0])
     found: list[dict[str, Any]] = []
-    seen = set()
-    for row in section.rows:
-        run = min((run for run, _ in row.members), key=lambda run: run.config["seed"])
-        config = run.config
-        family = (row.algorithm, row.preset)
-        if family in seen or not config["config"].get("barrier"):
-            continue
-        seen.add(family)
-        entry = {"name": _family_name(row.name, row.preset), "seed": config["seed"]}
-        state = _lonely_state(run, config["spec"]["n_agents"])
+    for name, row in first.items():
+        assert row.run is not None, "a method's row"
+        state = _lonely_state(row.run, row.config["spec"]["n_agents"])
+        entry: dict[str, Any] = {"name": name, "seed": row.seed}
         try:
-            drawn = figures.barrier_field(run, state, f"b{k}-{len(found)}")
+            drawn = barrier.field(row.run, state, f"b{k}-{len(found)}")
         except UserError as error:
             found.append(entry | {"missing": str(error)})
             continue
         if drawn is not None:
-            found.append(entry | {"field": drawn, "real": state is not None})
+            found.append(entry | {"field": drawn})
     return found
 
 
@@ -210,5 +194,5 @@ def _lonely_state(run: Run, n: int) -> np.ndarray | None:
         recorded = recordings.read(run.path, variant)
         if recorded is not None and "states" in recorded:
             states = recorded["states"]
-            return figures.lonely_state(states, n) if states.shape[-1] == 6 * n else None
+            return barrier.lonely_state(states, n) if states.shape[-1] == 6 * n else None
     return None

@@ -1,10 +1,5 @@
 "use strict";
 (function () {
-  const whole = (text) => {
-    const raw = atob(text), bytes = new Uint8Array(raw.length);
-    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
-    return new Int16Array(bytes.buffer);
-  };
   const variable = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   const redraws = [];
 
@@ -14,16 +9,13 @@
     const play = box.querySelector(".play"), scrub = box.querySelector(".scrub"), status = box.querySelector(".status");
     const episode = box.querySelector(".episode"), speed = box.querySelector(".speed"), toggle = box.querySelector(".plans");
     const n = recording.agents;
-    const read = recording.episodes.map((e) => ({
-      ...e, positions: whole(e.positions), landmarks: whole(e.landmarks), plans: e.plans ? whole(e.plans) : null,
-    }));
-    const chosen = () => read[+episode.value];
+    const chosen = () => recording.episodes[+episode.value];
     let now = 0, playing = false, last = 0;
 
     const at = (e, t, i) => {
-      const s = Math.min(Math.floor(t), e.steps), f = Math.min(s + 1, e.steps), w = t - s, k = 2 * i;
-      const a = 2 * n * s + k, b = 2 * n * f + k, p = e.positions;
-      return [(p[a] * (1 - w) + p[b] * w) * e.unit, (p[a + 1] * (1 - w) + p[b + 1] * w) * e.unit];
+      const s = Math.min(Math.floor(t), e.steps), w = t - s;
+      const a = e.positions[s][i], b = e.positions[Math.min(s + 1, e.steps)][i];
+      return [(a[0] * (1 - w) + b[0] * w) * e.unit, (a[1] * (1 - w) + b[1] * w) * e.unit];
     };
 
     function touching(points, charged) {  // by distance where bodies have a radius, else by what each was charged
@@ -50,8 +42,8 @@
       ink.strokeRect(X(-half), Y(half), 2 * half * scale, 2 * half * scale);
       ink.strokeStyle = dark;
       ink.lineWidth = 2 * unit;
-      for (let k = 0; k < e.landmarks.length; k += 2) {
-        const x = X(e.landmarks[k] * e.unit), y = Y(e.landmarks[k + 1] * e.unit), r = 6 * unit;
+      for (const mark of e.landmarks) {
+        const x = X(mark[0] * e.unit), y = Y(mark[1] * e.unit), r = 6 * unit;
         ink.beginPath();
         ink.moveTo(x - r, y - r); ink.lineTo(x + r, y + r); ink.moveTo(x - r, y + r); ink.lineTo(x + r, y - r);
         ink.stroke();
@@ -85,22 +77,18 @@
         ink.stroke();
       }
       if (e.plans && toggle.checked) {
-        const step = Math.min(Math.floor(now), e.steps - 1), [, p, h, m] = e.shape;
-        for (let q = p - 1; q >= 0; q--) for (let i = 0; i < m; i++) {  // the chosen plan, the first, on top
-          const followed = q === 0;
+        const drawn = e.plans[Math.min(Math.floor(now), e.steps - 1)];
+        for (let q = drawn.length - 1; q >= 0; q--) for (let i = 0; i < n; i++) {  // the chosen plan, the first, on top
+          const followed = q === 0, path = drawn[q].map((row) => [X(row[i][0] * 1e-3), Y(row[i][1] * 1e-3)]);
           ink.globalAlpha = followed ? 1 : 0.3;
           ink.lineWidth = (followed ? 2.6 : 1.2) * unit;
           ink.strokeStyle = ink.fillStyle = colours[i % 7];
           ink.beginPath();
-          for (let r = 0; r < h; r++) {
-            const k = 2 * (i + m * (r + h * (q + p * step))), x = X(e.plans[k] * 1e-3), y = Y(e.plans[k + 1] * 1e-3);
-            r ? ink.lineTo(x, y) : ink.moveTo(x, y);
-          }
+          for (const [x, y] of path) ink.lineTo(x, y);
           ink.stroke();
           if (followed) {
-            const k = 2 * (i + m * (h - 1 + h * (q + p * step)));
             ink.beginPath();
-            ink.arc(X(e.plans[k] * 1e-3), Y(e.plans[k + 1] * 1e-3), 3.4 * unit, 0, 2 * Math.PI);
+            ink.arc(...path[path.length - 1], 3.4 * unit, 0, 2 * Math.PI);
             ink.fill();
           }
         }

@@ -1,4 +1,4 @@
-"""Runs of one method on one task, played on the same resets, as one row of numbers. Both kinds of page rest on it."""
+"""Results of one method on one task, played on the same resets, as one line of numbers."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.evaluation import statistics
 from ringfence.evaluation.statistics import Interval
+from ringfence.evaluation.table import Result
 
-Result = dict[str, Any]  # a summary of episodes as results.json has it (schemas.Result), under today's names
 Number = TypeVar("Number", float, np.ndarray)
 
 
 @dataclass(kw_only=True)
 class Numbers:
-    """Per episode, over all runs of a row. Intervals are 95 %."""
+    """Per episode, over all runs of a line. Intervals are 95 %."""
 
     episodes: int  # over all runs
     returns: float
@@ -29,6 +29,8 @@ class Numbers:
     cost_norm: float
     cost_safe_start: float
     cost_safe_start_interval: Interval
+    returns_sd: float | None  # between runs; None of one
+    cost_sd: float | None
     violations: int
     violation_upper: float  # exact, one-sided, of the resets on which any run has one
     unsafe_starts: int
@@ -41,27 +43,8 @@ class Numbers:
         return self.violations / self.episodes
 
 
-@dataclass(kw_only=True)
-class Line(Numbers):
-    """A row of a table: a method over its seeds, or a reference policy."""
-
-    name: str  # in plain words
-    variant: str  # what is evaluated beside the default, in short; empty for references
-    seeds: tuple[int, ...]  # none of a reference
-    reference: bool = False
-    parameters: int | None = None
-    train_seconds: float | None = None  # of one seed
-    plan_ms: float | None = None  # median of one joint action
-    style: tuple[int, int] = (0, 0)  # colour, marker
-
-    @property
-    def label(self) -> str:
-        """Name and variant in one line, e.g. `ICBF-Diffuser split+plans4`."""
-        return f"{self.name} {self.variant}".strip()
-
-
-def pool(results: list[Result], name: str = "the runs of a row") -> Numbers:
-    """The summaries of a row's runs as one. `UserError` if they played different numbers of resets.
+def pool(results: list[Result], name: str = "the runs of a line") -> Numbers:
+    """The summaries of a line's runs as one. `UserError` if they played different numbers of resets.
 
     The interval of one run speaks of its episodes alone, that of several also of what another seed would have trained.
     """
@@ -72,12 +55,18 @@ def pool(results: list[Result], name: str = "the runs of a row") -> Numbers:
     return Numbers(
         **measured,
         episodes=sum(r["episodes"] for r in results),
+        returns_sd=_deviation(results, "return_mean"),
+        cost_sd=_deviation(results, "cost_mean"),
         violations=sum(map(_violations, results)),
         returns_norm=normal_return(measured["returns"], constants),
         cost_norm=_worst_share(results, limits) if limits else normal_cost(measured["cost"], constants),
         safe=kept and measured["cost_interval"][1] <= constants["cost_limit"],
         limits=limits,
     )
+
+
+def _deviation(results: list[Result], key: str) -> float | None:
+    return float(np.std([r[key] for r in results], ddof=1)) if len(results) > 1 else None
 
 
 def limits_of(results: Iterable[Result]) -> dict[str, float]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.ticker import MaxNLocator
@@ -54,7 +53,7 @@ def _neighbour(probe: Probe, subject: str, name: str) -> Drawn:
         ax.set_xlabel("distance")
         ax.set_ylabel("called unsafe, %")
         ax.legend(frameon=False)
-        svg = Markup(to_svg(made, title, name))
+        svg = to_svg(made, title, name)
     said = "Held-out states with it put at a quarter to twice the radius that these logs tell"
     return Drawn(title, svg, f"{said} ({_said(probe.edge)}, dotted).")
 
@@ -71,7 +70,7 @@ def _curve(probe: Probe, subject: str, name: str) -> Drawn:
         ax.set_ylim(-1.05 * MARGINS, 1.05 * MARGINS)
         ax.set_xlabel(subject.split(" (")[0])
         ax.set_ylabel("score, in margins")
-        svg = Markup(to_svg(made, title, name))
+        svg = to_svg(made, title, name)
     begins = "Danger begins nowhere here." if np.isnan(probe.edge) else f"Dotted: danger begins at {_said(probe.edge)}."
     return Drawn(title, svg, f"Shaded: called unsafe. {begins}")
 
@@ -104,5 +103,5 @@ def _map(plane: ProbeMap, subject: str, name: str) -> Drawn:
         ax.set_ylabel(entries[-1])
         ax.xaxis.set_major_locator(MaxNLocator(5))
         made.colorbar(image, ax=ax).set_label("score, in margins")
-        svg = Markup(to_svg(made, title, name))
+        svg = to_svg(made, title, name)
     return Drawn(title, svg, f"Red: called unsafe, {100 * float((scores < 0).mean()):.0f} % of this plane.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,27 +10,19 @@ from matplotlib.patches import Circle
 
 from ringfence.evaluation.replay.result import Film, ReplayResult
 from ringfence.report import html
-from ringfence.report.figures import INK, figure, style, to_svg
+from ringfence.report.figures import INK, Drawn, figure, style, to_svg
 
 BEYOND = 2.0  # m around the driven agent that are shown
 
 
-@dataclass(frozen=True)
-class Drawn:
-    """A window as a picture."""
-
-    title: str
-    svg: Markup
-
-
 def build_replay(out: str | Path, result: ReplayResult) -> Path:
     """Write the page of a replay."""
-    drawn = [Drawn(film.title, Markup(_drawn(film, result.radius, k))) for k, film in enumerate(result.films)]
+    drawn = [Drawn(film.title, _drawn(film, result.radius, k)) for k, film in enumerate(result.films)]
     title = f"{result.task}: one agent driven, the others as logged"
     return html.write(Path(out), html.render("replay.html.j2", {"title": title, "result": result, "films": drawn}))
 
 
-def _drawn(film: Film, radius: float, number: int) -> str:
+def _drawn(film: Film, radius: float, number: int) -> Markup:
     """Paths of the driven agent without guard, with it and as logged, among the others'."""
     own = np.concatenate([film.logged, film.alone, film.guarded])[:, :2]  # from above
     low, high = own.min(0) - BEYOND, own.max(0) + BEYOND

@@ -1,35 +1,21 @@
-"""From a board's rows to numbers: one standing per task and method, ranks, and what holds over all tasks."""
+"""From a board's lines to what compares methods: paired tests on a task, and statistics over all tasks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from ringfence.datasets.registry import TASKS
 from ringfence.evaluation import statistics
-from ringfence.report.board import Board, Entry, Method
-from ringfence.report.figures import COLOURS
-from ringfence.report.pooling import Interval, Line, Result, mean_of, normal_cost, normal_return, pool
+from ringfence.evaluation.statistics import Interval
+from ringfence.evaluation.table import Result
+from ringfence.report.board import Board
+from ringfence.report.pooling import normal_cost, normal_return
+from ringfence.report.table import Line, Method
 
 DRAWS = 2000  # of every bootstrap
-
-
-@dataclass(kw_only=True)
-class Standing(Line):
-    """A row of a task's ranking: a method over its seeds, or a reference policy."""
-
-    task: str
-    method: Method | None  # None: a reference
-    returns_sd: float | None = None  # between seeds; None with fewer than two
-    returns_norm_sd: float | None = None
-    cost_sd: float | None = None
-    ended: float | None = None  # share of episodes that ended before the time limit; None: not said
-    steps: float | None = None  # mean of an episode
-    rank: int = 0  # on this task, from 1; 0 for references
-    best: bool = False  # the highest return among the safe
-    entries: list[Entry] = field(default_factory=list, repr=False)
 
 
 @dataclass(frozen=True)
@@ -40,7 +26,7 @@ class Contest:
     adjusted after Holm over all contests of the task, returns and costs together.
     """
 
-    other: Standing
+    other: Line
     returns: float
     returns_interval: Interval
     returns_p: float
@@ -75,39 +61,12 @@ class Aggregate:
     cost_bands: list[np.ndarray | None]
 
 
-def standings(board: Board) -> dict[str, list[Standing]]:
-    """By task: the methods that were measured on it, ranked, in the order of rank."""
-    styles = _styles(board.methods)
-    made = {}
-    for task in board.tasks:
-        rows = [_standing(board, task, m, styles[m]) for m in board.methods if board.of(task, m)]
-        made[task] = _ranked(rows, board.constants[task]["cost_limit"]) if rows else []
-    return made
-
-
-def references(board: Board) -> dict[str, list[Standing]]:
-    """By task: the rows that every method is read against."""
-    return {t: [_reference(t, name, r) for name, r in board.references.get(t, {}).items()] for t in board.tasks}
-
-
-def _ranked(rows: list[Standing], limit: float) -> list[Standing]:
-    """Lexicographic, judged by the upper end of the cost's interval: within the limit first, by return; then the
-    rest, by cost."""
-    returns = [r.returns for r in rows]
-    # Who keeps the sum but not each constraint's own limit is over the limit.
-    costs = [r.cost_interval[1] if r.safe or not r.limits else max(r.cost_interval[1], 2 * limit + 1) for r in rows]
-    for row, place in zip(rows, statistics.places(returns, costs, limit)):
-        row.rank = int(place)
-        row.best = row.safe and bool(place == 1)
-    return [rows[i] for i in statistics.rank(returns, costs, limit)]
-
-
-def contests(rows: list[Standing]) -> list[Contest]:
-    """The first of a task's ranked rows against each of the others."""
-    if len(rows) < 2:
+def contests(lines: list[Line]) -> list[Contest]:
+    """The first of a task's ranked lines against each of the others."""
+    if len(lines) < 2:
         return []
-    first = rows[0]
-    others = rows[1:]
+    first = lines[0]
+    others = lines[1:]
     returns = [statistics.paired_test(_per_reset(first, "return"), _per_reset(other, "return")) for other in others]
     costs = [statistics.paired_test(_per_reset(first, "cost"), _per_reset(other, "cost")) for other in others]
     adjusted = statistics.holm([test["p"] for test in (*returns, *costs)])
@@ -127,67 +86,8 @@ def contests(rows: list[Standing]) -> list[Contest]:
     ]
 
 
-def _per_reset(row: Standing, what: str) -> np.ndarray:
-    return np.mean([e.summary["per_episode"][what] for e in row.entries], 0)
-
-
-def _standing(board: Board, task: str, method: Method, style: tuple[int, int]) -> Standing:
-    entries = board.of(task, method)
-    results = [e.summary for e in entries]
-    constants = board.constants[task]
-    deviation = _deviation(results, "return_mean")
-    if deviation is None:
-        normalised = None
-    else:
-        normalised = deviation / (constants["return_max"] - constants["return_min"])
-    return Standing(
-        task=task,
-        name=method.name,
-        variant=method.shown,
-        method=method,
-        seeds=tuple(e.seed for e in entries),
-        returns_sd=deviation,
-        returns_norm_sd=normalised,
-        cost_sd=_deviation(results, "cost_mean"),
-        ended=mean_of(results, "termination_rate"),
-        steps=mean_of(results, "steps_mean"),
-        train_seconds=mean_of(results, "train_seconds"),
-        plan_ms=mean_of(results, "plan_ms_p50"),
-        parameters=results[0].get("parameters"),
-        style=style,
-        entries=entries,
-        **vars(pool(results)),
-    )
-
-
-def _reference(task: str, name: str, result: Result) -> Standing:
-    return Standing(
-        task=task,
-        name=name,
-        variant="",
-        method=None,
-        seeds=(),
-        reference=True,
-        ended=result.get("termination_rate"),
-        steps=result.get("steps_mean"),
-        **vars(pool([result])),
-    )
-
-
-def _deviation(results: list[Result], key: str) -> float | None:
-    return float(np.std([r[key] for r in results], ddof=1)) if len(results) > 1 else None
-
-
-def _styles(methods: list[Method]) -> dict[Method, tuple[int, int]]:
-    """A colour per algorithm and preset; no two methods have both colour and marker in common."""
-    families: dict[tuple, int] = {}
-    taken: dict[int, int] = {}
-    styles = {}
-    for m in methods:
-        colour = families.setdefault((m.algorithm, m.preset), len(families)) % COLOURS
-        taken[colour] = taken.get(colour, -1) + 1
-        styles[m] = colour, taken[colour]
-    return styles
+def _per_reset(line: Line, what: str) -> np.ndarray:
+    return np.mean([row.result["per_episode"][what] for row in line.rows], 0)
 
 
 # --- over all tasks ---
@@ -248,7 +148,8 @@ def _common_seeds(board: Board, tasks: list[str]) -> tuple[dict[Method, tuple[in
     seeds: dict[Method, tuple[int, ...]] = {}
     left_out: dict[Method, list[str]] = {}
     for method in board.methods:
-        had = {task: {e.seed for e in board.of(task, method)} for task in tasks}
+        lines = {task: board.line(task, method) for task in tasks}
+        had = {task: set(line.seeds) if line else set() for task, line in lines.items()}
         common = tuple(sorted(set.intersection(*had.values())))
         if common:
             seeds[method] = common
@@ -257,29 +158,25 @@ def _common_seeds(board: Board, tasks: list[str]) -> tuple[dict[Method, tuple[in
     return seeds, left_out
 
 
-Score = Callable[[Result, dict[str, float]], float | np.ndarray]  # of a result, given its task's constants
+Score = Callable[[Result], float | np.ndarray]
 
 
 def _scores(board: Board, tasks: list[str], method: Method, seeds: tuple[int, ...], score: Score) -> np.ndarray:
     """(seeds, tasks, ...) scores of a method."""
-    rows = [[_entry(board, task, method, seed) for task in tasks] for seed in seeds]
-    return np.array([[score(e.summary, board.constants[e.task]) for e in row] for row in rows])
+    by_task = [{row.seed: row.result for row in line.rows} for t in tasks if (line := board.line(t, method))]
+    return np.array([[score(results[seed]) for results in by_task] for seed in seeds])
 
 
-def _entry(board: Board, task: str, method: Method, seed: int) -> Entry:
-    return next(e for e in board.of(task, method) if e.seed == seed)
+def _normal_return(result: Result) -> float:
+    return normal_return(result["return_mean"], result["constants"])
 
 
-def _normal_return(result: Result, constants: dict[str, float]) -> float:
-    return normal_return(result["return_mean"], constants)
+def _normal_cost(result: Result) -> float:
+    return normal_cost(result["cost_mean"], result["constants"])
 
 
-def _normal_cost(result: Result, constants: dict[str, float]) -> float:
-    return normal_cost(result["cost_mean"], constants)
-
-
-def _normal_episode_costs(result: Result, constants: dict[str, float]) -> np.ndarray:
-    return normal_cost(np.array(result["per_episode"]["cost"]), constants)
+def _normal_episode_costs(result: Result) -> np.ndarray:
+    return normal_cost(np.array(result["per_episode"]["cost"]), result["constants"])
 
 
 def _range(scores: dict[Method, np.ndarray]) -> Interval:

@@ -1,24 +1,22 @@
-"""The table: one row per algorithm and variant, all seeds pooled; what must not be mixed is refused here."""
+"""Rows of results as the lines of a task's table: one per method, all its seeds pooled, and the reference policies."""
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
 from ringfence.algos import ALGORITHMS
 from ringfence.errors import UserError
 from ringfence.evaluation import reference
-from ringfence.evaluation.protocol import of_last_step
-from ringfence.logs.provenance import other_data
-from ringfence.report.pooling import Line, Result, mean_of, pool
-from ringfence.training.runs import Run, runs_below
+from ringfence.evaluation.table import SPLITS, Row, check, of_reference, of_references, of_run
+from ringfence.report.pooling import Numbers, mean_of, pool
+from ringfence.training.runs import LOGS, Run, runs_below
+from ringfence.utils.config import fields_of
 
-SPLITS = ("test", "validation")
 NAMES = {
     "bc": "BC",
     "bc-safe": "BC on safe episodes",
@@ -34,53 +32,123 @@ NAMES = {
     "icbf": "ICBF-Diffuser",
     "mpc": "MPC from a zero proposal",
 }
-ORDER = list(NAMES)  # rows of the table; algorithms that are not named here come last
-NEEDED = ("episodes", "return_mean", "cost_mean", "cost_safe_start", "violation_rate", "constants", "protocol", "task")
-NEEDED += ("return_interval", "cost_interval", "cost_safe_start_interval", "cost_cvar10", "unsafe_starts")
+ORDER = list(NAMES)  # lines of the table; algorithms that are not named here come last
+COLOURS = 10  # series colours in style.css
+Style = tuple[int, int]  # colour, marker
 
 
-@dataclass(kw_only=True)
-class Row(Line):
-    """A row of a report: an algorithm and variant over its seeds, or a reference policy."""
+@dataclass(frozen=True)
+class Method:
+    """An algorithm with its preset, evaluated under one variant: what a line of a table compares."""
 
     algorithm: str
     preset: str
-    split: str
-    members: list[tuple[Run, Result]] = field(default_factory=list)
+    variant: str  # as in results.json
+    apart: str = ""  # settings in which runs of the same algorithm and preset differ
+
+    @property
+    def name(self) -> str:
+        """The algorithm in plain words."""
+        return NAMES.get(self.algorithm, self.algorithm)
+
+    @property
+    def shown(self) -> str:
+        """The variant without what a table says elsewhere: `default+plans4@validation` -> `plans4`."""
+        variant = re.sub(r"^default\b\+?|@validation\b", "", self.variant)
+        return f"{variant} {self.apart}".strip()
+
+    @property
+    def label(self) -> str:
+        return f"{self.name} {self.shown}".strip()
+
+    @property
+    def place(self) -> tuple:
+        """Order in tables: that of NAMES, then by variant, numbers by size."""
+        rank = ORDER.index(self.algorithm) if self.algorithm in ORDER else len(ORDER)
+        parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", self.shown)]
+        first = self.preset.startswith("algorithm1")
+        return rank, self.algorithm, not first, [(isinstance(p, str), p) for p in parts]
 
 
-LineT = TypeVar("LineT", bound=Line)
+@dataclass(kw_only=True)
+class Line(Numbers):
+    """A method over its seeds, or a reference policy."""
+
+    name: str  # in plain words
+    rows: list[Row] = field(repr=False)  # by seed
+    method: Method | None = None  # None: a reference
+    parameters: int | None = None
+    train_seconds: float | None = None  # of one seed
+    plan_ms: float | None = None  # median of one joint action
+    ended: float | None = None  # share of episodes that ended before the time limit; None: not said
+    steps: float | None = None  # mean of an episode
+    style: Style = (0, 0)
+    rank: int = 0  # on this task, from 1; 0 where nothing is ranked
+    best: bool = False  # the highest return among the safe
+
+    @property
+    def reference(self) -> bool:
+        return self.method is None
+
+    @property
+    def variant(self) -> str:
+        """What is evaluated beside the default, in short; empty for references."""
+        return "" if self.method is None else self.method.shown
+
+    @property
+    def label(self) -> str:
+        """Name and variant in one line, e.g. `ICBF-Diffuser split+plans4`."""
+        return f"{self.name} {self.variant}".strip()
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """None of a reference."""
+        return () if self.reference else tuple(row.seed for row in self.rows)
+
+    @property
+    def returns_norm_sd(self) -> float | None:
+        constants = self.rows[0].result["constants"]
+        span = constants["return_max"] - constants["return_min"]
+        return None if self.returns_sd is None else self.returns_sd / span
 
 
 @dataclass
-class Section(Generic[LineT]):
-    """One task: everything that may stand in one table, and the runs it came from."""
+class Section:
+    """One task: everything that may stand in one table."""
 
     task: str
-    hazard: dict[str, Any]
-    card: dict[str, Any]
-    constants: dict[str, float]
-    protocol: int
-    runs: list[Run]
-    tables: dict[str, list[LineT]]  # by split
-    references: list[LineT]
+    tables: dict[str, list[Line]]  # by split
+    references: list[Line]
+    hazard: dict[str, Any] = field(default_factory=dict)
+    card: dict[str, Any] = field(default_factory=dict)
+    constants: dict[str, float] = field(default_factory=dict)  # none where nothing was measured
+    protocol: int = 0
 
     @property
-    def rows(self) -> list[LineT]:
-        return [r for split in SPLITS for r in self.tables.get(split, [])]
+    def lines(self) -> list[Line]:
+        return [line for table in self.tables.values() for line in table]
+
+    @property
+    def runs(self) -> list[Run]:
+        """Of all lines, each once."""
+        found = {row.run.path: row.run for line in self.lines for row in line.rows if row.run is not None}
+        return list(found.values())
 
 
-Played = tuple[Run, str, Result]  # a run, and one of its evaluations by name
-
-
-def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Section[Row]]:
-    """One section per task, in the order in which the runs name them."""
-    tasks: dict[str, list[Run]] = {}
+def sections(runs: Iterable[Run | str | Path] | Run | str | Path) -> list[Section]:
+    """One section per task of evaluated runs, in the order in which the runs name them."""
+    rows: dict[str, list[Row]] = {}
     for run in _distinct([runs] if isinstance(runs, str | Path | Run) else runs):
-        tasks.setdefault(run.config["task"], []).append(run)
-    if not tasks:
+        found = of_run(run)
+        if not found:
+            raise UserError(
+                f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first, or for a simulator "
+                f"of your own `ringfence play {run.path} --env FILE.py:NAME`."
+            )
+        rows.setdefault(found[0].task, []).extend(found)
+    if not rows:
         raise UserError("No run was given, so there is nothing to report; pass run folders made by `ringfence train`.")
-    return [_section(task, members) for task, members in tasks.items()]
+    return [_section_of_runs(task, mine) for task, mine in rows.items()]
 
 
 def _distinct(runs: Iterable[Run | str | Path]) -> list[Run]:
@@ -93,211 +161,111 @@ def _distinct(runs: Iterable[Run | str | Path]) -> list[Run]:
     return list(found.values())
 
 
-def _section(task: str, runs: list[Run]) -> Section[Row]:
-    first = runs[0]
-    played = [each for run in runs for each in _evaluations(run)]
-    for run, name, result in played:
-        _check_result(run, name, result, task)
-    leader = played[0][2]
-    for run, name, result in played:
-        _agree(f"'{run.path}' variant '{name}'", result, leader, first)
-    card = first.config.get("data") or {}
-    _check_data(runs, card)
-    section = Section(
-        task=task,
-        hazard=dict(first.config.get("hazard") or {}),
-        card=dict(card),
-        constants=leader["constants"],
-        protocol=leader["protocol"],
-        runs=runs,
-        tables=_tables(runs, played),
-        references=_references(runs, task, leader),
-    )
-    _paint(section)
-    return section
+def _section_of_runs(task: str, rows: list[Row]) -> Section:
+    files = dict.fromkeys(row.file.parent.resolve().parent.parent / reference.FILE for row in rows)
+    found = [row for file in files if file.exists() for row in of_references(file, task)]
+    check([*rows, *found])
+    references = list({row.name: row for row in reversed(found)}.values())[::-1]  # the first of a name
+    first = rows[0]
+    if first.run is not None and reference.LOGS not in [row.name for row in references]:
+        logs = reference.of_run(first.run, first.result["constants"])
+        if logs is not None:
+            references.append(of_reference(first.run.path / LOGS, task, reference.LOGS, logs))
+    made = section(task, rows, references, methods_of(rows))
+    paint(made.lines)
+    return made
 
 
-def _evaluations(run: Run) -> list[Played]:
-    """A run's results under names that tell the checkpoint where it is not the last."""
-    results = run.results
-    if not results:
-        raise UserError(
-            f"'{run.path}' has not been evaluated; run `ringfence eval {run.path}` first, or for a simulator "
-            f"of your own `ringfence play {run.path} --env FILE.py:NAME`."
-        )
-    return [(run, _dated(name, r, run), {"variant": name, **r}) for name, r in results.items()]
-
-
-def _dated(variant: str, result: Result, run: Run) -> str:
-    """A variant's name with the step of the checkpoint that was played, where training went on since."""
-    known = "@step" in variant or of_last_step(result, run.config["config"])
-    return variant if known else f"{variant}@step{result['step']}"
-
-
-def _check_result(run: Run, name: str, result: Result, task: str) -> None:
-    _check(f"'{run.path}' variant '{name}'", result, task)
-    if result.get("split") not in SPLITS:
-        raise UserError(f"'{run.path}' variant '{name}' has split '{result.get('split')}', not test or validation.")
-    if "per_episode" not in result:
-        raise UserError(f"'{run.path}' variant '{name}' lacks its episodes; run `ringfence eval {run.path}` again.")
-
-
-def _check(name: str, result: Result, task: str) -> None:
-    missing = [k for k in NEEDED if k not in result]
-    if missing:
-        raise UserError(f"{name} lacks '{missing[0]}', so it was made by another version; evaluate it again.")
-    if result["task"] != task:
-        raise UserError(f"{name} holds a result of task '{result['task']}', not of '{task}'; evaluate the run again.")
-
-
-def _agree(name: str, result: Result, leader: Result, first: Run) -> None:
-    if result["protocol"] != leader["protocol"]:
-        raise UserError(
-            f"{name} was evaluated under protocol {result['protocol']}, '{first.path}' under protocol "
-            f"{leader['protocol']}; such numbers cannot stand in one table: evaluate both with one version."
-        )
-    if result["constants"] != leader["constants"]:
-        raise UserError(
-            f"{name} was normalised with other constants than '{first.path}'; evaluate both with one version."
-        )
-
-
-def _check_data(runs: list[Run], card: dict[str, Any]) -> None:
-    for run in runs:
-        if apart := other_data(run.config.get("data") or {}, card):
-            name, here, there = apart[0]
-            raise UserError(
-                f"'{run.path}' was trained on other data (its {name} is {here}) than '{runs[0].path}' ({there}); "
-                "make one report for each data set."
-            )
-
-
-def _tables(runs: list[Run], played: list[Played]) -> dict[str, list[Row]]:
-    """By split, the rows that any run has: evaluations of one algorithm, variant and config are one."""
-    tables: dict[str, list[Row]] = {}
-    fields = _differing(runs)
+def section(task: str, rows: list[Row], references: list[Row], methods: Mapping[Row, Method]) -> Section:
+    """The lines of a task's checked rows, of which each is of one of `methods`."""
+    tables: dict[str, list[Line]] = {}
     for split in SPLITS:
-        groups: dict[tuple, list[tuple[Run, Result]]] = {}
-        for run, name, result in played:
-            if result["split"] == split:
-                config = json.dumps(_made_with(run.config), sort_keys=True)
-                groups.setdefault((run.config["algorithm"], name, config), []).append((run, result))
-        rows = [_row(name, members, fields) for (_, name, _), members in groups.items()]
-        if rows:
-            tables[split] = sorted(rows, key=lambda r: place(r.algorithm, r.preset, r.variant))
-    return tables
-
-
-def _references(runs: list[Run], task: str, leader: Result) -> list[Row]:
-    rows: dict[str, Row] = {}
-    for file in dict.fromkeys(run.path.resolve().parent.parent / reference.FILE for run in runs):
-        if not file.exists():
-            continue
-        for name, result in reference.read(file).items():
-            _check(f"'{file}' row '{name}'", result, task)
-            _agree(f"'{file}' row '{name}'", result, leader, runs[0])
-            rows.setdefault(name, _reference(name, result))
-    if reference.LOGS not in rows and (logs := reference.of_run(runs[0], leader["constants"])) is not None:
-        rows[reference.LOGS] = _reference(reference.LOGS, logs)
-    return list(rows.values())
-
-
-def _reference(name: str, result: Result) -> Row:
-    return Row(
-        name=name,
-        variant="",
-        algorithm="",
-        preset="",
-        reference=True,
-        split=result.get("split", "test"),
-        seeds=(),
-        **vars(pool([result])),
+        groups: dict[Method, list[Row]] = {}
+        for row in rows:
+            if row.split == split:
+                groups.setdefault(methods[row], []).append(row)
+        if groups:
+            lines = [_line(method, mine) for method, mine in groups.items()]
+            tables[split] = sorted(lines, key=lambda line: line.method.place if line.method else ())
+    beside = [Line(name=row.name, rows=[row], **_means([row]), **vars(pool([row.result]))) for row in references]
+    for k, line in enumerate(beside):
+        line.style = 0, k
+    config = rows[0].config if rows else {}
+    told: Mapping[str, Any] = next((row.result for row in (*rows, *references)), {})
+    return Section(
+        task=task,
+        tables=tables,
+        references=beside,
+        hazard=dict(config.get("hazard") or {}),
+        card=dict(config.get("data") or {}),
+        constants=told.get("constants", {}),
+        protocol=told.get("protocol", 0),
     )
 
 
-def config_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings in a run's config.json; a field that is younger than the run had its default then."""
-    known = ALGORITHMS.get(config["algorithm"])
-    if known is None:  # one of somebody else's
-        return dict(config["config"])
-    return {f.name: f.default for f in dataclasses.fields(known.Config)} | config["config"]
-
-
-def _made_with(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings, and the algorithm's revision: with another one the same settings train another policy."""
-    return config_of(config) | {"revision": config.get("revision", 1)}
-
-
-def differing(configs: list[dict[str, Any]]) -> list[str]:
-    """Fields in which configs differ: their runs get rows of their own."""
-    fields = dict.fromkeys(k for c in configs for k in c)
-    return [k for k in fields if len({json.dumps(c.get(k)) for c in configs}) > 1]
-
-
-def _differing(runs: list[Run]) -> dict[tuple[str, str], list[str]]:
-    """Differing fields by algorithm and preset."""
-    configs: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for config in (run.config for run in runs):
-        configs.setdefault((config["algorithm"], config["preset"]), []).append(_made_with(config))
-    return {key: differing(several) for key, several in configs.items()}
-
-
-def _row(variant: str, members: list[tuple[Run, Result]], fields: dict[tuple[str, str], list[str]]) -> Row:
-    config = members[0][0].config
-    algorithm: str = config["algorithm"]
-    preset: str = config["preset"]
-    shown = plain_variant(variant)
-    if apart := fields.get((algorithm, preset)):
-        settings = _made_with(config)
-        shown += " [" + ", ".join(f"{k}={settings.get(k)}" for k in apart) + "]"
-    results = [result for _, result in members]
-    return Row(
-        name=NAMES.get(algorithm, algorithm),
-        variant=shown.strip(),
-        algorithm=algorithm,
-        preset=preset,
-        split=results[0]["split"],
-        seeds=_seeds(members),
-        parameters=results[0].get("parameters"),
-        train_seconds=mean_of(results, "train_seconds"),
-        plan_ms=mean_of(results, "plan_ms_p50"),
-        members=members,
-        **vars(pool(results, f"The runs of '{shown}'")),
-    )
-
-
-def _seeds(members: list[tuple[Run, Result]]) -> tuple[int, ...]:
-    """Those of a row's runs, in order; none may be there twice."""
-    first: dict[int, Run] = {}
-    for run, _ in members:
-        seed = run.config["seed"]
-        if seed in first:
+def _line(method: Method, rows: list[Row]) -> Line:
+    """A method's line; no seed may be there twice."""
+    first: dict[int, Row] = {}
+    for row in rows:
+        other = first.setdefault(row.seed, row)
+        if other is not row:
             raise UserError(
-                f"'{run.path}' and '{first[seed].path}' are the same job with the same seed {seed}; give only one of "
-                "them."
+                f"'{other.file.parent}' and '{row.file.parent}' are the same job with the same seed {row.seed}; keep "
+                "only one of them."
             )
-        first[seed] = run
-    return tuple(sorted(first))
+    rows = [first[seed] for seed in sorted(first)]
+    numbers = pool([row.result for row in rows], f"The runs of '{method.shown}'")
+    means = _means(rows) | {"parameters": rows[0].result.get("parameters")}
+    return Line(name=method.name, method=method, rows=rows, **means, **vars(numbers))
 
 
-def plain_variant(variant: str) -> str:
-    """A variant's name without what a table says elsewhere: `default+plans4@validation` -> `plans4`."""
-    return re.sub(r"^default\b\+?|@validation\b", "", variant)
+def _means(rows: list[Row]) -> dict[str, float | None]:
+    keys = {"train_seconds": "train_seconds", "plan_ms": "plan_ms_p50"}
+    keys |= {"ended": "termination_rate", "steps": "steps_mean"}
+    return {name: mean_of([row.result for row in rows], key) for name, key in keys.items()}
 
 
-def place(algorithm: str, preset: str, variant: str) -> tuple:
-    """Order of rows: that of NAMES, then by variant, numbers by size."""
-    rank = ORDER.index(algorithm) if algorithm in ORDER else len(ORDER)
-    parts = [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", variant)]
-    return rank, algorithm, not preset.startswith("algorithm1"), [(isinstance(p, str), p) for p in parts]
+def methods_of(rows: Iterable[Row]) -> dict[Row, Method]:
+    """Every row's method. Settings that differ between runs of the same algorithm, preset and task set methods apart;
+    one that is one thing on one task and another on the next does not."""
+    settings = {row: settings_of(row.config) for row in rows}
+    groups: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for row, mine in settings.items():
+        groups.setdefault((row.algorithm, row.preset, row.task), []).append(mine)
+    apart: dict[tuple[str, str], dict[str, None]] = {}
+    for (algorithm, preset, _), several in groups.items():
+        apart.setdefault((algorithm, preset), {}).update(dict.fromkeys(_differing(several)))
+    found = {}
+    for row, mine in settings.items():
+        words = ", ".join(f"{k}={mine.get(k)}" for k in apart[row.algorithm, row.preset])
+        found[row] = Method(row.algorithm, row.preset, row.variant, f"[{words}]" if words else "")
+    return found
 
 
-def _paint(section: Section[Row]) -> None:
-    """A colour per algorithm and preset, a marker per variant of it; the same ones in every figure."""
-    colours: dict[tuple, int] = {}
-    markers: dict[tuple, dict[str, int]] = {}
-    for row in section.rows:
-        family = (row.algorithm, row.preset)
-        colour = colours.setdefault(family, len(colours))
-        known = markers.setdefault(family, {})
-        row.style = (colour, known.setdefault(row.variant, len(known)))
+def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings in a run's config.json, where a field that is younger than the run had its default then; and the
+    algorithm's revision: with another one the same settings train another policy."""
+    known = ALGORITHMS.get(config["algorithm"])  # none of somebody else's
+    defaults = {} if known is None else {name: f.default for name, f in fields_of(known.Config).items()}
+    return defaults | config["config"] | {"revision": config.get("revision", 1)}
+
+
+def _differing(settings: list[dict[str, Any]]) -> list[str]:
+    fields = dict.fromkeys(k for one in settings for k in one)
+    return [k for k in fields if len({json.dumps(one.get(k)) for one in settings}) > 1]
+
+
+def paint(lines: Iterable[Line]) -> None:
+    """A colour per algorithm and preset, the same in every figure; no two methods have colour and marker in common."""
+    families: dict[tuple[str, str], int] = {}
+    taken: dict[int, int] = {}
+    styles: dict[tuple[str, str, str], Style] = {}
+    for line in lines:
+        if (method := line.method) is None:
+            continue
+        family = (method.algorithm, method.preset)
+        colour = families.setdefault(family, len(families)) % COLOURS
+        if (*family, line.label) not in styles:
+            taken[colour] = taken.get(colour, -1) + 1
+            styles[*family, line.label] = colour, taken[colour]
+        line.style = styles[*family, line.label]

@@ -186,6 +186,8 @@ class Result(Before, total=False):
     step: int
     algorithm: str
     variant: Variant
+    spec: str  # PolicySpec.name
+    command: list[str]  # of `ringfence`, without the run folder
     planner: str
     options: dict[str, Scalar]
     guard: str

@@ -1,5 +1,6 @@
-"""What the rollout player needs, packed: positions and plans in millimetres or coarser, as base64 of little-endian
-int16."""
+"""What the player of episodes shows (player.js): places and plans as whole numbers of a unit, millimetres or coarser.
+
+Pictures of every frame, as matplotlib writes them, would be tens of times as large, and of one ink."""
 
 from __future__ import annotations
 
@@ -14,9 +15,8 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation import recordings
 from ringfence.evaluation.places import LONGEST
-from ringfence.report.pooling import Result
-from ringfence.report.table import Row, Section
-from ringfence.training.runs import Run
+from ringfence.evaluation.table import Row
+from ringfence.report.table import Line, Section
 from ringfence.utils.files import regular, within
 
 EPISODES = 4  # per variant
@@ -28,39 +28,35 @@ NUMBERS = 20_000  # of an episode's plans; more plans than fit are left out, nev
 
 @dataclass(frozen=True)
 class Recorded:
-    """A row with the first recording of it."""
+    """A line with the first recording of it."""
 
+    line: Line
     row: Row
-    run: Run
     arrays: recordings.Recording
-    size: tuple[float, float]  # what it is chosen by: plans drawn, guidance by value
+
+    @property
+    def plans(self) -> int:
+        """How many plans every step drew."""
+        return self.arrays["plans"].shape[2] if "plans" in self.arrays else 0
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """What it is chosen by: plans drawn, guidance by value."""
+        return self.plans, (self.row.result.get("options") or {}).get("value_guidance", 0.0)
 
 
-def of_row(row: Row) -> Recorded | None:
-    """The first seed of a row that has a recording."""
-    for run, result in sorted(row.members, key=_seed):
-        arrays = recordings.read(run.path, result["variant"])
+def of_line(line: Line) -> Recorded | None:
+    """The first seed of a line that has a recording."""
+    for row in line.rows:
+        arrays = recordings.read(row.file.parent, row.name)
         if arrays is not None:
-            options = result.get("options") or {}
-            size = (_plans(arrays), options.get("value_guidance", 0.0))
-            return Recorded(row, run, arrays, size)
+            return Recorded(line, row, arrays)
     return None
 
 
-def _plans(arrays: recordings.Recording) -> int:
-    """How many plans every step drew."""
-    return arrays["plans"].shape[2] if "plans" in arrays else 0
-
-
-def _seed(member: tuple[Run, Result]) -> int:
-    return member[0].config["seed"]
-
-
-def players(section: Section[Row]) -> list[dict[str, Any]]:
+def players(section: Section) -> list[dict[str, Any]]:
     """At most two variants of a task: the planner with the most plans and one that draws a single plan."""
-    found = [recorded for row in section.rows if row.split == "test" and (recorded := of_row(row))]
-    if not found:
-        return []
+    found = [recorded for line in section.tables.get("test", []) if (recorded := of_line(line))]
     made = [p for chosen in _two(found) if (p := player(section, chosen))]
     for pair in zip(*(p["episodes"] for p in made)):  # the same resets at the same scale
         reach = max(episode["reach"] for episode in pair)
@@ -72,32 +68,37 @@ def players(section: Section[Row]) -> list[dict[str, Any]]:
 def _two(found: list[Recorded]) -> list[Recorded]:
     """The one with the most plans; and the last one beside it, of a single plan and of its algorithm where there is
     one. Of equals the last, since the flagship is last in the table."""
+    if not found:
+        return []
     size = max(recorded.size for recorded in found)
     most = [recorded for recorded in found if recorded.size == size][-1]
-    rest = [recorded for recorded in found if recorded.row is not most.row]
-    single = [recorded for recorded in rest if recorded.size[0] <= 1] or rest
-    family = (most.row.algorithm, most.row.preset)
-    same = [recorded for recorded in single if (recorded.row.algorithm, recorded.row.preset) == family]
+    rest = [recorded for recorded in found if recorded is not most]
+    single = [recorded for recorded in rest if recorded.plans <= 1] or rest
+    same = [recorded for recorded in single if _family(recorded) == _family(most)]
     return [most, *(same or single)[-1:]][:VARIANTS]
 
 
-def films(section: Section[Row]) -> list[dict[str, Any]]:
+def _family(recorded: Recorded) -> tuple[str, str]:
+    return recorded.row.algorithm, recorded.row.preset
+
+
+def films(section: Section) -> list[dict[str, Any]]:
     """GIFs of robots that lie beside recordings, at most two: {label, seed, gif (base64)}."""
     found = []
-    for row in section.rows:
-        for run, result in sorted(row.members, key=_seed):
-            file = recordings.kept(run.path, result["variant"], "gif")
-            if row.split == "test" and file is not None:
-                gif = base64.b64encode(_film(run, file)).decode()
-                found.append({"label": row.label, "seed": run.config["seed"], "gif": gif})
+    for line in section.tables.get("test", []):
+        for row in line.rows:
+            file = recordings.kept(row.file.parent, row.name, "gif")
+            if file is not None:
+                gif = base64.b64encode(_film(row.file.parent, file)).decode()
+                found.append({"label": line.label, "seed": row.seed, "gif": gif})
                 break
     return found[-VARIANTS:]
 
 
-def _film(run: Run, file: Path) -> bytes:
+def _film(folder: Path, file: Path) -> bytes:
     """A GIF that lies in the run's folder: a page that is passed on must hold no other file of its maker's."""
     try:
-        size = regular(within(run.path, file)).stat().st_size
+        size = regular(within(folder, file)).stat().st_size
         if size > LARGEST:
             raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
         content = file.read_bytes()
@@ -123,16 +124,15 @@ class Moved:
     shows: str  # in words
 
 
-def player(section: Section[Row], recorded: Recorded) -> dict[str, Any] | None:
+def player(section: Section, recorded: Recorded) -> dict[str, Any] | None:
     """One variant's episodes, or None where nobody can be shown on a plane."""
-    config = recorded.run.config
     moved = (_of_places if "places" in recorded.arrays else _of_states)(section, recorded)
     if moved is None:
         return None
     contact = None if moved.radius is None else 2 * moved.radius
     return {
-        "label": recorded.row.label,
-        "seed": config["seed"],
+        "label": recorded.line.label,
+        "seed": recorded.row.seed,
         "agents": moved.places.shape[2],
         "arena": moved.arena,
         "radius": moved.radius,
@@ -144,9 +144,9 @@ def player(section: Section[Row], recorded: Recorded) -> dict[str, Any] | None:
     }
 
 
-def _of_states(section: Section[Row], recorded: Recorded) -> Moved | None:
+def _of_states(section: Section, recorded: Recorded) -> Moved | None:
     """States of agents on a plane with landmarks."""
-    config = recorded.run.config
+    config = recorded.row.config
     n = config["spec"]["n_agents"]
     states = recorded.arrays["states"][:EPISODES].astype(np.float64)
     if states.shape[-1] != 6 * n or "radius" not in section.hazard:
@@ -167,7 +167,7 @@ def _of_states(section: Section[Row], recorded: Recorded) -> Moved | None:
     )
 
 
-def _of_places(section: Section[Row], recorded: Recorded) -> Moved:
+def _of_places(section: Section, recorded: Recorded) -> Moved:
     """Where agents were in a simulator of somebody's own."""
     arrays = recorded.arrays
     places = arrays["places"][:EPISODES].astype(np.float64)
@@ -206,8 +206,8 @@ def _episode(arrays: recordings.Recording, moved: Moved, e: int) -> dict[str, An
         "reach": float(f"{shown:.3g}") if moved.arena is None else round(shown, 2),  # half the width of what is shown
         "unit": unit,
         "steps": steps,
-        "positions": pack(positions, unit),
-        "landmarks": pack(landmarks, unit),
+        "positions": in_units(positions, unit),
+        "landmarks": in_units(landmarks, unit),
         "rewards": [round(float(x), 2) for x in np.nan_to_num(arrays["rewards"][e, :steps])],
         "costs": [round(float(x), 2) for x in np.nan_to_num(arrays["costs"][e, :steps])],
     }
@@ -215,7 +215,7 @@ def _episode(arrays: recordings.Recording, moved: Moved, e: int) -> dict[str, An
         charged = arrays["agent_costs"][e, :steps] > 0
         episode["charged"] = [[], *([int(i) for i in np.flatnonzero(one)] for one in charged)]
     if moved.plans is not None:
-        episode |= few(moved.plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
+        episode["plans"] = few(moved.plans[e], np.asarray(arrays["chosen"][e]) if "chosen" in arrays else None)
     return episode
 
 
@@ -244,7 +244,7 @@ def tracks(arrays: recordings.Recording, names: list[str], n: int, history: int)
     return xy
 
 
-def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict[str, Any]:
+def few(plans: np.ndarray, chosen: np.ndarray | None) -> list[Any]:
     """An episode's plans (L, P, H, N, 2) within the budget, the chosen one first."""
     steps, drawn, horizon, n, _ = plans.shape
     keep = int(np.clip(NUMBERS // (steps * horizon * n * 2), 1, drawn))
@@ -252,16 +252,9 @@ def few(plans: np.ndarray, chosen: np.ndarray | None) -> dict[str, Any]:
     chosen = np.broadcast_to(chosen.reshape(steps, -1), (steps, n))  # agents that execute apart choose apart
     rejected = np.arange(drawn)[None, :, None] != chosen[:, None]
     order = np.argsort(rejected, axis=1, kind="stable")[:, :keep]
-    kept = np.take_along_axis(plans, order[:, :, None, :, None], 1)
-    return {"plans": pack(kept), "shape": [steps, keep, horizon, n]}
+    return in_units(np.take_along_axis(plans, order[:, :, None, :, None], 1), MILLIMETRE)
 
 
-def pack(metres: np.ndarray, unit: float = MILLIMETRE) -> str:
-    """Rounded to millimetres, or to another unit."""
-    whole = np.clip(np.nan_to_num(np.round(metres / unit)), -32768, 32767).astype("<i2")
-    return base64.b64encode(whole.tobytes()).decode()
-
-
-def unpack(text: str) -> np.ndarray:
-    """Inverse of `pack`, flat."""
-    return np.frombuffer(base64.b64decode(text), "<i2") * MILLIMETRE
+def in_units(metres: np.ndarray, unit: float) -> list[Any]:
+    """Nested lists of whole numbers of a unit, 0 where nothing is known."""
+    return np.nan_to_num(np.round(metres / unit)).astype(int).tolist()
