@@ -86,7 +86,10 @@ def folder(tmp_path) -> Path:
         cell(root, {"default": summary([250] * 4, [0, 0, 0, 0], MEDIUM)}, seed=seed, task=MEDIUM)
     data = summary([530] * 4, [4, 4, 3, 3], split="data", episodes=40)
     del data["per_episode"]
-    write(root / "reference" / EXPERT / "reference.json", {"behaviour data": data, "do nothing": summary([180] * 4, [0] * 4)})
+    write(
+        root / "reference" / EXPERT / "reference.json",
+        {"behaviour data": data, "do nothing": summary([180] * 4, [0] * 4)},
+    )
     return root
 
 
@@ -337,8 +340,8 @@ def test_one_seed_has_no_interval_between_runs_and_twin_limits_are_no_two_tasks(
     cell(root, {"mujoco": summary([400] * 4, [0] * 4, names[0])}, "icbf", preset="mujoco", task=names[0])
     board = read(root)
     first, second = rankings(board)
-    assert [(r.name, r.mean) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
-    assert second.tasks == names[2:] and [r.name for r in second.rows] == ["BC"]  # who has no result has no row
+    assert [(r.line.name, r.mean) for r in first.rows] == [("BC", 1.0), ("ICBF-Diffuser", None)]
+    assert second.tasks == names[2:] and [r.line.name for r in second.rows] == ["BC"]  # who has no result has no row
     native, quantile = aggregates(board)
     assert (native.protocol, native.tasks, quantile.tasks) == ("native", names[:2], names[2:])
     (iqm,) = native.iqm_returns.values()

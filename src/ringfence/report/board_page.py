@@ -19,7 +19,7 @@ from ringfence.report.page import TEMPLATE, of_section
 from ringfence.report.provenance import environments
 from ringfence.report.published import NOTE, PUBLISHED, matches
 from ringfence.report.standings import DRAWS, Aggregate, aggregates, by_protocol, contests
-from ringfence.report.table import Line, Method, Style
+from ringfence.report.table import Line, Method
 
 
 def build_board(folder: str | Path, out: str | Path, title: str | None = None) -> Path:
@@ -35,7 +35,7 @@ def build_board(folder: str | Path, out: str | Path, title: str | None = None) -
 
 def _context(board: Board, out: Path, title: str | None) -> dict[str, Any]:
     lines = [line for some in board.lines.values() for line in some]
-    styles = {line.method: line.style for line in lines if line.method}
+    any_line = {line.method: line for line in reversed(lines) if line.method}
     return {
         "title": title or f"Leaderboard: {board.suite.replace('_', ' ')}",
         "js": "",
@@ -45,8 +45,8 @@ def _context(board: Board, out: Path, title: str | None) -> dict[str, Any]:
         "seeds": _seeds(lines),
         "older": _older(board),
         "sections": [_section(board, task, k, out) for k, task in enumerate(board.tasks)],
-        "aggregates": [_aggregate(board, a, k, styles) for k, a in enumerate(aggregates(board))],
-        "expenses": board_figures.expenses(_typical(board), "expenses"),
+        "aggregates": [_aggregate(board, a, k, any_line) for k, a in enumerate(aggregates(board))],
+        "expenses": board_figures.expenses([any_line[m] for m in board.methods], "expenses"),
         "published": published(board),
         "note": NOTE,
         "missing": _missing(board),
@@ -66,29 +66,9 @@ def short(task: str, suite: str) -> str:
 class RankingRow:
     """A method over the tasks of a ranking."""
 
-    method: Method
-    style: Style
+    line: Line  # of the first task on which it was measured
     cells: list[Line | None]  # per task
     mean: float | None  # of its ranks; None where a task is missing
-    reference: bool = False
-
-    @property
-    def name(self) -> str:
-        return self.method.name
-
-    @property
-    def variant(self) -> str:
-        return self.method.shown
-
-    @property
-    def within(self) -> int:
-        """Tasks on which it keeps the limit."""
-        return sum(cell.safe for cell in self.cells if cell)
-
-    @property
-    def measured(self) -> int:
-        """Tasks on which it was measured."""
-        return sum(cell is not None for cell in self.cells)
 
 
 @dataclass(frozen=True)
@@ -110,11 +90,11 @@ def _ranks(board: Board, tasks: list[str]) -> list[RankingRow]:
     none."""
     cells = {m: [board.line(t, m) for t in tasks] for m in board.methods}
     means = _mean_ranks(board, tasks, cells)
-    rows = []
-    for method, row in cells.items():
-        measured = [cell for cell in row if cell]
-        if measured:
-            rows.append(RankingRow(method, measured[0].style, row, means.get(method)))
+    rows = [
+        RankingRow(first, row, means.get(method))
+        for method, row in cells.items()
+        if (first := next((cell for cell in row if cell), None))
+    ]
     return sorted(rows, key=lambda r: (r.mean is None, r.mean or 0.0))
 
 
@@ -227,44 +207,30 @@ def _link(file: Path, out: Path) -> tuple[str, str]:
     return relative, quote(relative)
 
 
-@dataclass(frozen=True)
-class MissingSeeds:
-    """Cells without a result; seeds of one job that lack it for the same reason share a line."""
-
-    task: str
-    job: str
-    why: str
-    seeds: list[int]
-
-
-def _missing(board: Board) -> list[MissingSeeds]:
+def _missing(board: Board) -> list[tuple[str, str, str, list[int]]]:
+    """(task, job, why, seeds) of cells without a result; seeds that lack it for the same reason share a line."""
     groups: dict[tuple[str, str, str], list[int]] = {}
     for m in board.missing:
         groups.setdefault((m.task, m.job, m.why), []).append(m.seed)
-    return [MissingSeeds(*job, seeds) for job, seeds in groups.items()]
+    return [(*job, seeds) for job, seeds in groups.items()]
 
 
 @dataclass(frozen=True)
 class AggregateRow:
     """A method over all tasks of a protocol."""
 
-    name: str
-    variant: str
-    style: Style
+    line: Line  # of one of the tasks
     returns: tuple[float, Interval | None]
     costs: tuple[float, Interval | None]
     seeds: int
-    reference: bool = False
 
 
-def _aggregate(board: Board, aggregate: Aggregate, k: int, styles: dict[Method, Style]) -> dict[str, Any]:
+def _aggregate(board: Board, aggregate: Aggregate, k: int, lines: dict[Method, Line]) -> dict[str, Any]:
     """What the template shows of a protocol's tasks together."""
     best_first = sorted(aggregate.methods, key=lambda m: -aggregate.iqm_returns[m][0])
     rows = [
         AggregateRow(
-            name=m.name,
-            variant=m.shown,
-            style=styles[m],
+            line=lines[m],
             returns=aggregate.iqm_returns[m],
             costs=aggregate.iqm_costs[m],
             seeds=len(aggregate.seeds[m]),
@@ -279,6 +245,7 @@ def _aggregate(board: Board, aggregate: Aggregate, k: int, styles: dict[Method, 
         earns = board_figures.duels(aggregate.improves[pairs], best_first, "earns more", f"earns{k}")
         costs = board_figures.duels(aggregate.cheaper[pairs], best_first, "costs less", f"costs{k}")
     seeds = aggregate.seeds
+    styles = {m: line.style for m, line in lines.items()}
     return {
         "protocol": aggregate.protocol,
         "tasks": len(aggregate.tasks),
@@ -291,9 +258,3 @@ def _aggregate(board: Board, aggregate: Aggregate, k: int, styles: dict[Method, 
         "left_out": [(m.label, [short(t, board.suite) for t in at]) for m, at in aggregate.left_out.items()],
         "fewer": [(m.label, seeds[m]) for m in aggregate.methods if len(seeds[m]) < len(board.seeds)],
     }
-
-
-def _typical(board: Board) -> list[Line]:
-    """One line per method for the figure of time and size: that of the first task it was measured on."""
-    found = ((board.line(task, method) for task in board.tasks) for method in board.methods)
-    return [line for lines in found if (line := next((x for x in lines if x), None))]

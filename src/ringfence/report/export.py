@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,34 @@ from ringfence.report.html import share
 from ringfence.report.table import Line, Method
 from ringfence.utils.escape import latex, markdown, spreadsheet
 
-# CSV columns; intervals and the bound are 95 %, per-episode numbers, empty where not measured
-COLUMNS = (
-    "suite, task, algorithm, preset, variant, method, rank, within_limit, best, return_mean, return_sd, return_low, "
-    "return_high, return_norm, cost_mean, cost_sd, cost_low, cost_high, cost_norm, cost_safe_start, "
-    "cost_safe_start_low, cost_safe_start_high, unsafe_episodes, unsafe_upper, ended_early, steps_mean, seeds, "
-    "episodes, train_seconds, plan_ms_p50, parameters"
-).split(", ")
+# What CSV says of a line that was measured; intervals and the bound are 95 %, numbers per episode.
+NUMBERS: dict[str, Callable[[Line], Any]] = {
+    "within_limit": lambda r: int(r.safe),
+    "best": lambda r: "" if r.reference else int(r.best),
+    "return_mean": lambda r: r.returns,
+    "return_sd": lambda r: r.returns_sd,
+    "return_low": lambda r: r.returns_interval[0],
+    "return_high": lambda r: r.returns_interval[1],
+    "return_norm": lambda r: r.returns_norm,
+    "cost_mean": lambda r: r.cost,
+    "cost_sd": lambda r: r.cost_sd,
+    "cost_low": lambda r: r.cost_interval[0],
+    "cost_high": lambda r: r.cost_interval[1],
+    "cost_norm": lambda r: r.cost_norm,
+    "cost_safe_start": lambda r: r.cost_safe_start,
+    "cost_safe_start_low": lambda r: r.cost_safe_start_interval[0],
+    "cost_safe_start_high": lambda r: r.cost_safe_start_interval[1],
+    "unsafe_episodes": lambda r: r.violation_rate,
+    "unsafe_upper": lambda r: r.violation_upper,
+    "ended_early": lambda r: r.ended,
+    "steps_mean": lambda r: r.steps,
+    "seeds": lambda r: "" if r.reference else len(r.seeds),
+    "episodes": lambda r: r.episodes,
+    "train_seconds": lambda r: r.train_seconds,
+    "plan_ms_p50": lambda r: r.plan_ms,
+    "parameters": lambda r: r.parameters,
+}
+COLUMNS = ("suite", "task", "algorithm", "preset", "variant", "method", "rank", *NUMBERS)
 
 
 def export_board(folder: str | Path, form: str, out: str | Path) -> Path:
@@ -43,53 +65,22 @@ def _rows(board: Board) -> dict[str, list[Line | Method]]:
 def board_csv(board: Board) -> str:
     """One line per task and method, references included; full precision to six digits."""
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+    writer.writeheader()
     for task, rows in _rows(board).items():
         for row in rows:
-            values = {"suite": board.suite, "task": task}
-            values |= _absent(row) if isinstance(row, Method) else _numbers(row)
-            writer.writerow([spreadsheet(_plain(values.get(column, ""))) for column in COLUMNS])
+            values = {"suite": board.suite, "task": task, "method": row.label} | _names(row)
+            values |= {k: f(row) for k, f in NUMBERS.items()} if isinstance(row, Line) else {"seeds": 0}
+            writer.writerow({k: spreadsheet(f"{v:.6g}" if isinstance(v, float) else v) for k, v in values.items()})
     return file.getvalue()
 
 
-def _absent(m: Method) -> dict[str, Any]:
-    return {"algorithm": m.algorithm, "preset": m.preset, "variant": m.variant, "method": m.label, "seeds": 0}
-
-
-def _numbers(r: Line) -> dict[str, Any]:
-    method: dict[str, Any] = {"method": r.label, "variant": "reference"}
-    if r.method:
-        method = {"algorithm": r.method.algorithm, "preset": r.method.preset, "variant": r.method.variant}
-        method |= {"method": r.label, "rank": r.rank, "best": int(r.best), "seeds": len(r.seeds)}
-    return method | {
-        "within_limit": int(r.safe),
-        "return_mean": r.returns,
-        "return_sd": r.returns_sd,
-        "return_low": r.returns_interval[0],
-        "return_high": r.returns_interval[1],
-        "return_norm": r.returns_norm,
-        "cost_mean": r.cost,
-        "cost_sd": r.cost_sd,
-        "cost_low": r.cost_interval[0],
-        "cost_high": r.cost_interval[1],
-        "cost_norm": r.cost_norm,
-        "cost_safe_start": r.cost_safe_start,
-        "cost_safe_start_low": r.cost_safe_start_interval[0],
-        "cost_safe_start_high": r.cost_safe_start_interval[1],
-        "unsafe_episodes": r.violation_rate,
-        "unsafe_upper": r.violation_upper,
-        "ended_early": r.ended,
-        "steps_mean": r.steps,
-        "episodes": r.episodes,
-        "train_seconds": r.train_seconds,
-        "plan_ms_p50": r.plan_ms,
-        "parameters": r.parameters,
-    }
-
-
-def _plain(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value
+def _names(row: Line | Method) -> dict[str, Any]:
+    method = row.method if isinstance(row, Line) else row
+    if method is None:
+        return {"variant": "reference"}
+    names = {"algorithm": method.algorithm, "preset": method.preset, "variant": method.variant}
+    return names | ({"rank": row.rank} if isinstance(row, Line) else {})
 
 
 # --- LaTeX ---
@@ -175,7 +166,7 @@ def board_markdown_short(board: Board) -> str:
         for row in ranking.rows:
             mean = "–" if row.mean is None else f"{row.mean:.2f}"
             cells = (_brief(cell, len(board.seeds)) for cell in row.cells)
-            rows.append([row.method.label, *cells, mean])
+            rows.append([row.line.label, *cells, mean])
         blocks.append(_table(head, rows))
     return "\n\n".join([*blocks, _legend(board)]) + "\n"
 
