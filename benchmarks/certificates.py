@@ -102,7 +102,8 @@ def played(setting: str, margin: float, batch: int, episodes: int) -> dict[str, 
     from ringfence.evaluation.certify import shortfalls
     from ringfence.evaluation.rollout import rollout
     from ringfence.evaluation.stress import compensated
-    from ringfence.faults import Faults, under_faults
+    from ringfence.faults import Faults
+    from ringfence.faults.policy import under_faults
     from ringfence.loading.resolve import resolve
     from ringfence.loading.spec import PolicySpec
     from ringfence.utils.compilation import keep_programs

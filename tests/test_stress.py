@@ -23,9 +23,10 @@ from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import compensated, compensation, own_acceleration
-from ringfence.faults import Faults, Faulty, under_faults
+from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.faults.monitor import Monitor
+from ringfence.faults.policy import Faulty, under_faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
 from ringfence.loading.controller import Controller

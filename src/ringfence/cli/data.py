@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +13,7 @@ from rich.markup import escape
 
 from ringfence.cli.console import console
 from ringfence.errors import UserError, plain
+from ringfence.logs.io.table_options import Columns, EpisodeRules
 from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
 
@@ -22,39 +24,25 @@ Out = Annotated[Path, tyro.conf.arg(name="out")]
 
 
 @dataclass(frozen=True)
-class Episodes:
+class Episodes(EpisodeRules):
     """How rows of agents and times become episodes."""
 
     separation: float | None = None
     """m between two agents' centres below which a step costs 1, where nothing else says what it costs."""
-    dt: float | None = None
-    """s, of the store's steps; that of the rows by default."""
-    gap: float | None = None
-    """s without a row, after which an agent was away; five steps by default."""
-    team: int | None = None
-    """agents of an episode; by default as many as most rows have."""
-    neighbours: int | None = None
-    """episodes of one agent each, who sees so many others; one policy for any number of them."""
-    sensing_radius: float | None = None
-    """m, how far such an agent sees."""
-    min_episode_steps: int = 5
-    """steps of an episode, at least."""
-    max_episode_steps: int | None = None
-    """steps of an episode, at most; longer ones are cut."""
-    max_speed: float | None = None
-    """m/s that nothing there can do: rows that jump faster are dropped. Without it, 100 m/s are refused."""
 
     def options(self) -> dict[str, Any]:
         """Fields of a `TableSchema`."""
         from ringfence.problem.constraints import Separation
 
-        given = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        given = dataclasses.asdict(self)
         radius = given.pop("separation")
         return {**given, "danger": None if radius is None else Separation(radius, radius / 4)}
 
 
 AS_THEY_ARE = Episodes()
 HowEpisodes = tyro.conf.OmitArgPrefixes[Episodes]
+UNNAMED = Columns()
+Named = tyro.conf.OmitArgPrefixes[Columns]
 
 
 @dataclass(frozen=True)
@@ -103,20 +91,10 @@ def make(
 def import_table(
     files: Positional[list[Path]],
     out_file: Out,
-    time: str = "time",
-    time_unit: float = 1.0,
-    agent: str = "agent",
-    state: list[str] = [],  # noqa: B006 (tyro reads it, nobody writes it)
-    episode: str | None = None,
-    action: list[str] = [],  # noqa: B006
-    reward: str | None = None,
+    columns: Named = UNNAMED,
     bounds: HowBounded = AS_LOGGED,
-    cost: list[str] = [],  # noqa: B006
-    limits: list[float] = [],  # noqa: B006
-    terminated: str | None = None,
-    goal: list[str] = [],  # noqa: B006
+    limits: list[float] = [],  # noqa: B006 (tyro reads it, nobody writes it)
     rename: list[str] = [],  # noqa: B006
-    wide: str | None = None,
     layout: Literal["highd", "interaction", "syndrone", "sumo", "obsmat"] | None = None,
     split: float | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
@@ -128,21 +106,11 @@ def import_table(
         files: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml or an obsmat.txt; several are
             recordings, each with episodes of its own.
         out_file: the store to write.
-        time: column of times, s (or of dates).
-        time_unit: seconds of one, where times are something else, e.g. 0.001 of ms, 0.04 of frames at 25 a second.
-        agent: column that tells agents apart.
-        state: columns of where an agent is (x y z), how it moves (vx vy vz) and what else it knows of itself, SI units.
-        episode: column that tells recordings apart.
-        action: columns of what it was commanded to do until its next row; accelerations by default.
+        columns: what its columns are.
         bounds: how far actions go.
-        reward: column of what it earned since its row before; progress to the goal by default, or nothing.
-        cost: column of danger since its row before, 0 or above; several are constraints of these names.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
-        terminated: column of flags, 1 on the row with which an episode ended by itself, not by a time limit.
-        goal: columns of where it is to go, as many as its position has.
         rename: what columns are called in the file and here, e.g. position_x=x position_y=y.
-        wide: how a file with columns for every agent calls them, e.g. {agent}_{column} of leader_x and follower_x.
-        layout: names of columns of a published format, instead of the options above.
+        layout: names of columns of a published format, instead of options of columns.
         split: share of the time to learn by, e.g. 0.7; the rest is written beside it, as fleet-rest.h5, to judge by.
         episodes: how rows become episodes.
         task: a name for the data; that of the store's file by default.
@@ -154,20 +122,14 @@ def import_table(
     named = files[0].name if len(files) == 1 else f"{files[0].name} and {len(files) - 1} more"
     kept = writable(out_file)
     rest = None if split is None else writable(kept.with_name(f"{kept.stem}-rest{kept.suffix}"))
-    options = {
-        **episodes.options(),
-        "cost": cost,
-        "card": {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(cost, limits)}
-        | bounds.facts(),
-    }
-    if layout is not None:
-        if state or action or reward or goal or episode or rename or wide or terminated or time_unit != 1:
-            raise UserError(f"--layout {layout} says which columns are what, in which unit; leave these options out.")
-        options["layout"] = layout
+    facts = {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(columns.cost, limits)}
+    options: dict[str, Any] = {**episodes.options(), "cost": columns.cost, "card": facts | bounds.facts()}
+    if layout is None:
+        options |= {**dataclasses.asdict(columns), "rename": _pairs(rename)}
+    elif dataclasses.replace(columns, cost=()) != UNNAMED or rename:
+        raise UserError(f"--layout {layout} says which columns are what, in which unit; leave these options out.")
     else:
-        options |= {"time": time, "agent": agent, "episode": episode, "state": state}
-        options |= {"action": action, "reward": reward, "goal": goal, "rename": _pairs(rename), "wide": wide}
-        options |= {"terminated": terminated, "time_unit": time_unit}
+        options["layout"] = layout
     if split is not None and rest is not None:
         learned, judged = EpisodeStore.split_table(files, split, **options)
         imported(learned, kept)
@@ -187,7 +149,7 @@ def _pairs(rename: list[str]) -> dict[str, str]:
     return pairs
 
 
-def _limits_of(cost: list[str], limits: list[float]) -> dict[str, Any]:
+def _limits_of(cost: Sequence[str], limits: list[float]) -> dict[str, Any]:
     """What a card says of the limits of these costs: of each by its name, where there are several."""
     if limits and len(limits) != len(cost):
         raise UserError(f"--limits gives {len(limits)} numbers for {len(cost)} columns of costs; give one for each.")

@@ -9,7 +9,6 @@ from rich.markup import escape
 
 from ringfence.cli.console import console
 from ringfence.errors import UserError
-from ringfence.utils.environment import device_problem
 
 out = console()
 
@@ -48,6 +47,8 @@ def doctor() -> None:
 
 def _devices(found: list[str]) -> str:
     """Devices in words; where JAX finds none, why, and what to do."""
+    from ringfence.utils.environment import device_problem
+
     if found:
         return ", ".join(found)
     chosen = os.environ.get("JAX_PLATFORMS")

@@ -31,8 +31,9 @@ from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator, compensated
 from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
-from ringfence.faults import Faults, under_faults
+from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate, digest
+from ringfence.faults.policy import under_faults
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec

@@ -15,7 +15,8 @@ from ringfence.datasets.task import Task
 from ringfence.envs.episode import Shape
 from ringfence.errors import UserError
 from ringfence.evaluation import evaluate
-from ringfence.faults import Faults, behind
+from ringfence.faults import Faults
+from ringfence.faults.policy import behind
 from ringfence.guards.wrap import Callback
 from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import Resolved, resolve

@@ -19,7 +19,8 @@ from ringfence.envs.base import Measured, NativeEnv
 from ringfence.errors import UserError, whole_number
 from ringfence.evaluation import statistics
 from ringfence.evaluation.rollout import rollout
-from ringfence.faults import Faults, under_faults
+from ringfence.faults import Faults
+from ringfence.faults.policy import under_faults
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy

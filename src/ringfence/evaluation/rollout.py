@@ -10,7 +10,7 @@ import numpy as np
 
 from ringfence.envs.base import Env, NativeEnv, Outcome
 from ringfence.errors import UserError
-from ringfence.faults import Faulty
+from ringfence.faults.policy import Faulty
 from ringfence.proposals.base import act_with, with_cost
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
 from ringfence.utils.progress import Progress

@@ -3,6 +3,5 @@
 from __future__ import annotations
 
 from ringfence.faults.faults import Faults
-from ringfence.faults.policy import Faulty, behind, under_faults
 
-__all__ = ["Faults", "Faulty", "behind", "under_faults"]
+__all__ = ["Faults"]

@@ -14,7 +14,8 @@ from ringfence.evaluation.replay.drivers import DRIVERS, Now, braked
 from ringfence.evaluation.replay.motion import Kinematics, foreseen_velocity, in_unit
 from ringfence.evaluation.replay.scene import Windows
 from ringfence.evaluation.rollout import FORESEEN
-from ringfence.faults import Faults, Faulty, behind
+from ringfence.faults import Faults
+from ringfence.faults.policy import Faulty, behind
 from ringfence.guards import Guard
 from ringfence.guards.policy import Guarded
 from ringfence.proposals.base import act_with, held, with_cost

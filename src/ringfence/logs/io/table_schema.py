@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from ringfence.errors import UserError, unknown, whole_number
+from ringfence.logs.io.table_options import Columns, EpisodeRules
 from ringfence.logs.schema import FIELDS as CARD_FIELDS
 from ringfence.problem.constraints import Hazard, Separation
 
@@ -22,8 +23,8 @@ OLD_OPTIONS = {
 }
 
 
-@dataclass(frozen=True)
-class TableSchema:
+@dataclass(frozen=True, kw_only=True)
+class TableSchema(Columns, EpisodeRules):
     """Columns of a table with a row per agent and time, in SI units. Checked when made; lists may be given as any
     iterable of names, and `cost` as one name.
 
@@ -48,27 +49,8 @@ class TableSchema:
     `wide` how these are called: "{agent}_{column}" reads leader_x as x of `leader`, and `agent` is a name of our own.
     """
 
-    time: str
-    agent: str
-    state: tuple[str, ...]
-    episode: str | None = None
-    time_unit: float = 1.0
-    action: tuple[str, ...] = ()
-    reward: str | None = None
-    cost: tuple[str, ...] = ()
-    terminated: str | None = None
-    goal: tuple[str, ...] = ()
-    dt: float | None = None
-    gap: float | None = None
-    team: int | None = None
-    neighbours: int | None = None
-    sensing_radius: float | None = None
-    min_episode_steps: int = 5
-    max_episode_steps: int | None = None
-    max_speed: float | None = None
     danger: Hazard | None = None
     rename: Mapping[str, str] = field(default_factory=dict)
-    wide: str | None = None
 
     def __post_init__(self):
         if isinstance(self.cost, str):
