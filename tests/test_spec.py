@@ -1,8 +1,12 @@
 """Who plays, as one value: names that read back, options sorted to whom they belong, refusals."""
 
+import dataclasses
+
 import pytest
+import tyro
 
 from ringfence.bench.suites import SUITES
+from ringfence.cli.playing import Playing
 from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError
 from ringfence.loading.spec import PolicySpec
@@ -13,6 +17,25 @@ NAMES = sorted({name for suite in SUITES.values() for e in suite.entries for nam
 @pytest.mark.parametrize("name", NAMES)
 def test_every_name_of_a_suite_reads_back(name):
     assert PolicySpec.parse(name).name == name
+
+
+@pytest.mark.parametrize("name", [*NAMES, "executiondecentralized", "low_temperature+temperature0.5"])
+def test_the_words_of_a_spec_are_options_of_the_command_line(name):
+    """What a result says made it is what the command line reads."""
+    spec = PolicySpec.parse(name)
+    if spec.barrier == "oracle":  # of benchmarks alone
+        return
+    read = tyro.cli(Playing, args=spec.words)
+    assert PolicySpec.of(**read.arguments()) == spec
+
+
+def test_a_world_that_was_given_is_among_the_words(small_world):
+    """Its file, or where it came as a value a place for one: of a task's data whoever plays can fit it."""
+    assert PolicySpec.of(guard="shield", world="a b.world").words[-2:] == ["--world", "a b.world"]
+    assert "--world" not in PolicySpec.of(guard="shield", world=small_world).words
+    data = dataclasses.replace(small_world.card.data, task="harbour")
+    own = dataclasses.replace(small_world, card=dataclasses.replace(small_world.card, data=data))
+    assert PolicySpec.of(guard="shield", world=own).words[-2:] == ["--world", "DATA.world"]
 
 
 def test_a_name_does_not_follow_the_order_or_the_spelling_of_options():
