@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ringfence.evaluation.statistics import Interval
-from ringfence.report.figures import FAR, INK, Ticks, colour, figure, marker, style, to_svg
+from ringfence.report.figures import FAR, INK, Ticks, colour, figure, figure_with_legend, marker, style, to_svg
 from ringfence.report.standings import Aggregate
 from ringfence.report.table import Line, Method, Style
 
@@ -104,10 +104,8 @@ def _shade(p: float) -> tuple[str, str]:
 def profiles(aggregate: Aggregate, styles: dict[Method, Style], name: str) -> Markup:
     """Share of runs above a return and share of episodes within a cost, against the threshold."""
     methods = aggregate.methods
-    columns = 2 if max(len(m.label) for m in methods) > 24 else 3
-    rows = -(-len(methods) // columns)
     with style():
-        made = figure(WIDTH, 4.2 + 0.24 * rows)
+        made, columns = figure_with_legend(WIDTH, 4.2, [m.label for m in methods])
         left, right = made.subplots(1, 2)
         for k, method in enumerate(methods):
             _profile(

@@ -125,6 +125,12 @@ def figure(width: float, height: float) -> Figure:
     return made
 
 
+def figure_with_legend(width: float, height: float, labels: Sequence[str]) -> tuple[Figure, int]:
+    """(a figure that has room below for a legend of these labels, the legend's columns)."""
+    columns = 2 if max(len(label) for label in labels) > 24 else 3
+    return figure(width, height + 0.24 * -(-len(labels) // columns)), columns
+
+
 def to_svg(made: Figure, label: str, name: str) -> Markup:
     """The figure as an accessible inline element without any address in it; `name` keeps ids apart on the page."""
     file = io.BytesIO()
@@ -150,7 +156,7 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
     """Return against the cost of safe starts with 95 % intervals, in the colours and markers of the table."""
     points = [*lines, *section.references]
     with style():
-        made = figure(8.2, max(4.4, 0.9 + 0.22 * len(points)))
+        made, columns = figure_with_legend(8.2, 4.4, [line.label for line in points])
         ax = made.add_subplot()
         for line in points:
             _point(ax, line)
@@ -159,7 +165,7 @@ def scatter(section: Section, lines: Sequence[Line], x_label: str, name: str) ->
         _cost_axis(ax, section.constants["cost_limit"] if section.constants and not several else 0.0)
         ax.set_xlabel(f"{x_label}, safe starts")
         ax.set_ylabel("return per episode")
-        made.legend(loc="outside right upper", frameon=False, fontsize=9)
+        made.legend(loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
         each = [f"{r.label}: return {r.returns:.1f}, cost of safe starts {r.cost_safe_start:.3f}" for r in points]
         return to_svg(made, f"Return against the cost of safe starts on {section.task}. {'; '.join(each)}", name)
 
