@@ -584,10 +584,12 @@ def words_of_results(
         ("results.json", (variant, "barrier")), ("results.json", (variant, "execution")),
         ("results.json", (variant, "simulator")), ("results.json", (variant, "split")),
         ("results.json", (variant, "guard_options")), ("results.json", (variant, "options")),
+        ("results.json", (variant, "command")), ("results.json", (variant, "spec")),
     ]  # fmt: skip
     for file, (*path, last) in places:
         for word in words:
-            for value in (word, {word: 1}, {"horizon": word}) if last.endswith("options") else (word,):
+            options, told = (word, {word: 1}, {"horizon": word}), ([word], ["eval", "--set", word], word)
+            for value in options if last.endswith("options") else told if last == "command" else (word,):
                 whole = json.loads(json.dumps(config if file == "config.json" else results))
                 inner = whole
                 for key in path:
@@ -617,6 +619,7 @@ def _harmless(found: tuple[str, list[str]]) -> bool:
 def _one_command(line: str) -> bool:
     words = shlex.shlex(line.removesuffix("\\"), posix=True, punctuation_chars=True)
     words.whitespace_split = True
+    words.commenters = ""
     unquoted = re.sub(r"'[^']*'", "", line)
     return not re.search(r"[;&|<>`$()\n]", unquoted) and bool(list(words))
 
