@@ -409,13 +409,11 @@ def certify(
     if given.get("guard", "none") == "none":
         given |= {"guard": "shield"}
     file = writable(out_file)
-    found = _runs([run])
-    if len(found) > 1:
-        raise UserError(f"'{run}' holds {len(found)} runs, and a certificate is of one; name it, e.g. {found[0].path}.")
+    found = _one_run(run)
     given |= {"confidence": confidence, "quantile": quantile, "calibration": calibration, "episodes": episodes}
     given |= replaying.arguments() | {"logs": None if logs is None else _store(logs)}
     given |= {"make_env": None if env is None else simulator(env)}
-    made = run_certify(found[0], faults, quiet=False, **given)
+    made = run_certify(found, faults, quiet=False, **given)
     for line in made.summary():
         out.print(lines(line), soft_wrap=True)
     print(made.save(file))
@@ -468,12 +466,9 @@ def export(
         checkpoint: step of the one that is written; the last one by default.
     """
     given = playing.arguments()
-    found = _runs([run])
-    if len(found) > 1:
-        raise UserError(f"'{run}' holds {len(found)} runs, and a file is of one; name it, e.g. {found[0].path}.")
     from ringfence.deploy.export import export as write
 
-    print(write(found[0], out_file, format, checkpoint, **given))
+    print(write(_one_run(run), out_file, format, checkpoint, **given))
 
 
 def ope(
@@ -505,7 +500,7 @@ def ope(
 
     given = playing.arguments()
     report = None if report is None else writable(report)
-    found = _runs([run])[0]
+    found = _one_run(run)
     sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     evaluation.check_sizes(**sizes)
     store = _store(data)
@@ -549,7 +544,7 @@ def replay(
     given: dict[str, Any] = {**playing.arguments(), "faults": wrong.faults(), "compensate": compensate}
     out_file = None if out_file is None else writable(out_file)
     report = None if report is None else writable(report)
-    policy = None if run.is_file() else _runs([run])[0]
+    policy = None if run.is_file() else _one_run(run)
     if policy is None:
         given["world"] = playing.world or run
     given |= replaying.arguments() | {"windows": windows, "seed": seed, "quiet": False}
@@ -691,6 +686,14 @@ def _some_runs(paths: list[Path]) -> list[Run]:
     if not paths:
         raise UserError("No run was given; name run folders that `ringfence train` made.")
     return _runs(paths)
+
+
+def _one_run(path: Path) -> Run:
+    """The run in a folder, or the only one below it."""
+    found = _runs([path])
+    if len(found) > 1:
+        raise UserError(f"'{path}' holds {len(found)} runs, and one is asked for; name it, e.g. {found[0].path}.")
+    return found[0]
 
 
 def _runs(paths: list[Path]) -> list[Run]:
