@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,6 +26,38 @@ Positional = tyro.conf.Positional
 Names = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME")]
 
 
+@dataclass(frozen=True)
+class Machines:
+    """Who makes the cells."""
+
+    engine: Literal["local", "ray"] = "local"
+    """processes on this machine, or Ray tasks."""
+    workers: int | None = None
+    """local processes; one per `threads` cores by default."""
+    threads: int = 1
+    """per worker; cores that Ray sets aside per task."""
+    memory: float | None = None
+    """GiB that a local process may hold before it is stopped."""
+    address: str | None = None
+    """of the Ray cluster, e.g. auto; without it a local one is started."""
+
+    def run(self, grid: Grid) -> dict[str, int]:
+        """Cells by state after the run."""
+        if self.engine == "ray":
+            for name, value in (("workers", self.workers), ("memory", self.memory)):
+                if value is not None:
+                    raise UserError(f"--{name} is about local processes, Ray divides its cluster itself; leave it out.")
+            from ringfence.bench.cluster import run_ray
+
+            return run_ray(grid, address=self.address, threads=self.threads)
+        from ringfence.bench import run_local
+
+        return run_local(grid, workers=self.workers, threads=self.threads, memory=self.memory)
+
+
+HERE = Machines()
+
+
 def bench(
     suite: Positional[str],
     seeds: int = 5,
@@ -33,11 +66,7 @@ def bench(
     tasks: Names = [],  # noqa: B006
     algorithms: Names = [],  # noqa: B006
     num_updates: int | None = None,
-    engine: Literal["local", "ray"] = "local",
-    workers: int | None = None,
-    threads: int = 1,
-    memory: float | None = None,
-    address: str | None = None,
+    machines: Annotated[tyro.conf.OmitArgPrefixes[Machines], tyro.conf.arg(name="machines")] = HERE,
     certificate: Path | None = None,
 ) -> None:
     """Make the grid task x algorithm x seed; the same command goes on where it was left, and repeats nothing.
@@ -56,11 +85,6 @@ def bench(
         tasks: these alone.
         algorithms: these alone, as algorithm or algorithm:preset.
         num_updates: of every algorithm, for a quick trial.
-        engine: processes on this machine, or Ray tasks.
-        workers: local processes; one per `threads` cores by default.
-        threads: per worker; cores that Ray sets aside per task.
-        memory: GiB that a local process may hold before it is stopped.
-        address: of the Ray cluster, e.g. auto; without it a local one is started.
         certificate: of a run of the suite stress, whose table then says behind which faults it is kept.
     """
     from ringfence.bench import pack
@@ -80,7 +104,7 @@ def bench(
     for grid in grids:
         idle = idle and not grid.groups()
         try:
-            counts = _run_grid(grid, engine, workers, threads, memory, address)
+            counts = machines.run(grid)
         finally:
             pack(grid.out)
         whole = _say_made(grid, counts, suite != "paper", certificate)
@@ -133,22 +157,6 @@ def _say_made(grid: Grid, counts: dict[str, int], ranked: bool, certificate: Pat
     if unfinished:
         status(grid.out)
     return not lacking and not unfinished
-
-
-def _run_grid(
-    grid: Grid, engine: str, workers: int | None, threads: int, memory: float | None, address: str | None
-) -> dict[str, int]:
-    """Cells by state after the run."""
-    if engine == "ray":
-        for name, value in (("workers", workers), ("memory", memory)):
-            if value is not None:
-                raise UserError(f"--{name} is about local processes, Ray divides its cluster itself; leave it out.")
-        from ringfence.bench.cluster import run_ray
-
-        return run_ray(grid, address=address, threads=threads)
-    from ringfence.bench import run_local
-
-    return run_local(grid, workers=workers, threads=threads, memory=memory)
 
 
 def status(folder: Positional[Path]) -> None:
