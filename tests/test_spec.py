@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import msgspec
 import pytest
 import tyro
 
@@ -33,8 +34,8 @@ def test_a_world_that_was_given_is_among_the_words(small_world):
     """Its file, or where it came as a value a place for one: of a task's data whoever plays can fit it."""
     assert PolicySpec.of(guard="shield", world="a b.world").words[-2:] == ["--world", "a b.world"]
     assert "--world" not in PolicySpec.of(guard="shield", world=small_world).words
-    data = dataclasses.replace(small_world.card.data, task="harbour")
-    own = dataclasses.replace(small_world, card=dataclasses.replace(small_world.card, data=data))
+    data = msgspec.structs.replace(small_world.card.data, task="harbour")
+    own = dataclasses.replace(small_world, card=msgspec.structs.replace(small_world.card, data=data))
     assert PolicySpec.of(guard="shield", world=own).words[-2:] == ["--world", "DATA.world"]
 
 
