@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
 from ringfence.cli import app
-from ringfence.errors import UserError
+from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.lerobot import read_lerobot
 from ringfence.logs.io.observe import observe
+from ringfence.logs.io.units import utm, zone_of
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.constraints import Separation
 from tests.test_tables import NAMES, entry, fleet
@@ -530,3 +533,173 @@ def test_drones_telemetry_is_read_as_it_is(tmp_path):
     store = EpisodeStore.load(f"{file}.h5")
     assert (store.episodes, store.n_agents, store.actions.shape[2]) == (1, 3, 3)
     np.testing.assert_allclose(entry(store, "other0.dx")[:, 0], 5.0, atol=1e-2)
+
+
+def written(path, *lines) -> str:
+    path.write_text("\n".join(lines) + "\n")
+    return str(path)
+
+
+ALONE = dict(time="t", agent="id", state=["x", "y"])
+
+
+def test_ids_are_text(tmp_path):
+    """007 is not 7, and 1e10 not 10e9; what begins with 4e is no number that is too large."""
+    ids = ["007", "7", "1e10", "10e9", "4e1234", "4e1235"]
+    rows = [f"{k / 10},{name},{k},{j}" for j, name in enumerate(ids) for k in range(9)]
+    store = EpisodeStore.from_table(written(tmp_path / "a.csv", "t,id,x,y", *rows), **ALONE)
+    assert store.n_agents == 6 and sorted(store.card.agents) == sorted(ids)
+    with pytest.raises(StoreError, match="row 4: id is missing"):
+        EpisodeStore.from_table(written(tmp_path / "a.csv", "t,id,x,y", *rows[:4], "0.4,,4,0", *rows[5:]), **ALONE)
+    lines = [json.dumps({"t": k / 10, "id": who, "x": k, "y": who % 2}) for who in (2**53, 2**53 + 1) for k in range(9)]
+    assert EpisodeStore.from_table(written(tmp_path / "a.jsonl", *lines), **ALONE).card.agents == [
+        str(2**53),
+        str(2**53 + 1),
+    ]
+
+
+def test_utm_is_what_it_is_published_as():
+    """The CN Tower as in Wikipedia's article on UTM; a quarter meridian of WGS 84; and a circle of latitude."""
+    tower = utm(np.array([-(79 + 23 / 60 + 13.7 / 3600)]), np.array([43 + 38 / 60 + 33.24 / 3600]), 17, True)
+    np.testing.assert_allclose(np.ravel(tower), [630084, 4833438], atol=1)
+    np.testing.assert_allclose(utm(np.array([3.0]), np.array([45.0]), 31, True), [[500000], [0.9996 * 4984944.378]])
+    assert utm(np.array([3.0]), np.array([-45.0]), 31, False)[1] == pytest.approx(1e7 - 0.9996 * 4984944.378)
+    here, there = (np.array(utm(np.array([lon]), np.array([60.0]), 32, True)) for lon in (9.0, 9.001))
+    circle = (
+        np.deg2rad(0.001) * 6378137 * np.cos(np.deg2rad(60)) / np.sqrt(1 - 0.00669438 * np.sin(np.deg2rad(60)) ** 2)
+    )
+    assert np.linalg.norm(there - here) == pytest.approx(0.9996 * circle, rel=1e-6)
+    assert zone_of(np.array([179.9, -179.9, -179.8]), np.array([-3.0, -3, -3])) == (1, False)
+
+
+def degrees(**changed) -> dict[str, np.ndarray]:
+    k = np.tile(np.arange(20), 2)
+    table = {"t": k * 1.0, "id": np.repeat([0, 1], 20), "lon": 11 + k * 1e-4, "lat": 48 + np.repeat([0, 1e-3], 20)}
+    return table | changed
+
+
+def test_degrees_are_no_metres(tmp_path):
+    names = {"lon": "x", "lat": "y"}
+    with pytest.raises(UserError, match="'lon' is in degrees by its name.*--project utm"):
+        EpisodeStore.from_table(degrees(), **ALONE, rename=names)
+    with pytest.raises(UserError, match="'goal_lat' is in degrees"):
+        EpisodeStore.from_table(
+            degrees(goal_lat=0), **ALONE | dict(goal=["g", "goal_lat"], rename={"a": "x", "b": "y"})
+        )
+    store = EpisodeStore.from_table(degrees(), **ALONE, rename=names, project="utm")
+    assert "degrees of longitude and latitude are metres of UTM zone 32N" in store.card.warnings
+    speed = 1e-4 * np.deg2rad(1) * 6388e3 * np.cos(np.deg2rad(48))  # by the radius of curvature there
+    east = entry(store, "own.x")[:, 0]
+    assert (east[-1] - east[0]) / (0.9996 * 19) == pytest.approx(speed, rel=1e-3)
+    assert EpisodeStore.from_table(degrees(), **ALONE, rename=names, project="none").n_agents == 2
+    micro = degrees(lon=degrees()["lon"] * 1e7, lat=degrees()["lat"] * 1e7)
+    scaled = EpisodeStore.from_table(micro, **ALONE, rename=names, project="utm", scale={"x": 1e-7, "y": 1e-7})
+    np.testing.assert_allclose(scaled.observations, store.observations, atol=1e-3)
+    for table, options, said in (
+        (micro, {}, "row 0: x is 110000000, and degrees of UTM are within 180"),
+        (degrees(), {"rename": {"lon": "y", "lat": "x"}}, "'lat' is called x for project='utm'"),
+        (degrees(lon=np.linspace(0, 60, 40)), {}, "import one region at a time"),
+        (degrees(), {"project": "mercator"}, "projection.*mercator"),
+        (degrees(), {"scale": {"z": 2.0}}, "column of numbers.*z"),
+        (degrees(), {"scale": {"x": 0}}, "scale of x=0 must be a number other than 0"),
+    ):
+        with pytest.raises(UserError, match=said):
+            EpisodeStore.from_table(table, **{**ALONE, "rename": names, "project": "utm", **options})
+
+
+@pytest.mark.parametrize(
+    ("entry", "option", "wanted"),
+    [
+        ("13/11/2015 23:59:{:02d}", "time_format", "%d/%m/%Y %H:%M:%S"),
+        ("11/13/2015 23:59:{:02d}", "time_format", "%m/%d/%Y %H:%M:%S"),
+        ("13.11.2015 23:59:{:02d}.5", "time_format", "%d.%m.%Y %H:%M:%S.%f"),
+        ("10:00:{:02d}", "time_format", "%H:%M:%S"),
+        ("1{:02d},5", "decimal", ","),
+    ],
+)
+def test_what_is_no_number_is_told_how_to_be_one(tmp_path, entry, option, wanted):
+    """The remedy that the refusal names is one that works."""
+    file = written(tmp_path / "a.csv", "t;id;x;y", *(f"{entry.format(k)};0;{k};0" for k in range(20)))
+    with pytest.raises(StoreError, match=f"row 0: t is .* no number; .*{option}='{re.escape(wanted)}'"):
+        EpisodeStore.from_table(file, **ALONE)
+    store = EpisodeStore.from_table(file, **ALONE, **{option: wanted})
+    assert store.card.dt == 1.0 and store.steps == 19
+
+
+def test_rows_are_sorted_where_that_is_asked_for(tmp_path):
+    rows = [f"2020-01-01 00:00:{k * 7 % 30:02d},0,{k * 7 % 30},0" for k in range(30)]
+    file = written(tmp_path / "a.csv", "t,id,x,y", *rows, *rows[3:9])
+    with pytest.raises(StoreError, match=r"row 5: t=2020-01-01T00:00:05 is earlier than row 4 .* sort=True \(--sort\)"):
+        EpisodeStore.from_table(file, **ALONE)
+    store = EpisodeStore.from_table(file, **ALONE, sort=True)
+    assert store.steps == 29 and "6 rows that repeat another are left out" in store.card.warnings
+    written(tmp_path / "a.csv", "t,id,x,y", *rows, "2020-01-01 00:00:05,0,99,0")
+    with pytest.raises(StoreError, match="row 30: .* is the time of row 5 of the same agent"):
+        EpisodeStore.from_table(file, **ALONE, sort=True)
+
+
+def test_places_that_jitter_do_not_make_velocities_doubtful():
+    """Trackers: a walker at 30 frames a second whose centre is 3 cm off, and who hardly moves along y."""
+    rng, t = np.random.default_rng(0), np.arange(600) / 30
+    off = rng.normal(0, 0.03, (2, 600))
+    walker = {"t": t, "id": 0 * t, "x": 1.2 * t + off[0], "y": off[1], "vx": 1.2 + 0 * t, "vy": 0 * t}
+    options = ALONE | {"state": ["x", "y", "vx", "vy"]}
+    assert not any("times what" in note for note in EpisodeStore.from_table(walker, **options).card.warnings)
+    notes = EpisodeStore.from_table(walker | {"vx": 3.6 * walker["vx"]}, **options).card.warnings
+    assert sum("vx is 3." in note and "times what x changes by" in note for note in notes) == 1
+    slow = walker | {"x": walker["x"] / 111e3, "y": walker["y"] / 111e3}
+    assert any("degrees (--project utm)" in note for note in EpisodeStore.from_table(slow, **options).card.warnings)
+
+
+def test_public_sets_are_read_by_one_command_each(tmp_path, capsys):
+    """Files as Trajnet++, tracks in centimetres without a head, CITR's cart and people, MRCLAM, ADS-B and AIS are
+    written, by the commands of docs/import-tracks.md; a step of each is one of theirs."""
+    frames = range(30)
+    scene = json.dumps({"scene": {"id": 0, "p": 1, "s": 0, "e": 290, "fps": 2.5}})
+    tracks = [json.dumps({"track": {"f": k * 10, "p": i, "x": k * 0.4, "y": i}}) for i in (1, 2) for k in frames]
+    written(tmp_path / "crowds.ndjson", scene, *tracks)
+    written(
+        tmp_path / "corridor.txt",
+        "# id frame x y z",
+        *(f"{i} {k} {k * 4:.1f}  {i * 100} 160" for i in (1, 2) for k in frames),
+    )
+    cart = [f"1,{k},veh,{k * 0.1:.2f},0,0,3" for k in frames]
+    people = [f"{i},{k},ped,{k * 0.05:.2f},{i},1.5,0" for i in (1, 2) for k in frames]
+    written(tmp_path / "clip_veh.csv", "id,frame,label,x_est,y_est,psi_est,vel_est", *cart)
+    written(tmp_path / "clip_ped.csv", "id,frame,label,x_est,y_est,vx_est,vy_est", *people)
+    for i in (1, 2):
+        truth = (f"{1248272272.841 + k * 0.01:.3f}\t {k * 0.001 + i}\t{i}\t 0.1" for k in frames)
+        written(tmp_path / f"Robot{i}_Groundtruth.dat", "# MRCLAM", "# Time [s]   x [m]   y [m]   theta [rad]", *truth)
+    states = [
+        f"{1.6e9 + k * 7 % 30:.0f},4e{i},{47 + k * 7 % 30 * 1e-3:.6f},{8 + i * 0.01},216.2"
+        for i in (1234, 1235)
+        for k in frames
+    ]
+    written(tmp_path / "states.csv", "time,icao24,lat,lon,velocity", *states, *states[5:9])
+    ships = [f"31/12/2015 23:{k:02d}:00,21{i},{55 + k * 1e-3},{10 + i * 0.1},3.6" for i in (0, 1) for k in frames]
+    written(tmp_path / "aisdk.csv", "# Timestamp,MMSI,Latitude,Longitude,SOG", *ships)
+    page = Path(__file__).resolve().parent.parent.joinpath("docs", "import-tracks.md").read_text()
+    commands = re.findall(
+        r"^    ringfence (data import-table (?:crowds|corridor|clip|Robot|states|aisdk).*)$", page, re.M
+    )
+    found = {}
+    for command in commands:
+        words = shlex.split(command)
+        files = [sorted(map(str, tmp_path.glob(word))) if "." in word and "*" in word else [word] for word in words]
+        words = [str(tmp_path / word) if (tmp_path / word).is_file() else word for each in files for word in each]
+        out = tmp_path / words[words.index("--out") + 1]
+        app.main([*words[: words.index("--out")], "--out", str(out)])
+        store = EpisodeStore.load(out)
+        found[out.stem] = (
+            store.n_agents,
+            store.steps // (1 if not store.card.homogeneous else 2),
+            round(store.card.dt, 4),
+        )
+    assert found == {
+        "crowds": (1, 29, 0.4),
+        "corridor": (1, 29, 0.04),
+        "clip": (3, 29, 0.0334),
+        "robots": (2, 29, 0.01),
+        "air": (2, 29, 1.0),
+        "sea": (2, 29, 60.0),
+    }

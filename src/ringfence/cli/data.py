@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from ringfence.cli.console import console
 from ringfence.errors import UserError, plain
-from ringfence.logs.io.table_options import Columns, EpisodeRules
+from ringfence.logs.io.table_options import Columns, EpisodeRules, Written
 from ringfence.utils.escape import terminal
 from ringfence.utils.files import writable
 
@@ -43,6 +43,8 @@ AS_THEY_ARE = Episodes()
 HowEpisodes = tyro.conf.OmitArgPrefixes[Episodes]
 UNNAMED = Columns()
 Named = tyro.conf.OmitArgPrefixes[Columns]
+AS_USUAL = Written()
+HowWritten = tyro.conf.OmitArgPrefixes[Written]
 
 
 @dataclass(frozen=True)
@@ -95,24 +97,28 @@ def import_table(
     bounds: HowBounded = AS_LOGGED,
     limits: list[float] = [],  # noqa: B006 (tyro reads it, nobody writes it)
     rename: list[str] = [],  # noqa: B006
+    scale: list[str] = [],  # noqa: B006
     layout: Literal["highd", "interaction", "syndrone", "sumo", "obsmat"] | None = None,
     split: float | None = None,
     episodes: HowEpisodes = AS_THEY_ARE,
+    written: HowWritten = AS_USUAL,
     task: str | None = None,
 ) -> None:
     """Import a table with a row per agent and time; CSV and Parquet need the extra `ringfence[tables]`.
 
     Args:
-        files: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml or an obsmat.txt; several are
-            recordings, each with episodes of its own.
+        files: fleet.csv, fleet.parquet, fleet.jsonl (JSON lines), SUMO's fcd.xml, an obsmat.txt, or with --header any
+            text; several are recordings, each with episodes of its own.
         out_file: the store to write.
         columns: what its columns are.
         bounds: how far actions go.
         limits: cost of each constraint that an episode may have, in the order of --cost; 0 by default.
         rename: what columns are called in the file and here, e.g. position_x=x position_y=y.
+        scale: factors of columns, e.g. x=0.01 y=0.01 of cm, vx=0.514444 of knots.
         layout: names of columns of a published format, instead of options of columns.
         split: share of the time to learn by, e.g. 0.7; the rest is written beside it, as fleet-rest.h5, to judge by.
         episodes: how rows become episodes.
+        written: how files are written.
         task: a name for the data; that of the store's file by default.
     """
     from ringfence.logs.store import EpisodeStore
@@ -123,10 +129,11 @@ def import_table(
     kept = writable(out_file)
     rest = None if split is None else writable(kept.with_name(f"{kept.stem}-rest{kept.suffix}"))
     facts = {"task": task or kept.stem, "provenance": f"table {named}", **_limits_of(columns.cost, limits)}
-    options: dict[str, Any] = {**episodes.options(), "cost": columns.cost, "card": facts | bounds.facts()}
+    how = episodes.options() | dataclasses.asdict(written) | {"scale": _factors(scale)}
+    options: dict[str, Any] = {**how, "cost": columns.cost, "card": facts | bounds.facts()}
     if layout is None:
-        options |= {**dataclasses.asdict(columns), "rename": _pairs(rename)}
-    elif dataclasses.replace(columns, cost=()) != UNNAMED or rename:
+        options |= {**dataclasses.asdict(columns), "rename": _pairs(rename, "--rename", "THEIRS=OURS", "position_x=x")}
+    elif dataclasses.replace(columns, cost=()) != UNNAMED or rename or written.header:
         raise UserError(f"--layout {layout} says which columns are what, in which unit; leave these options out.")
     else:
         options["layout"] = layout
@@ -138,15 +145,26 @@ def import_table(
     imported(made(files, **options), kept)
 
 
-def _pairs(rename: list[str]) -> dict[str, str]:
-    """Our names by the file's."""
+def _pairs(given: list[str], option: str, form: str, example: str) -> dict[str, str]:
+    """What is given after an = by what is before it."""
     pairs = {}
-    for pair in rename:
-        theirs, equals, ours = pair.rpartition("=")
-        if not (theirs and equals and ours) or theirs in pairs:
-            raise UserError(f"--rename {pair} must be THEIRS=OURS, each of theirs once, such as position_x=x.")
-        pairs[theirs] = ours
+    for pair in given:
+        name, equals, value = pair.rpartition("=")
+        if not (name and equals and value) or name in pairs:
+            raise UserError(f"{option} {pair} must be {form}, each name once, such as {example}.")
+        pairs[name] = value
     return pairs
+
+
+def _factors(scale: list[str]) -> dict[str, float]:
+    """Factors by our names of columns."""
+    factors = {}
+    for name, text in _pairs(scale, "--scale", "COLUMN=FACTOR", "x=0.01").items():
+        try:
+            factors[name] = float(text)
+        except ValueError:
+            raise UserError(f"--scale {name}={text} gives no number; write it as x=0.01.") from None
+    return factors
 
 
 def _limits_of(cost: Sequence[str], limits: list[float]) -> dict[str, Any]:

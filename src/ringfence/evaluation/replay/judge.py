@@ -322,6 +322,11 @@ def _stage(
     dt = float(store.card.dt)
     chosen = np.arange(store.episodes) if how.every_episode else _unlearned(world, store)
     longest = int(np.median(store.lengths[chosen]))
+    if how.steps is None and round(SECONDS / dt) < 2:
+        raise UserError(
+            f"A step of '{store.card.task}' is {dt:g} s, and a window has {SECONDS:g} s; say how many steps it has "
+            "(--steps, steps=)."
+        )
     steps = how.steps or max(1, min(round(SECONDS / dt), longest))
     cut, left_out = windows_of(store, names, motion, chosen, steps, most, radius, dt)
     body = kinematics_of(how.kinematics, store, motion, world, dt, how.wheelbase)

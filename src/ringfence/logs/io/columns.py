@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import io
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from datetime import UTC, datetime
+from dataclasses import dataclass
+from datetime import UTC, datetime, time
 from numbers import Number
 from pathlib import Path
 from types import ModuleType
@@ -30,11 +33,27 @@ READERS: dict[str, Callable[[Path], Columns]] = {
 KINDS = (".csv", ".parquet", ".pq", *READERS)
 
 
-def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
-    """The named columns, whatever the table is; one that is absent is refused with the nearest name."""
+@dataclass(frozen=True)
+class Form:
+    """How a text file is written."""
+
+    header: tuple[str, ...] = ()  # names of its columns, where it has no head; lines that begin with # are left out
+    decimal: str = "."
+    texts: tuple[str, ...] = ()  # columns that are text whatever they look like: 007 is another than 7
+
+
+AS_USUAL = Form()
+
+
+def read_columns(table: Table, wanted: Iterable[str], form: Form = AS_USUAL) -> Columns:
+    """The named columns, whatever the table is; one that is absent is refused with the nearest name. JSON lines that
+    hold none of them are left out."""
     wanted = list(dict.fromkeys(wanted))
     if isinstance(table, str | Path):
-        table = _read_file(Path(table), wanted)
+        table = _read_file(Path(table), wanted, form)
+        if table and all(name in table and table[name].dtype.kind == "O" for name in wanted):
+            there = np.any([[entry is not None for entry in table[name]] for name in wanted], 0)
+            table = {name: table[name][there] for name in wanted}
     if isinstance(table, Mapping):
         found = {name: _array(name, table[name]) for name in _known(wanted, list(table))}
     else:
@@ -47,10 +66,10 @@ def read_columns(table: Table, wanted: Iterable[str]) -> Columns:
     return found
 
 
-def names_of(table: Table) -> list[str]:
+def names_of(table: Table, form: Form = AS_USUAL) -> list[str]:
     """The names of all its columns."""
     if isinstance(table, str | Path):
-        return list(_read_file(Path(table), None))
+        return list(_read_file(Path(table), None, form))
     return [str(name) for name in (table if isinstance(table, Mapping) else _frame(table).columns)]
 
 
@@ -65,13 +84,16 @@ def seconds(columns: Columns, name: str) -> np.ndarray:
     return (column - column.min() if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
 
 
-def dates(column: np.ndarray) -> np.ndarray:
-    """A column of dates that are written as text (ISO 8601) as dates; any other as it is. Those with an offset are
-    counted in UTC, and a column in which some have one is left to be refused."""
+def dates(column: np.ndarray, written: str | None = None) -> np.ndarray:
+    """A column of dates that are `written` as text (by default as ISO 8601) as dates; any other as it is. Those with an
+    offset are counted in UTC, and a column in which some have one is left to be refused."""
     if column.dtype.kind not in "UO" or column.ndim != 1 or not len(column):
         return column
     try:
-        found = [datetime.fromisoformat(entry) for entry in column.tolist()]
+        if written is None:
+            found = [datetime.fromisoformat(entry) for entry in column.tolist()]
+        else:
+            found = [datetime.strptime(entry, written) for entry in column.tolist()]
     except (TypeError, ValueError):
         return column
     if len({one.tzinfo is None for one in found}) > 1:
@@ -80,12 +102,32 @@ def dates(column: np.ndarray) -> np.ndarray:
     return np.array(plain, "datetime64[us]")
 
 
+def _remedy(entry: Any) -> str | None:
+    """What to do about an entry that is no number as it is written, where its looks tell."""
+    text = f"{entry:%H:%M:%S}" if isinstance(entry, time) else str(entry).strip()
+    if re.fullmatch(r"[+-]?\d+,\d+", text):
+        return "if its comma is a decimal point, give decimal=',' (--decimal ,)"
+    date = re.match(r"(\d{1,4})([/.-])(\d{1,2})\2(\d{1,4})([T ]*)", text)
+    clock = re.fullmatch(r"\d{1,2}:\d{2}(:\d{2}(\.\d+)?)?", text[date.end() :] if date else text)
+    if not (date or clock):
+        return None
+    form = ""
+    if date:
+        first, mark, second, _, between = date.groups()
+        order = "Ymd" if len(first) == 4 else "mdY" if int(second) > 12 else "dmY"
+        form = mark.join(f"%{letter}" for letter in order) + between
+    if clock:
+        form += "%H:%M" + (":%S" if clock[1] else "") + (".%f" if clock[2] else "")
+    return f"if it is a time, say how times are written, as time_format='{form}' (--time-format)"
+
+
 def numbers(columns: Columns, name: str) -> np.ndarray:
     """A column as float64; the first entry that is no finite real number is refused by its row. Text, dates, complex
     numbers and missing entries are none: what they would become is a guess."""
     column = columns[name]
     if column.dtype.kind not in "biufO":
-        raise StoreError(f"row 0: {name} is {str(column[0])[:40]!r}, no number; convert the column, or leave it out.")
+        remedy = _remedy(column[0]) or "convert the column, or leave it out"
+        raise StoreError(f"row 0: {name} is {str(column[0])[:40]!r}, no number; {remedy}.")
     row = None
     if column.dtype.kind == "O":
         others = [k for k, entry in enumerate(column) if not _is_number(entry)]
@@ -93,7 +135,8 @@ def numbers(columns: Columns, name: str) -> np.ndarray:
         words = (k for k in others if not _reads_as_number(column[k]))
         row = next(words, others[0] if others else None)
     if row is not None:
-        raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; repair or drop it.")
+        remedy = _remedy(column[row]) or "repair or drop it"
+        raise StoreError(f"row {row}: {name} is {str(column[row])[:40]!r}, no number; {remedy}.")
     found = column.astype(np.float64)
     wrong = ~np.isfinite(found)
     if wrong.any():
@@ -178,11 +221,13 @@ def _needs(module: str) -> ModuleType:
         ) from None
 
 
-def _read_file(path: Path, wanted: list[str] | None) -> Columns:
+def _read_file(path: Path, wanted: list[str] | None, form: Form) -> Columns:
     """The wanted columns of a file; all of them where nothing is wanted."""
     kind = path.suffix.lower()
     if not path.is_file():
         raise StoreError(f"'{path}' is no file; give a {_or(KINDS)} file.")
+    if form.header and kind not in (".parquet", ".pq", ".jsonl", ".ndjson", ".xml"):
+        return _read_by_arrow(path, wanted, form)
     if kind not in KINDS:
         raise StoreError(f"'{path}' ends in '{kind}'; give a {_or(KINDS)} file.")
     if kind in READERS:
@@ -190,7 +235,7 @@ def _read_file(path: Path, wanted: list[str] | None) -> Columns:
             return READERS[kind](path)
         except (OSError, UnicodeDecodeError) as error:
             raise StoreError(f"'{path}' is no table that can be read ({error}).") from None
-    return _read_by_arrow(path, wanted)
+    return _read_by_arrow(path, wanted, form)
 
 
 def _or(kinds: Iterable[str]) -> str:
@@ -198,11 +243,12 @@ def _or(kinds: Iterable[str]) -> str:
     return f"{', '.join(first)} or {last}"
 
 
-def _read_by_arrow(path: Path, wanted: list[str] | None) -> Columns:
-    """Columns of a CSV or Parquet file."""
+def _read_by_arrow(path: Path, wanted: list[str] | None, form: Form) -> Columns:
+    """Columns of a text or Parquet file."""
     pyarrow = _needs("pyarrow")
     try:
-        table = _read_csv(path) if path.suffix.lower() == ".csv" else _read_parquet(path, wanted)
+        parquet = path.suffix.lower() in (".parquet", ".pq")
+        table = _read_parquet(path, wanted) if parquet else _read_csv(path, form)
         names = table.column_names
         twice = [name for name, times in Counter(names).items() if times > 1]
         if twice:
@@ -217,14 +263,31 @@ def _read_by_arrow(path: Path, wanted: list[str] | None) -> Columns:
         raise StoreError(f"'{path}' is no table that can be read ({said}).") from None
 
 
-def _read_csv(path: Path) -> Any:
-    """An Arrow table, separated by what separates the header."""
+def _read_csv(path: Path, form: Form) -> Any:
+    """An Arrow table, separated by what separates the first line; by spaces only where the form names the columns."""
+    import pyarrow
     from pyarrow import csv
 
     with path.open(encoding="utf-8-sig", errors="replace") as file:
-        head = file.readline(2**20)
-    separator = max(",;\t|", key=head.count)  # the first of those that separate as often
-    return csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=separator))
+        lines = (line for line in file if line.strip() and not line.startswith("#"))
+        head = next(lines, "") if form.header else file.readline(2**20)
+        separator = max(",;\t|", key=head.count)  # the first of those that separate as often
+        source: Any = path
+        if form.header:
+            spaces = separator not in head
+            separator = "\t" if spaces else separator
+            rows = ("\t".join(line.split()) + "\n" if spaces else line for line in (head, *lines))
+            source = io.BytesIO("".join(rows).encode())
+    return csv.read_csv(
+        source,
+        read_options=csv.ReadOptions(column_names=list(form.header) or None),
+        parse_options=csv.ParseOptions(delimiter=separator),
+        convert_options=csv.ConvertOptions(
+            column_types={name: pyarrow.string() for name in form.texts},
+            strings_can_be_null=True,
+            decimal_point=form.decimal,
+        ),
+    )
 
 
 def _read_parquet(path: Path, wanted: list[str] | None) -> Any:

@@ -62,7 +62,7 @@ def _column(values: list[Any]) -> np.ndarray:
     kinds = {type(value) for value in values}
     if kinds <= {int, float}:
         try:
-            return np.array(values, np.float64)
+            return np.array(values, np.int64 if kinds == {int} else np.float64)  # ids are longer than floats are exact
         except OverflowError:  # an integer that no float holds
             pass
     if kinds == {bool}:

@@ -17,6 +17,9 @@ COARSE = 0.01  # of what a column changes by in a row: the distance of neighbour
 LONG = 5.0  # s, a step that hardly any controller has
 FEW_MOVED = 0.01  # of the rows, that may have jumped and leave the others in doubt of nothing
 MANY_MOVED = 0.05  # of the rows, that are not dropped for having jumped: the unit is another
+SPAN = 10  # rows that velocities are compared over
+JITTERS = 0.25  # power of rows, by which places move farther than they jitter: 0 of jitter alone, 0.5 of a random walk
+DEGREE = 111_000.0  # m of a degree of latitude
 MAX_SPEED = 100.0  # m/s that nothing there can do, unless somebody says what it can
 
 
@@ -73,15 +76,28 @@ def sorted_rows(columns: Columns, schema: TableSchema) -> Rows:
     recording = np.zeros(len(clock), int)
     if schema.episode is not None:
         recording = numbered(words(columns, schema.episode))[1]
-    order = np.lexsort((np.arange(len(clock)), owner, recording))  # an agent's rows in the order of the table
+    later = clock if schema.sort else np.zeros(len(clock))
+    order = np.lexsort((np.arange(len(clock)), later, owner, recording))  # else an agent's rows as in the table
     ended = _ends(columns, schema, len(clock))
     rows = Rows(order, recording[order], owner[order], clock[order], agents, ended[order])
+    if schema.sort:
+        rows = rows.chosen(~_repeats(rows, columns, schema))
     _refuse_disorder(rows, columns, schema)
     if not rows.follows.any():
         raise StoreError(
             f"No agent has two rows; check that {schema.agent} tells agents and {schema.time} their times."
         )
     return rows
+
+
+def _repeats(rows: Rows, columns: Columns, schema: TableSchema) -> np.ndarray:
+    """(M,) whether a row says nothing that the one before does not say."""
+    same = np.ones(len(rows.order), bool)
+    same[0] = False
+    for name in schema.columns:
+        column = columns[name][rows.order]
+        same[1:] &= np.asarray(column[1:] == column[:-1], bool)
+    return same
 
 
 def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
@@ -91,17 +107,23 @@ def _refuse_disorder(rows: Rows, columns: Columns, schema: TableSchema) -> None:
     twice = same & (passed == 0)
     where = "." if schema.episode is not None else ", or name the column that tells episodes apart."
     for wrong, what, remedy in (
-        (backwards, "is earlier than", "sort each agent's rows by time"),
+        (backwards, "is earlier than", "sort each agent's rows by time with sort=True (--sort)"),
         (twice, "is the time of", "keep one row per agent and time"),
     ):
         if not wrong.any():
             continue
         k = int(np.flatnonzero(wrong)[np.argmin(rows.order[1:][wrong])])
         row = int(rows.order[k + 1])
+        when = _written(columns[schema.time][row])
         raise StoreError(
-            f"row {row}: {schema.time}={rows.time[k + 1]:.10g} {what} row {int(rows.order[k])} of the same agent "
+            f"row {row}: {schema.time}={when} {what} row {int(rows.order[k])} of the same agent "
             f"({schema.agent}={columns[schema.agent][row]}); {remedy}{where}"
         )
+
+
+def _written(time: object) -> str:
+    """A time as the table has it."""
+    return f"{time:.10g}" if isinstance(time, int | float | np.number) else str(time)
 
 
 def values_of(columns: Columns, rows: Rows, schema: TableSchema) -> Values:
@@ -242,22 +264,32 @@ def blurred(rows: Rows, values: Values) -> Iterator[str]:
 
 
 def _doubtful_velocities(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:
-    """Columns of velocities that are not those of the positions."""
-    moved = _moved(rows, values, schema)
-    speed = np.linalg.norm(moved, axis=1)
-    follows = rows.follows
-    usual = follows & (speed <= np.quantile(speed[follows], 0.99))  # a row that jumped says nothing of the others
-    for k, axis in enumerate(schema.position):
+    """Columns of velocities that are not those of the positions. Both are means over several rows, of which jitter of
+    the places is a smaller part; where places move no farther than they jitter, nothing is said."""
+    track = np.cumsum(np.append(True, ~rows.follows))
+    span = max(min(SPAN, int(np.median(np.bincount(track)[track])) // 2), 1)
+    whole = track[span:] == track[:-span]
+    passed = np.where(whole, rows.time[span:] - rows.time[:-span], np.inf)
+    place = values.stacked(schema.position)
+    speed = np.linalg.norm(place[span:] - place[:-span], axis=1) / passed
+    usual = whole & (speed <= np.quantile(speed[whole], 0.99))  # a row that jumped says nothing of the others
+    for axis in schema.position:
         if f"v{axis}" not in schema.velocity:
             continue
-        real = moved[usual, k]
-        v = values.columns[f"v{axis}"]
+        x, v = values.columns[axis], values.columns[f"v{axis}"]
+        far, near = (x[span:] - x[:-span])[usual], np.diff(x)[rows.follows]
+        moved = float(np.sqrt((far**2).mean()))
+        if moved == 0 or moved < span**JITTERS * float(np.quantile(np.abs(near), 0.68)):
+            continue
         # Simulators differ in which of both velocities moves things.
-        ways = (v[:-1][usual], v[1:][usual], (v[:-1] + v[1:])[usual] / 2)
-        logged = max(ways, key=lambda way: abs(float((real * way).sum())) / max(float(np.linalg.norm(way)), 1e-12))
-        ratio = float((real * logged).sum() / max((real**2).sum(), 1e-12))
-        if (real != 0).any() and not 0.67 < ratio < 1.5:
-            yield f"v{axis} is {ratio:.3g} times what {axis} changes by: check its unit, sign, axis and frame"
+        ways = (v[:-1], v[1:], (v[:-1] + v[1:]) / 2)
+        sums = (np.concatenate([[0], np.cumsum(way * np.diff(rows.time) * rows.follows)]) for way in ways)
+        paths = [(path[span:] - path[:-span])[usual] for path in sums]
+        logged = max(paths, key=lambda path: abs(float((far * path).sum())) / max(float(np.linalg.norm(path)), 1e-12))
+        ratio = float((far * logged).sum() / (far**2).sum())
+        if not 0.67 < ratio < 1.5:
+            perhaps = ", or whether it is in degrees (--project utm)" if ratio > DEGREE / 2 else ""
+            yield f"v{axis} is {ratio:.3g} times what {axis} changes by: check its unit, sign, axis and frame{perhaps}"
 
 
 def _jumps(rows: Rows, values: Values, schema: TableSchema) -> Iterator[str]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,18 @@ import numpy as np
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.angles import without_angles
 from ringfence.logs.io.clock import Clock, clock_of, off_the_clock, on_whole_steps
-from ringfence.logs.io.columns import Columns, Table, Tables, dates, numbers, read_columns, seconds, words
+from ringfence.logs.io.columns import (
+    Columns,
+    Form,
+    Table,
+    Tables,
+    dates,
+    names_of,
+    numbers,
+    read_columns,
+    seconds,
+    words,
+)
 from ringfence.logs.io.episodes import Episodes, Motion, neighbour_episodes, team_episodes
 from ringfence.logs.io.lerobot import entry_names
 from ringfence.logs.io.lists import expanded
@@ -33,6 +45,7 @@ from ringfence.logs.io.rows import (
 )
 from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.io.tracks import Tracks, resample
+from ringfence.logs.io.units import in_metres
 from ringfence.logs.io.wide import read_wide
 from ringfence.problem.constraints import CostColumn
 
@@ -107,9 +120,12 @@ def _read(
     share: float | None = None,
 ) -> tuple[dict[str, Any], int]:
     """What `from_steps` takes, and how many episodes are of the first `share` of the time."""
-    columns, schema = _joined([_columns_of(one, schema) for one in _each(table)])
+    columns, schema = _joined([_columns_of(one, schema, k) for k, one in enumerate(_each(table))])
+    columns, metres = in_metres(columns, schema)
     columns, schema, angles = without_angles(columns, schema)
     rows = sorted_rows(columns, schema)
+    twice = len(columns[schema.time]) - len(rows.order)
+    repeated = [f"{twice} rows that repeat another are left out"] if twice else []
     values = values_of(columns, rows, schema)
     rows, values, dropped = without_jumps(rows, values, schema)
     refuse_jumps(rows, values, schema)
@@ -125,7 +141,7 @@ def _read(
     motion = Motion(schema, _on_clock(rows, values, clock, schema), rows.agents)
     episodes = neighbour_episodes(motion) if schema.homogeneous else team_episodes(motion)
     early = motion.tracks.recording[episodes.rows[episodes.last, 0]] < recordings
-    warnings = [*notes, *angles, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
+    warnings = [*notes, *metres, *angles, *repeated, *dropped, *doubtful, *drifts, *_made_of(schema), *episodes.notes]
     steps = _steps(motion, episodes, warnings, card or {})
     if lost:  # what the table has lost is not found again by moving it
         steps |= {name: steps[name].astype(np.float32) for name in ("observations", "final_observations")}
@@ -137,10 +153,14 @@ def read_layout(table: Tables, layout: str, options: Mapping[str, Any]) -> tuple
     are those of a `TableSchema` beside columns."""
     if layout not in LAYOUTS:
         raise unknown("layout", layout, LAYOUTS)
-    return _joined([_of_layout(one, LAYOUTS[layout], layout, options) for one in _each(table)])
+    tables = [_of_layout(one, LAYOUTS[layout], layout, options, k) for k, one in enumerate(_each(table))]
+    columns, schema = _joined(tables)
+    return columns, replace(schema, join=False)
 
 
-def _of_layout(table: Table, known: Layout, layout: str, options: Mapping[str, Any]) -> tuple[Columns, TableSchema]:
+def _of_layout(
+    table: Table, known: Layout, layout: str, options: Mapping[str, Any], number: int
+) -> tuple[Columns, TableSchema]:
     names = {"time": "time", "agent": "agent", "state": known.state, "action": known.action}
     for name in names:
         if name in options:
@@ -149,11 +169,14 @@ def _of_layout(table: Table, known: Layout, layout: str, options: Mapping[str, A
     theirs = {name: known.columns.get(name, name) for name in ("time", "agent", *known.state, *known.action)}
     sides = known.corner or ()
     others = [name for name in schema.columns if name not in theirs]
-    read = read_columns(table, [*theirs.values(), *sides, *others])
+    form = Form(decimal=schema.decimal, texts=(theirs["agent"],))
+    read = read_columns(table, [*theirs.values(), *sides, *others], form)
     columns = read | {ours: read[name] for ours, name in theirs.items()}
     columns["time"] = seconds(read, theirs["time"]) * known.time_unit
     for axis, side in zip("xy", sides):
         columns[axis] = numbers(columns, axis) + numbers(read, side) / 2
+    if schema.join:
+        columns["agent"] = _after_the_table(table, columns, schema, number)
     return columns, schema
 
 
@@ -179,6 +202,8 @@ def _joined(tables: list[tuple[Columns, TableSchema]]) -> tuple[Columns, TableSc
         own = [""] * len(columns[schema.time]) if schema.episode is None else words(columns, schema.episode)
         episodes.append(np.array([f"{k:06d}/{name}" for name in own]))
     columns = {name: _one_after_another(name, [columns[name] for columns, _ in tables]) for name in tables[0][0]}
+    if first.join:
+        return columns, first
     return columns | {RECORDING: np.concatenate(episodes)}, replace(first, episode=RECORDING)
 
 
@@ -190,17 +215,32 @@ def _one_after_another(name: str, parts: list[np.ndarray]) -> np.ndarray:
         raise StoreError(f"{name} is {kinds} in tables that are given together; write it in one way.") from None
 
 
-def _columns_of(table: Table, schema: TableSchema) -> tuple[Columns, TableSchema]:
-    """The schema's columns under our names, and the schema with the entries of its lists."""
+def _columns_of(table: Table, schema: TableSchema, number: int) -> tuple[Columns, TableSchema]:
+    """The schema's columns of table `number` under our names, and the schema with the entries of its lists."""
     theirs = {ours: their for their, ours in schema.rename.items()}
+    texts = [name for name in (schema.agent, schema.episode, schema.time_format and schema.time) if name]
+    form = Form(schema.header, schema.decimal, tuple(theirs.get(name, name) for name in texts))
     if schema.wide is not None:
-        columns = read_wide(table, schema, theirs)
+        columns = read_wide(table, schema, theirs, form)
     else:
-        read = read_columns(table, [theirs.get(name, name) for name in schema.columns])
-        columns = {name: read[theirs.get(name, name)] for name in schema.columns}
-    columns[schema.time] = dates(columns[schema.time])
+        named = list(schema.columns)
+        if schema.join and theirs.get(schema.agent, schema.agent) not in names_of(table, form):
+            named.remove(schema.agent)
+        read = read_columns(table, [theirs.get(name, name) for name in named], form)
+        columns = {name: read[theirs.get(name, name)] for name in named}
+    if schema.join:
+        columns[schema.agent] = _after_the_table(table, columns, schema, number)
+    columns[schema.time] = dates(columns[schema.time], schema.time_format)
     names = entry_names(table)
     return expanded(columns, schema, {name: names.get(theirs.get(name, name)) for name in columns})
+
+
+def _after_the_table(table: Table, columns: Columns, schema: TableSchema, number: int) -> np.ndarray:
+    """(M,) names of the agents of a table that is joined with others."""
+    whose = Path(table).stem if isinstance(table, str | Path) else str(number)
+    if schema.agent not in columns:
+        return np.full(len(columns[schema.time]), whose)
+    return np.array([f"{whose}/{name}" for name in words(columns, schema.agent)])
 
 
 def _on_clock(rows: Rows, values: Values, clock: Clock, schema: TableSchema) -> Tracks:

@@ -1,8 +1,9 @@
-"""What is said of a table: what its columns are, and how rows become episodes. The command line reads these classes."""
+"""What is said of a table: how it is written, what its columns are, how rows become episodes. The command line reads these classes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,3 +54,21 @@ class EpisodeRules:
     """steps of an episode, at most; longer ones are cut."""
     max_speed: float | None = None
     """m/s that nothing there can do: rows that jump faster are dropped. Without it, 100 m/s are refused."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Written:
+    """How a table is written."""
+
+    header: tuple[str, ...] = ()
+    """names of the columns of a text file without a head; its lines that begin with # are left out."""
+    decimal: Literal[".", ","] = "."
+    """what a CSV file writes for a decimal point."""
+    time_format: str | None = None
+    """how times are written as text, e.g. "%d/%m/%Y %H:%M:%S"; ISO 8601 needs none."""
+    project: Literal["utm", "none"] | None = None
+    """utm: x and y are degrees of longitude and latitude, to be metres; none: they are metres, whatever their names."""
+    sort: bool = False
+    """put each agent's rows in order of time, and leave out rows that repeat another."""
+    join: bool = False
+    """several files are of one recording; agents are called after the file, too, which is an agent if it names none."""

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
 from ringfence.errors import UserError, unknown, whole_number
-from ringfence.logs.io.table_options import Columns, EpisodeRules
+from ringfence.logs.io.table_options import Columns, EpisodeRules, Written
 from ringfence.logs.schema import FIELDS as CARD_FIELDS
 from ringfence.problem.constraints import Hazard, Separation
 
 AXES = "xyz"
 LARGEST = 1e15  # number of a schema
-LISTS = ("state", "action", "goal", "cost")
+LISTS = ("state", "action", "goal", "cost", "header")
+PROJECTIONS = ("utm", "none")
+LONGITUDE = {"lon", "lng", "long", "longitude"}  # words in names of columns
+LATITUDE = {"lat", "latitude"}
 # Options as 0.1.0 called them.
 OLD_OPTIONS = {
     "longest": "max_episode_steps",
@@ -24,7 +29,7 @@ OLD_OPTIONS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableSchema(Columns, EpisodeRules):
+class TableSchema(Columns, EpisodeRules, Written):
     """Columns of a table with a row per agent and time, in SI units. Checked when made; lists may be given as any
     iterable of names, and `cost` as one name.
 
@@ -47,10 +52,17 @@ class TableSchema(Columns, EpisodeRules):
 
     `rename` has our names by the table's, for all that is named above. A table with columns for every agent says by
     `wide` how these are called: "{agent}_{column}" reads leader_x as x of `leader`, and `agent` is a name of our own.
+
+    `header` names the columns of a text file without one, and `decimal` is what it writes for a point. `time_format`
+    says how times are written as text, as `datetime.strptime` reads it. `scale` has factors by column, and
+    `project="utm"` makes metres of x and y that are degrees of longitude and latitude. `sort` puts an agent's rows in
+    the order of their times and leaves out those that repeat one. With `join`, several tables are of one recording,
+    whose agents are called after the table, too; a table without the column `agent` is of one.
     """
 
     danger: Hazard | None = None
     rename: Mapping[str, str] = field(default_factory=dict)
+    scale: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self):
         if isinstance(self.cost, str):
@@ -103,6 +115,11 @@ class TableSchema(Columns, EpisodeRules):
         optional = [name for name in (self.episode, self.reward, self.terminated) if name]
         return [self.time, self.agent, *self.state, *self.action, *self.goal, *self.cost, *optional]
 
+    @property
+    def numbers(self) -> list[str]:
+        """Those that a factor may be given of."""
+        return [*self.state, *self.action, *self.goal, *self.cost, *([self.reward] if self.reward else [])]
+
 
 def _names(field: str, given: Iterable[str] | None) -> tuple[str, ...]:
     if isinstance(given, str):
@@ -126,7 +143,7 @@ def _require_word(field: str, name: Any) -> None:
 
 # --- rules, in the order in which they are asked ---
 def _words(schema: TableSchema) -> None:
-    for option in ("time", "agent", "episode", "reward", "terminated", "wide"):
+    for option in ("time", "agent", "episode", "reward", "terminated", "wide", "time_format"):
         name = getattr(schema, option)
         if name is not None or option in ("time", "agent"):
             _require_word(option, name)
@@ -216,6 +233,40 @@ def _action(schema: TableSchema) -> None:
         )
 
 
+def _written(schema: TableSchema) -> None:
+    if schema.decimal not in (".", ","):
+        raise UserError(f"decimal={schema.decimal!r:.60} is no decimal point; give '.' or ','.")
+    for name in ("sort", "join"):
+        if not isinstance(getattr(schema, name), bool):
+            raise UserError(f"{name}={getattr(schema, name)!r:.60} is no choice; give True or False.")
+
+
+def _scale(schema: TableSchema) -> None:
+    if not isinstance(schema.scale, Mapping):
+        raise UserError(f"scale={schema.scale!r:.60} is no dictionary; give factors by the names of columns.")
+    for name, factor in schema.scale.items():
+        if not (isinstance(factor, int | float) and math.isfinite(factor) and factor != 0):
+            raise UserError(f"scale of {name}={factor!r:.60} must be a number other than 0.")
+
+
+def _project(schema: TableSchema) -> None:
+    if schema.project not in (None, *PROJECTIONS):
+        raise unknown("projection", str(schema.project), PROJECTIONS)
+    if schema.project == "utm" and schema.position[:2] != ("x", "y"):
+        raise UserError("project='utm' makes metres of x and y, which state must hold; rename longitude=x latitude=y.")
+    theirs = {ours: their for their, ours in schema.rename.items()}
+    for ours in (*schema.position, *schema.goal):
+        name = theirs.get(ours, ours)
+        words = set(re.split(r"[^a-z]+", name.lower()))
+        if schema.project is None and words & (LONGITUDE | LATITUDE):
+            raise UserError(
+                f"'{name}' is in degrees by its name, and places are in metres; give project='utm' (--project utm) to "
+                "make metres of longitude=x and latitude=y, or 'none' if it is in metres."
+            )
+        if schema.project == "utm" and words & {"x": LATITUDE, "y": LONGITUDE}.get(ours, set()):
+            raise UserError(f"'{name}' is called {ours} for project='utm'; rename longitude=x latitude=y.")
+
+
 RULES: tuple[Callable[[TableSchema], None], ...] = (
     _words,
     _one_kind_of_episode,
@@ -229,4 +280,7 @@ RULES: tuple[Callable[[TableSchema], None], ...] = (
     _action,
     _rename,
     _wide,
+    _written,
+    _scale,
+    _project,
 )

@@ -8,20 +8,20 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from ringfence.errors import StoreError, UserError
-from ringfence.logs.io.columns import Columns, Table, names_of, read_columns
+from ringfence.logs.io.columns import Columns, Form, Table, names_of, read_columns
 from ringfence.logs.io.table_schema import TableSchema
 
 AGENT = "{agent}"
 COLUMN = "{column}"
 
 
-def read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str]) -> Columns:
+def read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str], form: Form) -> Columns:
     """The schema's columns, agent by agent. A column that no agent has of its own is everybody's. Rows in which all of
     an agent's own columns are missing are left out: it was away. `theirs` are names in the table, by ours."""
     assert schema.wide is not None
     shared = {name for name in (schema.time, schema.episode) if name}
     asked = [name for name in schema.columns if name not in shared and name != schema.agent]
-    own = _owners(schema.wide, names_of(table), {name: theirs.get(name, name) for name in asked})
+    own = _owners(schema.wide, names_of(table, form), {name: theirs.get(name, name) for name in asked})
     agents = list(dict.fromkeys(agent for columns in own.values() for agent in columns))
     if not agents:
         raise UserError(
@@ -38,7 +38,7 @@ def read_wide(table: Table, schema: TableSchema, theirs: Mapping[str, str]) -> C
             )
     everybodys = {name: theirs.get(name, name) for name in (*shared, *(name for name in asked if not own[name]))}
     read = read_columns(
-        table, [*everybodys.values(), *(column for columns in own.values() for column in columns.values())]
+        table, [*everybodys.values(), *(column for columns in own.values() for column in columns.values())], form
     )
     parts = [_of_agent(agent, schema.agent, everybodys, own, read) for agent in agents]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -1,0 +1,86 @@
+"""Units of a table's columns: numbers times a factor, and degrees of longitude and latitude as metres."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ringfence.errors import StoreError, unknown
+from ringfence.logs.io.columns import Columns, numbers
+from ringfence.logs.io.table_schema import TableSchema
+
+# WGS 84 and the transverse Mercator projection of UTM, by Krüger's series (Karney 2011, to the third order: 1 mm).
+RADIUS, FLATTENING = 6378137.0, 1 / 298.257223563
+N = FLATTENING / (2 - FLATTENING)
+MERIDIAN = RADIUS / (1 + N) * (1 + N**2 / 4 + N**4 / 64)
+SERIES = (N / 2 - 2 * N**2 / 3 + 5 * N**3 / 16, 13 * N**2 / 48 - 3 * N**3 / 5, 61 * N**3 / 240)
+SCALE, EASTING, NORTHING = 0.9996, 500_000.0, 10_000_000.0
+REACH = 9.0  # degrees from a zone's middle, beyond which distances are off by more than a hundredth
+POLES = 84.0  # degrees of latitude, where UTM ends
+
+
+def in_metres(columns: Columns, schema: TableSchema) -> tuple[Columns, list[str]]:
+    """The columns in SI units, as the schema's `scale` and `project` say, and what was made of degrees."""
+    for name in schema.scale:
+        if name not in schema.numbers:
+            raise unknown("column of numbers", name, schema.numbers)
+    columns = columns | {name: _times(columns, name, factor) for name, factor in schema.scale.items()}
+    if schema.project != "utm":
+        return columns, []
+    pairs = [("x", "y"), schema.goal[:2]] if schema.goal else [("x", "y")]
+    degrees = [[numbers(columns, name) for name in pair] for pair in pairs]
+    for pair, values in zip(pairs, degrees):
+        for name, value, largest in zip(pair, values, (180.0, POLES)):
+            _require_degrees(name, value, largest)
+    zone, north = zone_of(*degrees[0])
+    for pair, values in zip(pairs, degrees):
+        columns |= dict(zip(pair, utm(values[0], values[1], zone, north)))
+    return columns, [f"degrees of longitude and latitude are metres of UTM zone {zone}{'N' if north else 'S'}"]
+
+
+def _times(columns: Columns, name: str, factor: float) -> np.ndarray:
+    """A column times a factor; what is missing in it stays so, for whoever reads it to judge."""
+    column = columns[name]
+    return (column if column.dtype.kind in "iuf" else numbers(columns, name)) * factor
+
+
+def _require_degrees(name: str, value: np.ndarray, largest: float) -> None:
+    beyond = np.abs(value) > largest
+    if beyond.any():
+        row = int(np.flatnonzero(beyond)[0])
+        raise StoreError(
+            f"row {row}: {name} is {value[row]:.10g}, and degrees of UTM are within {largest:g}; scale it to degrees "
+            f"(--scale {name}=1e-7 of tenths of a millionth), drop the row, or see that x is the longitude."
+        )
+
+
+def zone_of(longitude: np.ndarray, latitude: np.ndarray) -> tuple[int, bool]:
+    """The UTM zone in which places lie in the mean, 1 to 60, and whether it is of the north."""
+    mean = float(np.rad2deg(np.angle(np.exp(1j * np.deg2rad(longitude)).mean())))
+    zone = int((mean + 180) // 6) % 60 + 1
+    far = np.abs((longitude - _middle(zone) + 180) % 360 - 180)
+    if far.max() > REACH:
+        row = int(np.flatnonzero(far > REACH)[0])
+        raise StoreError(
+            f"row {row}: the longitude {longitude[row]:.6g} is {far[row]:.3g} degrees from the middle of UTM zone "
+            f"{zone}, where most rows are, and UTM is true within {REACH:g}; import one region at a time."
+        )
+    return zone, bool(np.median(latitude) >= 0)
+
+
+def utm(longitude: np.ndarray, latitude: np.ndarray, zone: int, north: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Easting and northing (m) of degrees in a UTM zone."""
+    sine = np.sin(np.deg2rad(latitude))
+    around = np.deg2rad(longitude - _middle(zone))
+    bend = 2 * np.sqrt(N) / (1 + N)
+    t = np.sinh(np.arctanh(sine) - bend * np.arctanh(bend * sine))
+    xi, eta = np.arctan2(t, np.cos(around)), np.arctanh(np.sin(around) / np.hypot(1, t))
+    x, y = eta.copy(), xi.copy()
+    for k, a in enumerate(SERIES, 1):
+        x += a * np.cos(2 * k * xi) * np.sinh(2 * k * eta)
+        y += a * np.sin(2 * k * xi) * np.cosh(2 * k * eta)
+    return EASTING + SCALE * MERIDIAN * x, (0.0 if north else NORTHING) + SCALE * MERIDIAN * y
+
+
+def _middle(zone: int) -> float:
+    """Degrees of longitude of a zone's middle."""
+    return 6.0 * zone - 183.0
