@@ -685,3 +685,15 @@ def test_events_keep_their_sum_whatever_the_steps():
     np.testing.assert_array_equal(store.costs > 0, [0.85 < 0.1 * k < 2.05 for k in range(1, 50)])
     halves = EpisodeStore.from_table(lasts, **options, dt=0.05)
     assert np.isclose(halves.costs.sum(), lasts["hit"].sum()) and (np.diff(halves.costs > 0) != 0).sum() == 2
+
+
+@pytest.mark.parametrize("after", [0.03, 0.05, 0.08])
+def test_agents_whose_rows_come_between_those_of_others_lose_no_command(after):
+    """Two robots with timers of their own, both of which jitter by a fifth of a step."""
+    k = np.arange(500)
+    t = np.r_[k, k + after / 0.1] * 0.1 + np.random.default_rng(0).uniform(-0.02, 0.02, 1000)
+    t[0] = 0.0
+    table = {"t": t, "id": np.repeat([0, 1], 500), "x": np.tile(np.sin(k * 0.01), 2), "y": np.repeat([0.0, 1.0], 500)}
+    table |= {"a": np.tile(k * 1.0, 2), "hit": np.zeros(1000)}
+    store = EpisodeStore.from_table(table, time="t", agent="id", state=["x", "y"], action=["a"], cost="hit")
+    assert store.steps > 490 and (np.diff(store.actions[:, :, 0], axis=0) == 1).all()

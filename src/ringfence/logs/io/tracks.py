@@ -13,6 +13,7 @@ from ringfence.errors import StoreError
 
 FINEST = 1000  # steps between two rows: more are another unit of time
 EARLY = 0.05  # of a step, by which an agent's first or last row may miss one
+STEADY = 0.5  # length of the mean phase of rows that keep their place between steps
 CHUNK = 4_000_000  # pairs of agents whose distances are looked at together
 
 
@@ -123,12 +124,19 @@ class _Segments:
         """(where steps are on that axis, the last row at or before each)."""
         axis = self.axis
         place = step * dt + (self.origin + self.shift)[segment]
-        # Clocks jitter, so a row may come up to half a step late (half of the finer of both steps).
-        inside = np.diff(self.time)[~self.begins[1:]]
-        late = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
-        row = np.searchsorted(axis, place + late, "right") - 1
+        row = np.searchsorted(axis, place + self._late(dt)[segment], "right") - 1
         at = np.clip(place, axis[self.first][segment], axis[self.last][segment])
         return at, np.clip(row, self.first[segment], self.last[segment])
+
+    def _late(self, dt: float) -> np.ndarray:
+        """(S,) s by which a row may come after the step that it is of: half a step, since clocks jitter (half of the
+        finer of both steps). Around the usual place of a segment's rows between steps, where they have one, so that
+        jitter makes no difference to agents whose rows come half a step after those of others."""
+        inside = np.diff(self.time)[~self.begins[1:]]
+        half = 0.499 * min(dt, float(np.median(inside)) if len(inside) else dt)
+        steps = (self.time - self.origin[np.cumsum(self.begins) - 1]) / dt
+        turns = np.add.reduceat(np.exp(2j * np.pi * steps), self.first) / (self.last - self.first + 1)
+        return half + np.where(np.abs(turns) > STEADY, np.angle(turns) / (2 * np.pi) * dt, 0.0)
 
 
 def _between(sum_of: np.ufunc, values: np.ndarray, before: np.ndarray, row: np.ndarray) -> np.ndarray:
