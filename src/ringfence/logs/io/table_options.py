@@ -1,4 +1,4 @@
-"""What is said of a table: how it is written, what its columns are, how rows become episodes. The command line reads these classes."""
+"""How a table is written, what its columns are, how rows become episodes. The command line reads these classes."""
 
 from __future__ import annotations
 
