@@ -42,6 +42,7 @@ REFERENCE = {
     ),
     "Importers": (
         "ringfence.logs.io.table_schema",
+        "ringfence.logs.io.table_options",
         "ringfence.logs.io.table",
         "ringfence.logs.io.observe",
         "ringfence.logs.io.rosbag",
