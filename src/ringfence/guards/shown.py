@@ -13,6 +13,7 @@ import numpy as np
 
 from ringfence.errors import UserError
 from ringfence.guards.correction import ASKED
+from ringfence.problem.entries import Entries
 from ringfence.types import Array
 from ringfence.world import World, cause_candidates
 from ringfence.world.cause_nets import values_of
@@ -51,7 +52,8 @@ class Shown(eqx.Module):
                 "within_logs keeps to what varies in the logs, and no entry of an agent does; leave it out."
             )
         nearest = tuple((one, ranges[one.name][0], ranges[one.name][1] - ranges[one.name][0]) for one in lengths)
-        places = tuple(_is_place(name, names) for name in known)
+        going = _going(names)
+        places = tuple(names.index(name) in going for name in known)
         return cls(low, high, tuple(names.index(name) for name in known), places, nearest)
 
     def along(self, x: Array) -> Array:
@@ -90,10 +92,10 @@ def _in_margins(inside: Array) -> Array:
     return jnp.where(steps >= 0, 1.0 + steps, 1.0 / (1.0 + jnp.maximum(-steps, 0.0) / STEEP))
 
 
-def _is_place(name: str, names: list[str]) -> bool:
-    """Whether an entry goes on by a velocity: a place, or what has a velocity of its name."""
-    whose, _, what = name.partition(".")
-    return what in ("x", "y", "z") or f"{whose}.v{what}" in names
+def _going(names: list[str]) -> set[int]:
+    """Entries that go on by a velocity: places, and what has a velocity of its name."""
+    known = Entries.of(names)
+    return {e.source for e in known.each if e.role == "place" or f"v{e.what}" in known.bodies[e.whose, e.order]}
 
 
 def _varying(world: World) -> list[str]:

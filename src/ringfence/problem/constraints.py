@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.errors import UserError, unknown
+from ringfence.problem.entries import Entries, axes_of
 from ringfence.types import Array
 
 Numbers = np.ndarray | Array
@@ -155,12 +156,11 @@ def bind_or_none(hazard: Hazard, names: tuple[str, ...], n_agents: int) -> Bound
 
 
 def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) -> BoundHazard:
-    slots = 0
-    while f"other{slots}.dx" in names:
-        slots += 1
+    known = Entries.of(names)
+    slots = len(list(itertools.takewhile(axes_of, known.others)))
     # An agent may see not all others, but those who come nearest; in a crowd somebody is always seen, and no entry
     # needs to say so.
-    nearest_only = any(re.fullmatch(r"other\d+\.seen", name) for name in names) or (n_agents < 2 and slots > 0)
+    nearest_only = any("seen" in other for other in known.others) or (n_agents < 2 and slots > 0)
     if n_agents < 2 and not nearest_only:
         raise UserError(f"Separation needs at least 2 agents, the data has {n_agents}; use another hazard.")
     offsets = _offsets(names, n_agents, slots if nearest_only else n_agents - 1)
@@ -176,13 +176,14 @@ def _bind_separation(hazard: Separation, names: tuple[str, ...], n_agents: int) 
 def _offsets(names: tuple[str, ...], n_agents: int, others: int) -> Callable[[Numbers], Numbers]:
     """A function from features (..., N, D) to the places of others relative to an agent (..., N, others, 2), where
     features hold these or everybody's places."""
-    relative = [(f"other{j}.dx", f"other{j}.dy") for j in range(others)]
+    first, second = Entries.of(names).axes[:2]
+    relative = [(f"other{j}.d{first}", f"other{j}.d{second}") for j in range(others)]
     lacking = [name for pair in relative for name in pair if name not in names]
     if not lacking:
         index = np.array([[names.index(x), names.index(y)] for x, y in relative])  # (others, 2)
         return lambda x: x[..., index]
 
-    absolute = [(f"agent{j}.x", f"agent{j}.y") for j in range(n_agents)]
+    absolute = [(f"agent{j}.{first}", f"agent{j}.{second}") for j in range(n_agents)]
     if any(name not in names for pair in absolute for name in pair):
         raise _missing("Separation", lacking[0], names)
     index = np.array([[names.index(x), names.index(y)] for x, y in absolute])  # (N, 2)

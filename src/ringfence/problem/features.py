@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
@@ -23,6 +22,7 @@ import numpy as np
 
 from ringfence.errors import UserError, unknown
 from ringfence.problem import on_map, partners, turns
+from ringfence.problem.entries import Entries, axes_of
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.others import order_in, others
 from ringfence.problem.partners import Mirrored
@@ -154,30 +154,17 @@ def derived(names: tuple[str, ...], n: int) -> dict[int, tuple[int, int]]:
     or with the product of `own.v` and `own.cos` (`headed`, numbered after all entries). Who the others are, a map's
     `order` says.
     """
-    at = {name: d for d, name in enumerate(names)}
-    for axis, number in zip("xy", range(len(names), len(names) + len(headed(names)))):
-        at.setdefault(f"own.v{axis}", number)
+    known = Entries.of(names)
+    own = {f"v{axis}": len(names) + k for k, axis in enumerate(known.axes[: len(headed(names))])} | known.own
     found = {}
-    for d, name in enumerate(names):
-        match = re.fullmatch(r"([a-z_]+?)(\d*)\.d(\w+)", name)
-        if match is None or match[1] == "own" or f"own.{match[3]}" not in at:
+    for e in known.each:
+        if e.whose == "own" or not e.what.startswith("d") or e.what[1:] not in own:
             continue
-        if match[1] != "other":
-            found[d] = (at[f"own.{match[3]}"], -1)
-        elif match[2] and int(match[2]) < n - 1:
-            found[d] = (at[f"own.{match[3]}"], int(match[2]))
+        if e.whose != "other":
+            found[e.source] = (own[e.what[1:]], -1)
+        elif e.order is not None and e.order < n - 1:
+            found[e.source] = (own[e.what[1:]], e.order)
     return found
-
-
-def numbered(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
-    """Fields of each of several things that names number (`other0.dx`, `wall1.dy`), by kind and in order: their
-    entries."""
-    found: dict[str, dict[int, dict[str, int]]] = {}
-    for d, name in enumerate(names):
-        match = re.fullmatch(r"([a-z]+)(\d+)\.(\w+)", name)
-        if match:
-            found.setdefault(match[1], {}).setdefault(int(match[2]), {})[match[3]] = d
-    return {kind: [fields for _, fields in sorted(things.items())] for kind, things in found.items()}
 
 
 def given_names(map: FeatureMap, entries: Sequence[str], state: Sequence[str] | None = None) -> list[str]:
@@ -193,19 +180,20 @@ def given_names(map: FeatureMap, entries: Sequence[str], state: Sequence[str] | 
 
 def others_offsets(names: Sequence[str]) -> np.ndarray:
     """(J, 2 or 3) entries that say where each of the others is (dx, dy, dz); (0, 2) where names tell no such thing."""
-    things = numbered(names).get("other", [])
-    axes = [f"d{axis}" for axis in "xyz" if things and all(f"d{axis}" in thing for thing in things)]
-    return np.array([[thing[axis] for axis in axes] for thing in things], int).reshape(len(things), len(axes) or 2)
+    things = Entries.of(names).others
+    axes = axes_of(set.intersection(*map(set, things))) if things else ""
+    return np.array([[thing[f"d{axis}"] for axis in axes] for thing in things], int).reshape(
+        len(things), len(axes) or 2
+    )
 
 
 def headed(names: Sequence[str]) -> tuple[tuple[int, int], ...]:
     """The velocity of an agent that tells its speed and heading: two products of entries, along x and y; none where
     it tells no such thing."""
-    at = {name: d for d, name in enumerate(names)}
-    for speed in ("own.v", "own.speed"):
-        if {speed, "own.cos", "own.sin"} <= set(at) and "own.vx" not in at:
-            return (at[speed], at["own.cos"]), (at[speed], at["own.sin"])
-    return ()
+    known = Entries.of(names)
+    if known.speed is None or len(known.direction) < 2 or f"v{known.axes[0]}" in known.own:
+        return ()
+    return tuple((known.speed, looks) for looks in known.direction)
 
 
 def translation(wanted: FeatureMap, given: FeatureMap) -> np.ndarray | None:
@@ -267,14 +255,12 @@ def constant_velocity(map: FeatureMap, dt: float, late: float = 1.0) -> FeatureM
 
 def motion_rules(names: Sequence[str]) -> tuple[tuple[int, int, int], ...]:
     """(entry of a place, entry of its relative velocity or −1, entry of the own velocity) of what is named so."""
-    entries = {name: d for d, name in enumerate(names)}
-    rules = []
-    for name, d in entries.items():
-        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
-        if match is not None and f"own.v{match[2]}" in entries:
-            thing, axis = match.groups()
-            rules.append((d, entries.get(f"{thing}.dv{axis}", -1), entries[f"own.v{axis}"]))
-    return tuple(rules)
+    known = Entries.of(names)
+    return tuple(
+        (e.source, known.bodies[e.whose, e.order].get(f"dv{e.axis}", -1), known.own[f"v{e.axis}"])
+        for e in known.each
+        if e.role == "offset" and f"v{e.axis}" in known.own
+    )
 
 
 def decentralized(view: str, names: tuple[str, ...], dt: float) -> FeatureMap:
@@ -403,7 +389,7 @@ def from_data(
         plain = replace(plain, turns=turns.found_in(steps.before, steps.after))
     if view == "centralized":
         return plain
-    if homogeneous and not any(f"own.{c}" in plain.names for c in "xyz"):
+    if homogeneous and not axes_of(Entries.of(plain.names).own, "{}"):
         dt = dt or _step_of(plain, steps)
         if dt is not None:
             return constant_velocity(plain, dt, _late(plain, steps, dt))
@@ -524,19 +510,14 @@ def _step_of(map: FeatureMap, steps: _Steps | None) -> float | None:
     `own.vx`. None where no entry tells, or logged steps do not agree."""
     if steps is None:
         return None
-    names = {name: d for d, name in enumerate(map.names)}
     before = steps.before.astype(np.float64)
     after = steps.after.astype(np.float64)
     found = []
-    for name, d in names.items():
-        match = re.fullmatch(r"([a-z_]+\d*)\.d([xyz])", name)
-        if match is None:
+    for place, relative, mine in motion_rules(map.names):
+        if relative >= 0:
             continue
-        thing, axis = match.groups()
-        if f"own.v{axis}" not in names or f"{thing}.dv{axis}" in names:
-            continue
-        moved = (after - before)[..., d].ravel()
-        speed = after[..., names[f"own.v{axis}"]].ravel()
+        moved = (after - before)[..., place].ravel()
+        speed = after[..., mine].ravel()
         fast = np.abs(speed) > np.quantile(np.abs(speed), 0.5)
         if not fast.any():
             continue

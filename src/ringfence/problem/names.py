@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+
+from ringfence.problem.entries import HEADINGS, LANE, SPACE, SPEEDS, Entries
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,10 +25,15 @@ class Names:
         return cls({n: d for d, n in enumerate(observation)}, {n: d for d, n in enumerate(state)}, agents)
 
     @cached_property
+    def entries(self) -> Entries:
+        """What names say of observations."""
+        return Entries.of(list(self.observation))
+
+    @cached_property
     def axes(self) -> str:
         """Along which agents move: a plane, or space where something is logged along z."""
-        along_z = [*self.observation, *self.state]
-        return "xyz" if any(re.fullmatch(r"own\.v?z|other0\.dz|agent0\.v?z", name) for name in along_z) else "xy"
+        each = {self.entries.axes, Entries.of(list(self.state)).axes}
+        return next((axes for axes in (SPACE, LANE) if axes in each), SPACE[:2])
 
     def pair(self, pattern: str) -> list[int] | None:
         """Entries of x and y (and z in space), where all are observed; `pattern` as own.v{}."""
@@ -59,14 +65,19 @@ class Names:
     @cached_property
     def things(self) -> list[str]:
         """What else is observed relative to an agent, e.g. goal and landmark0."""
-        found = [m[1] for name in self.observation if (m := re.fullmatch(r"(\w+)\.d[xyz]", name))]
-        return [name for name in dict.fromkeys(found) if not re.fullmatch(r"own|other\d+", name)]
+        found = dict.fromkeys((e.whose, e.order) for e in self.entries.each if e.role == "offset")
+        named = [(whose, "" if order is None else str(order)) for whose, order in found]
+        return [whose + order for whose, order in named if not (whose == "other" and order) and whose + order != "own"]
 
     @cached_property
     def as_logged(self) -> list[str]:
         """Entries of a driven agent that stay as they were logged: no name says how they follow from its motion."""
-        known = re.compile(r"own\.(v?[xyz]|v|speed|cos|sin|heading|yaw|theta)|other\d+\.(dv?[xyz]|seen)|\w+\.dv?[xyz]")
-        return [name for name in self.observation if not known.fullmatch(name)]
+        own = self.entries.own
+        moved = {e.source for e in self.entries.each if e.role in ("offset", "drift")}
+        moved |= {e.source for e in self.entries.each if e.whose == "own" and e.role in ("place", "velocity")}
+        moved |= {*self.entries.direction, *(own[word] for word in (*HEADINGS, *SPEEDS) if word in own)}
+        moved |= {other["seen"] for other in self.entries.others if "seen" in other}
+        return [name for d, name in enumerate(self.observation) if d not in moved]
 
     @cached_property
     def resting(self) -> list[list[int]]:

@@ -31,7 +31,8 @@ import optax
 from ringfence.nets.mlp import MLP
 from ringfence.nets.optim import regress
 from ringfence.problem.constraints import lowest
-from ringfence.problem.features import FeatureMap, numbered
+from ringfence.problem.entries import Entries
+from ringfence.problem.features import FeatureMap
 from ringfence.types import Array, Key
 from ringfence.utils.device import on_device
 from ringfence.world.cause_nets import Score, blank, scores, worst
@@ -220,7 +221,8 @@ def shape_of(map: FeatureMap, use_transition: bool | None = None, distances: boo
             blame="all" if map.shared_body else "worst",
         )
     # A pair is the same wherever it is: own entries but the place.
-    moving = tuple(d for d, name in enumerate(names) if _own_but_place(name))
+    known = Entries.of(names)
+    moving = tuple(e.source for e in known.each if (e.whose, e.order) == ("own", None) and e.role != "place")
     pairs = tuple((kind, tuple(moving + entries for entries in each)) for kind, each in things.items())
     inside = {d for each in things.values() for entries in each for d in entries}
     return Shape(
@@ -234,15 +236,11 @@ def shape_of(map: FeatureMap, use_transition: bool | None = None, distances: boo
     )
 
 
-def _own_but_place(name: str) -> bool:
-    return name.startswith("own.") and name.split(".")[1] not in ("x", "y", "z")
-
-
 def _things(names: tuple[str, ...]) -> dict[str, list[tuple[int, ...]]]:
     """Entries of each other, obstacle or wall, by kind, in the order of their fields' names; of kinds whose things all
     have the same fields."""
     kinds: dict[str, list[tuple[int, ...]]] = {}
-    for kind, things in numbered(names).items():
+    for kind, things in Entries.of(names).numbered.items():
         if kind in DANGEROUS and len({tuple(sorted(fields)) for fields in things}) == 1:
             kinds[kind] = [tuple(fields[f] for f in sorted(fields)) for fields in things]
     return kinds
@@ -251,11 +249,8 @@ def _things(names: tuple[str, ...]) -> dict[str, list[tuple[int, ...]]]:
 def _offsets(names: tuple[str, ...], kind: str, pair: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Which of a pair's entries are the offset (dx, ...) and the relative velocity (dvx, ...)."""
 
-    def those(field: str) -> tuple[int, ...]:
-        return tuple(k for k, d in enumerate(pair) if re.fullmatch(rf"{kind}\d+\.{field}", names[d]))
-
-    place = those("d[xyz]")
-    speed = those("dv[xyz]")
+    roles = {e.source: e.role for e in Entries.of(names).each if e.whose == kind}
+    place, speed = (tuple(k for k, d in enumerate(pair) if roles.get(d) == role) for role in ("offset", "drift"))
     return place, speed if len(speed) == len(place) else ()
 
 

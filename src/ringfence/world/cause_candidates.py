@@ -8,12 +8,10 @@ from collections.abc import Iterator, Sequence
 
 from msgspec.structs import replace
 
-from ringfence.problem.features import numbered
+from ringfence.problem.entries import LANE, SPACE, Entries, axes_of
 from ringfence.world.causes import Cause, narrowed
 
 WIDEST = 4  # entries of one cause
-# That one looks into; who has no such entry looks to where he moves.
-DIRECTIONS = (("own.cos", "own.sin"), ("own.heading",), ("own.yaw",), ("own.theta",), ("own.vx", "own.vy"))
 ROW = 3  # entries at least that names number
 NAMELESS = ("obs", "state", "entry")  # what numbers alone tell apart is no row
 ORDINALS = ("", "second ", "third ", "fourth ", "fifth ", "sixth ")  # nearest of several things, that causes read
@@ -46,8 +44,7 @@ def offsets(names: Sequence[str]) -> list[Cause]:
     """How far away things are, by kind, as names tell (dx, dy, dz)."""
     found = []
     for kind, each in things_of(names).items():
-        axes = [f"d{c}" for c in "xyz" if f"d{c}" in each[0]]
-        if axes:
+        if axes := [f"d{c}" for c in axes_of(each[0])]:
             found.append(Cause(f"length of {kind}.{', '.join(axes)}", _picked(each, axes), length=True))
     return found
 
@@ -58,14 +55,16 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
     looks into a direction."""
     found: list[Cause] = []
     own, several, lone = _own(names), things_of(names), _lone_things(names)
+    known = Entries.of(names)
+    looks = known.direction or known.pair("v{}")  # who tells no direction looks to where he moves
     of_lone = {d for each in lone.values() for d in each[0].values()}
     moving = {name: d for name, d in own.items() if d not in of_lone}
     for kind, each in (several | lone).items():
-        axes = [c for c in "xyz" if f"d{c}" in each[0]]
+        axes = axes_of(each[0])
         if axes:
             offset = Cause(f"{kind}.distance", _picked(each, [f"d{c}" for c in axes]))
             found += _nearing(offset, each, axes, own)
-            found += _turned(offset, kind, own)
+            found += _turned(offset, kind, looks)
             found += _beside(offset, [own if kind in several else moving] * len(each))
             theirs = [{f"{kind}.{f}": d for f, d in thing.items() if f[1:] not in axes} for thing in each]
             found += _beside(offset, theirs)
@@ -74,9 +73,7 @@ def with_distances(names: Sequence[str]) -> list[Cause]:
     return found
 
 
-def _nearing(
-    offset: Cause, each: Sequence[dict[str, int]], axes: Sequence[str], own: dict[str, int]
-) -> Iterator[Cause]:
+def _nearing(offset: Cause, each: Sequence[dict[str, int]], axes: str, own: dict[str, int]) -> Iterator[Cause]:
     """How far things are, and how fast that shrinks: by their velocity, or of what logs none by one's own."""
     theirs, mine = [f"dv{c}" for c in axes], [f"own.v{c}" for c in axes]
     name = f"{offset.name}, how fast it shrinks"
@@ -86,15 +83,14 @@ def _nearing(
         yield replace(offset, name=name, also=_picked([own] * len(each), mine), how="nearing", against=True)
 
 
-def _turned(offset: Cause, kind: str, own: dict[str, int]) -> Iterator[Cause]:
+def _turned(offset: Cause, kind: str, looks: tuple[int, ...]) -> Iterator[Cause]:
     """How far ahead things in a plane are, and how far aside."""
-    looks = next((fields for fields in DIRECTIONS if set(fields) <= set(own)), ())
     if len(offset.things[0]) == 2 and looks:
-        direction = _picked([own] * len(offset.things), looks)
-        yield replace(offset, name=f"{kind}.ahead, {kind}.aside", also=direction, how="turned")
+        also = (looks,) * len(offset.things)
+        yield replace(offset, name=f"{kind}.ahead, {kind}.aside", also=also, how="turned")
 
 
-def _both(kind: str, each: Sequence[dict[str, int]], axes: Sequence[str], own: dict[str, int]) -> Iterator[Cause]:
+def _both(kind: str, each: Sequence[dict[str, int]], axes: str, own: dict[str, int]) -> Iterator[Cause]:
     """Where one is, and where things are: what has room for one is dangerous for two."""
     place = [f"own.{c}" for c in axes]
     if set(place) <= set(own) and 0 < 2 * len(axes) <= WIDEST:
@@ -164,7 +160,7 @@ def _with_one_more(cause: Cause, names: Sequence[str]) -> Iterator[Cause]:
 def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
     """Fields of each thing, by kind: those that all of a kind have."""
     kinds = {}
-    for kind, things in numbered(names).items():
+    for kind, things in Entries.of(names).numbered.items():
         shared = set.intersection(*[set(fields) for fields in things])
         if shared:
             kinds[kind] = [{f: d for f, d in fields.items() if f in shared} for fields in things]
@@ -174,9 +170,9 @@ def things_of(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
 def _lone_things(names: Sequence[str]) -> dict[str, list[dict[str, int]]]:
     """Likewise things that no number tells from others of their kind, e.g. a goal: each is a kind of one."""
     kinds: dict[str, list[dict[str, int]]] = {}
-    for d, name in enumerate(names):
-        if match := re.fullmatch(r"([a-z_]+)\.(dv?[xyz])", name):
-            kinds.setdefault(match[1], [{}])[0][match[2]] = d
+    for e in Entries.of(names).each:
+        if e.order is None and e.role in ("offset", "drift"):
+            kinds.setdefault(e.whose, [{}])[0][e.what] = e.source
     return kinds
 
 
@@ -194,8 +190,9 @@ def _sets(kind: str, each: list[dict[str, int]]) -> Iterator[Cause]:
 def _numbers(names: Sequence[str]) -> Iterator[tuple[str, ...]]:
     """Each by itself, and those that are a vector: they differ in the axis at the end alone."""
     yield from ((name,) for name in names)
-    axes: dict[str, list[str]] = {}
+    axes: dict[tuple[str, str], list[str]] = {}
     for name in names:
-        if name[-1] in "xyz":
-            axes.setdefault(name[:-1], []).append(name)
+        for frame in (SPACE, LANE):
+            if name[-1] in frame:
+                axes.setdefault((name[:-1], frame), []).append(name)
     yield from (tuple(vector) for vector in axes.values() if len(vector) > 1)

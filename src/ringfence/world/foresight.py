@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 
 import numpy as np
 
+from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
 from ringfence.world import cause_candidates
 from ringfence.world.barrier import Barrier, MinBarrier
@@ -62,11 +62,12 @@ def _moved(map: FeatureMap, now: np.ndarray, before: np.ndarray, dt: float | Non
     moved = map.apart(now, before)
     if dt is None:
         return moved
-    at = {name: d for d, name in enumerate(map.names)}
-    for name, d in at.items():
-        velocity = at.get(re.sub(r"\.(d?)([xyz])$", r".\1v\2", name))
-        if velocity is not None and velocity != d:
-            moved[..., d] = dt * now[..., velocity]
+    known = Entries.of(map.names)
+    for e in known.each:
+        fast = {"place": f"v{e.axis}", "offset": f"dv{e.axis}"}.get(e.role)
+        velocity = known.bodies[e.whose, e.order].get(fast or "")
+        if velocity is not None:
+            moved[..., e.source] = dt * now[..., velocity]
     return moved
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,10 +9,10 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 
+from ringfence.problem.entries import Entries
 from ringfence.types import Array
 
 AHEAD = "own speed ahead"  # which names do not give, and which the card has a range of
-RELATIVE = re.compile(r"(?!own\.)[a-z_]+\d*\.dv[xy]")  # how fast things move, less one's own velocity
 
 
 class Heading(msgspec.Struct, frozen=True):
@@ -27,15 +26,16 @@ class Heading(msgspec.Struct, frozen=True):
     @classmethod
     def of(cls, names: Sequence[str]) -> Heading | None:
         """None where names tell of none."""
-        at = {name: d for d, name in enumerate(names)}
-        if not {"own.cos", "own.sin"} <= set(at):
+        known = Entries.of(names)
+        if len(known.direction) < 2:
             return None
-        direction = at["own.cos"], at["own.sin"]
-        relative = [(d, "xy".index(name[-1])) for name, d in at.items() if RELATIVE.fullmatch(name)]
-        if {"own.vx", "own.vy"} <= set(at):
-            return cls((at["own.vx"], at["own.vy"]), direction, tuple(relative))
-        speed = next((at[name] for name in ("own.v", "own.speed") if name in at), None)
-        return None if speed is None else cls((speed,), direction, tuple(relative))
+        cos, sin = known.direction
+        axes = known.axes[:2]
+        drifts = [e for e in known.each if e.role == "drift" and e.whose != "own" and e.axis in axes]
+        relative = tuple((e.source, axes.index(e.axis)) for e in drifts)
+        if velocity := known.pair("v{}"):
+            return cls(velocity, (cos, sin), relative)
+        return None if known.speed is None else cls((known.speed,), (cos, sin), relative)
 
     @property
     def about(self) -> tuple[int, ...]:

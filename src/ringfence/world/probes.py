@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ringfence.problem.entries import Entries
 from ringfence.types import Array
 from ringfence.world import cause_candidates, cause_edges
 from ringfence.world.barrier import Barrier, MinBarrier
@@ -24,8 +25,6 @@ POINTS = 25  # of a curve
 FARTHEST = 4.0  # radii, up to which the curve of a distance reaches
 SIDE = 32  # values along each axis of a map
 ASKED = 50  # held-out states in which every place of a map is asked about
-OWN_PLACE = ("own.x", "own.y")
-OWN_SPEED = (("own.vx", "own.vy"), ("own.v",), ("own.speed",))
 
 
 class Probed(NamedTuple):
@@ -115,10 +114,10 @@ def _axis(low: float, high: float) -> np.ndarray:
 
 def _own_speed(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequence[str], unit: float) -> list[Probe]:
     """Median scores of the first agent along its own speed, where names tell it; all else stays as it was."""
-    entries = next((found for found in OWN_SPEED if set(found) <= set(names)), None)
-    if entries is None:
+    known = Entries.of(names)
+    index = np.array(known.pair("v{}") or [known.speed] * (known.speed is not None), int)
+    if not len(index):
         return []
-    index = np.array([list(names).index(name) for name in entries])
     velocity = states[:, 0, index]
     speed = np.maximum(np.sqrt((velocity**2).sum(-1, keepdims=True)), 1e-6)
     at = np.linspace(0.0, 1.25 * np.quantile(speed, 0.999), POINTS)
@@ -127,15 +126,15 @@ def _own_speed(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequenc
         put = states.copy()
         put[:, 0, index] = value * velocity / speed
         scores.append(np.median(np.asarray(_scores_of_all(barrier, states, put))[:, 0]))
-    name = f"own speed ({', '.join(entries)}), put into held-out states"
+    name = f"own speed ({', '.join(names[d] for d in index)}), put into held-out states"
     return [_along(name, at, np.array(scores) / unit)]
 
 
 def _own_place(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequence[str], unit: float) -> list[ProbeMap]:
     """Median scores of the first agent over its own place, where names tell it; all else stays as it was."""
-    if not set(OWN_PLACE) <= set(names):
+    index = np.array(Entries.of(names).pair("{}"), int)
+    if not len(index):
         return []
-    index = np.array([list(names).index(name) for name in OWN_PLACE])
     some = states[:ASKED]
     axes = [_axis(*np.quantile(states[:, 0, d], (0.0, 1.0))) for d in index]
     rows = []
@@ -146,7 +145,7 @@ def _own_place(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequenc
         put[:, 0, index] = np.repeat(places, len(some), 0)
         scores = _scores_of_all(barrier, before, put)
         rows.append(np.median(np.asarray(scores)[:, 0].reshape(SIDE, -1), 1))
-    return [_over(f"{', '.join(OWN_PLACE)}, put into held-out states", axes, np.array(rows) / unit)]
+    return [_over(f"{', '.join(names[d] for d in index)}, put into held-out states", axes, np.array(rows) / unit)]
 
 
 def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Edge]]:

@@ -13,6 +13,7 @@ from ringfence.errors import UserError, known
 from ringfence.evaluation.replay.scene import Motion
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import normalise
+from ringfence.problem.entries import LANE, SPACE, Entries, axes_of
 from ringfence.world import World
 
 KINEMATICS = ("double_integrator", "holonomic", "unicycle", "bicycle", "world")
@@ -91,8 +92,8 @@ class Kinematics:
 
 def foreseen_velocity(world: World) -> Any:
     """A compiled function (features (B, N, D), actions (B, N, A) in [−1, 1]) -> change of velocities (B, N, X)."""
-    names = list(world.spec.feature_names)
-    at = np.array([names.index(name) for name in ("own.vx", "own.vy", "own.vz") if name in names])
+    own = Entries.of(world.spec.feature_names).own
+    at = np.array([own[f"v{axis}"] for axis in axes_of(own, "v{}")])
 
     @jax.jit
     def change(world: World, before: Any, action: Any) -> Any:
@@ -121,7 +122,8 @@ def kinematics_of(
     if name in TURNING:
         return made
     fitted = _fitted(made, store, motion) if size == axes else made
-    needed = [f"own.v{axis}" for axis in "xyz"[:axes]]
+    lane = world is not None and Entries.of(world.spec.feature_names).axes == LANE
+    needed = [f"own.v{axis}" for axis in (LANE if lane else SPACE)[:axes]]
     world_can = world is not None and set(needed) <= set(world.spec.feature_names)
     if name == "world" or (name is None and not fitted.explained >= WELL and world_can):
         if not world_can:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
@@ -11,6 +10,7 @@ import numpy as np
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import on_map
+from ringfence.problem.entries import HEADINGS, SPEEDS
 from ringfence.problem.kinematics import late_share
 from ringfence.problem.names import Names
 from ringfence.problem.others import others
@@ -101,11 +101,10 @@ def _velocities(store: EpisodeStore, names: Names, x: np.ndarray) -> np.ndarray 
         return x[..., pair]
     if store.state is not None and (where := names.state_pairs("agent{}.v{{}}")):
         return np.asarray(store.state, np.float64)[:, where]
-    entry = names.observation
-    speed = entry.get("own.v", entry.get("own.speed"))
-    if speed is not None and "own.cos" in entry and "own.sin" in entry:
-        along = x[..., [entry["own.cos"], entry["own.sin"]]] * x[..., speed, None]
-        return along if names.axes == "xy" else None
+    speed, looks = names.entries.speed, names.entries.direction
+    if speed is not None and len(looks) == 2:
+        along = x[..., looks] * x[..., speed, None]
+        return along if len(names.axes) == 2 else None
     return None
 
 
@@ -187,10 +186,12 @@ class Windows:
             if pair := self.names.pair(pattern):
                 mine[:, pair] += change
         along = (velocity[:, :2] * np.stack([np.cos(heading), np.sin(heading)], -1)).sum(-1)
-        known = {"own.v": along, "own.speed": along, "own.cos": np.cos(heading), "own.sin": np.sin(heading)}
-        for name, value in (known | {"own.heading": heading, "own.yaw": heading, "own.theta": heading}).items():
-            if name in self.names.observation:
-                mine[:, self.names.observation[name]] = value
+        own = self.names.entries.own
+        known = dict.fromkeys(SPEEDS, along) | dict.fromkeys(HEADINGS, heading)
+        for what in known.keys() & own.keys():
+            mine[:, own[what]] = known[what]
+        if len(looks := self.names.entries.direction) == 2:
+            mine[:, looks] = np.stack([np.cos(heading), np.sin(heading)], -1)
 
     def _others(self, mine, moved, faster) -> None:
         """What the driven agent sees of others; those who are not there stay where nobody is."""
@@ -205,8 +206,9 @@ class Windows:
             self._sort(mine)
 
     def _sort(self, mine: np.ndarray) -> None:
-        whats = [m[1] for n in self.names.observation if (m := re.fullmatch(r"other0\.(\w+)", n))]
-        entries = np.array([[self.names.observation[f"other{j}.{w}"] for w in whats] for j in range(self.names.slots)])
+        others = self.names.entries.others[: self.names.slots]
+        whats = list(others[0])
+        entries = np.array([[other[what] for what in whats] for other in others])
         blocks = mine[:, entries]  # (W, K, C)
         far = np.linalg.norm(blocks[..., [whats.index(f"d{axis}") for axis in self.names.axes]], axis=-1)
         if "seen" in whats:

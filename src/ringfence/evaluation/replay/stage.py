@@ -104,9 +104,9 @@ class Stage:
         place = w.place[:, 0].copy()
         velocity = w.velocity[:, 0].copy()
         heading = np.arctan2(velocity[:, 1], velocity[:, 0])
-        if {"own.cos", "own.sin"} <= set(w.names.observation):
-            first = w.observations[np.arange(w.count), 0, w.driven]
-            heading = np.arctan2(first[:, w.names.observation["own.sin"]], first[:, w.names.observation["own.cos"]])
+        if looks := w.names.entries.direction:
+            first = w.observations[np.arange(w.count), 0, w.driven][:, looks]
+            heading = first[:, 0] if len(looks) == 1 else np.arctan2(first[:, 1], first[:, 0])
         if guard is not None:
             guard = self._of_one(guard)
         if guard is not None and not isinstance(driver, str):

@@ -1,0 +1,131 @@
+"""What entries' names say: whose each is, which of several, in which role and along which axis (docs/arrays.md)."""
+
+from __future__ import annotations
+
+import functools
+import re
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+SPACE, LANE = "xyz", "sd"  # axes: of a plane or space; along a lane and aside
+HEADINGS = ("heading", "yaw", "theta", "psi")  # angles from the first axis towards the second, rad
+SPEEDS = ("v", "speed")
+_NAME = re.compile(r"([a-z_]+?)([0-9]{0,9})\.(.+)")
+_WORD = re.compile(r"\w+")
+_MOTION = re.compile(rf"(d?v?)([{SPACE}{LANE}])")
+
+Role = Literal["place", "velocity", "offset", "drift", "number"]  # drift: a velocity less one's own
+_ROLES: dict[str, Role] = {"": "place", "v": "velocity", "d": "offset", "dv": "drift"}
+
+
+class Entry(NamedTuple):
+    """An entry of observations, of the state or of a view."""
+
+    whose: str  # own, other, or as a thing is called; "" where the name does not say
+    order: int | None  # which of several of that name: 1 of other1
+    what: str  # the rest of the name
+    role: Role
+    axis: str  # one of SPACE or LANE; "" of a number
+    source: int  # which entry it is
+
+
+def axes_of(fields: Collection[str], pattern: str = "d{}") -> str:
+    """The axes along which fields of one body tell something, e.g. `dx` and `dy`; those of a lane where both are."""
+    found = "".join(axis for axis in SPACE if pattern.format(axis) in fields)
+    return found or LANE * all(pattern.format(axis) in fields for axis in LANE)
+
+
+@dataclass(frozen=True)
+class Entries:
+    """All that the names of entries say, in their order."""
+
+    names: tuple[str, ...]
+
+    @classmethod
+    def of(cls, names: Sequence[str]) -> Entries:
+        """The same value for the same names, since it is asked often."""
+        return _entries(tuple(names))
+
+    @cached_property
+    def at(self) -> dict[str, int]:
+        """Entries by name."""
+        return {name: d for d, name in enumerate(self.names)}
+
+    @cached_property
+    def bodies(self) -> dict[tuple[str, int | None], dict[str, int]]:
+        """Fields of oneself, of others and of things, by what each is called and which of several it is."""
+        found: dict[tuple[str, int | None], dict[str, int]] = {}
+        for d, name in enumerate(self.names):
+            if match := _NAME.fullmatch(name):
+                found.setdefault((match[1], int(match[2]) if match[2] else None), {})[match[3]] = d
+        return found
+
+    @cached_property
+    def each(self) -> tuple[Entry, ...]:
+        """Every entry whose name says whose it is, in their order."""
+        found = [
+            _entry(whose, order, what, fields, d)
+            for (whose, order), fields in self.bodies.items()
+            for what, d in fields.items()
+        ]
+        return tuple(sorted(found, key=lambda entry: entry.source))
+
+    @cached_property
+    def own(self) -> dict[str, int]:
+        """Fields of oneself."""
+        return self.bodies.get(("own", None), {})
+
+    @cached_property
+    def numbered(self) -> dict[str, list[dict[str, int]]]:
+        """Fields of each of several things that names number (`other0.dx`, `wall1.dy`), by kind and in order."""
+        found: dict[str, dict[int, dict[str, int]]] = {}
+        for (kind, order), fields in self.bodies.items():
+            words = {what: d for what, d in fields.items() if _WORD.fullmatch(what)}
+            if order is not None and "_" not in kind and words:
+                found.setdefault(kind, {})[order] = words
+        return {kind: [fields for _, fields in sorted(things.items())] for kind, things in found.items()}
+
+    @property
+    def others(self) -> list[dict[str, int]]:
+        """Fields of each of the others."""
+        return self.numbered.get("other", [])
+
+    @cached_property
+    def axes(self) -> str:
+        """Along which bodies move: a plane, space where anything is told along z, or a lane."""
+        known = [(self.own, "{}"), (self.own, "v{}"), *((other, "d{}") for other in self.others[:1])]
+        known += [(self.bodies.get(("agent", 0), {}), pattern) for pattern in ("{}", "v{}")]
+        told = {axis for fields, pattern in known for axis in axes_of(fields, pattern)}
+        return SPACE if "z" in told else LANE if told & set(LANE) and not told & set(SPACE) else SPACE[:2]
+
+    def pair(self, pattern: str) -> tuple[int, ...]:
+        """Own entries along the axes of a plane or a lane, e.g. v{}; none where one is not told."""
+        fields = [pattern.format(axis) for axis in self.axes[:2]]
+        return tuple(self.own[field] for field in fields) if set(fields) <= set(self.own) else ()
+
+    @cached_property
+    def direction(self) -> tuple[int, ...]:
+        """Entries of where one looks: its cosine and sine, or an angle; none where names tell none."""
+        for cos, sin in (("cos", "sin"), *((f"cos_{word}", f"sin_{word}") for word in HEADINGS)):
+            if cos in self.own and sin in self.own:
+                return self.own[cos], self.own[sin]
+        return next(((self.own[word],) for word in HEADINGS if word in self.own), ())
+
+    @cached_property
+    def speed(self) -> int | None:
+        """The entry of how fast one goes ahead."""
+        return next((self.own[word] for word in SPEEDS if word in self.own), None)
+
+
+@functools.lru_cache(256)
+def _entries(names: tuple[str, ...]) -> Entries:
+    return Entries(names)
+
+
+def _entry(whose: str, order: int | None, what: str, fields: Collection[str], source: int) -> Entry:
+    match = _MOTION.fullmatch(what)
+    if match is None or match[2] not in axes_of(fields, match[1] + "{}"):
+        return Entry(whose, order, what, "number", "", source)
+    return Entry(whose, order, what, _ROLES[match[1]], match[2], source)
