@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ringfence.problem import partners
+from ringfence.problem.entries import Entries
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
@@ -27,7 +28,6 @@ LIKE = 0.05  # of a change: what a velocity predicts is off by less
 LESS = 0.5  # of a change that is left of that of a velocity relative to one's own, once one's own is added
 SHARE = 0.9  # of the rows that have to agree: angles jump where they are full, and goals where they are reached
 AXES = "xyz"
-SAID = re.compile(r"own\.|other\d+\.")
 MEANING = ("own", "other", "agent", "obs", "state")  # words that name something else, or nothing
 
 
@@ -49,7 +49,8 @@ def inferred_names(
     """Names (O) of entries of observations (M, N, O) where those that were given, if any were, say of none whose it is.
     Those that do not follow stay as they are, and so do those to `keep`. `first_rows` (E,) are those that episodes
     begin with."""
-    if observations.shape[1] < 2 or any(SAID.match(name) for name in names):
+    said = Entries.of(names)
+    if observations.shape[1] < 2 or said.own or said.others:
         return tuple(names)
     steps = Steps.of(observations, first_rows)
     if steps is None:

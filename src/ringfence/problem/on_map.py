@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ringfence.problem.entries import SPACE, Entries
 from ringfence.problem.inferred_names import EXACT, LIKE, SHARE, Steps, inferred_names, unlike
 
 FIRST = 8  # of the rows that are compared, by which most entries are told apart
@@ -128,7 +129,7 @@ def relative(
     of_others = _of_others(steps, free, names)
     columns = columns.less(of_others)
     found = called(columns)
-    if joined is not None and len(columns.plus) > 1 and not any(re.match(r"other\d+\.", name) for name in found):
+    if joined is not None and len(columns.plus) > 1 and not Entries.of(found).others:
         seen = free if joined[1] is not None else list(_own_axes(steps, free, found).values())
         columns = columns.with_others(_of_state(steps, seen, names, joined, keep))
         found = called(columns)
@@ -265,8 +266,9 @@ def _with_things(
 def _own_axes(steps: _Steps, free: Sequence[int], found: Sequence[str]) -> dict[str, int]:
     """Entries of one's own place and velocity by axis (x, vx): as they are called, or as their names have it, and what
     the place changes by."""
-    own = {name[4:]: d for d, name in enumerate(found) if re.fullmatch(r"own\.v?[xyz]", name)}
-    if any(axis in own for axis in "xyz"):
+    moving = [e for e in Entries.of(found).each if e.whose == "own" and e.role in ("place", "velocity")]
+    own = {e.what: e.source for e in moving if e.axis in SPACE}
+    if any(axis in own for axis in SPACE):
         return own
     for d in free:
         if match := MINE.fullmatch(found[d].lower()):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +13,7 @@ from ringfence.logs.io.angles import angle_of
 from ringfence.logs.io.table_schema import AXES
 from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
+from ringfence.problem.entries import Entries, Entry
 from ringfence.problem.others import others
 from ringfence.utils import stored
 from ringfence.utils.given import refuse_other_order
@@ -44,9 +44,11 @@ def observe(
     shapes = {column.shape for column in (*columns.values(), *goals.values())}
     if len(shapes) != 1 or len(next(iter(shapes))) != 1:
         raise UserError(f"state and goal hold arrays of shapes {sorted(shapes)}; give one number per agent of each.")
-    whom = _seen_by_each(fields, columns, _others_in(names))
+    known = {e.source: e for e in Entries.of(names).each}
+    places = 1 + max((e.order for e in known.values() if e.whose == "other" and e.order is not None), default=-1)
+    whom = _seen_by_each(fields, columns, places)
     now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
-    seen = np.stack([now.entry(name) for name in names], 1)
+    seen = np.stack([now.entry(name, known.get(d)) for d, name in enumerate(names)], 1)
     return seen if fields.get("observation_origins") else seen.astype(np.float32)
 
 
@@ -59,17 +61,17 @@ class _Now:
     others: np.ndarray  # (N, M) whom each agent sees, -1 where nobody is near
     sensing_radius: float  # m
 
-    def entry(self, name: str) -> np.ndarray:
-        """(N,) of an observation's entry."""
-        whose, _, what = name.partition(".")
+    def entry(self, name: str, known: Entry | None) -> np.ndarray:
+        """(N,) of an observation's entry, of which so much is known."""
+        whose, order, what = known[:3] if known else ("", None, name)
         relative = what[:1] == "d" and what[1:] in self.columns
         column = what[1:] if relative else what
         if whose == "goal" and column in self.goals:
             return self.goals[column] - self.columns[column]
         if whose == "own" and what in self.columns:
             return self.columns[what]
-        if whose.startswith("other") and (what == "seen" or column in self.columns):
-            who = self.others[:, int(whose.removeprefix("other"))]
+        if whose == "other" and order is not None and (what == "seen" or column in self.columns):
+            who = self.others[:, order]
             return (who >= 0).astype(float) if what == "seen" else self._of_other(who, column, relative)
         raise UserError(f"The logs observe '{name}', which state and goal do not tell; add it.")
 
@@ -79,12 +81,6 @@ class _Now:
         theirs = own[who] - own if relative else own[who]
         first_axis = next((axis for axis in AXES if axis in self.columns), None)
         return np.where(who >= 0, theirs, self.sensing_radius if column == first_axis else 0.0)
-
-
-def _others_in(names: list[str]) -> int:
-    """How many others the entries are of."""
-    numbers = [re.match(r"other(\d+)\.", name) for name in names]
-    return 1 + max((int(found[1]) for found in numbers if found), default=-1)
 
 
 def _seen_by_each(card: Mapping[str, Any], columns: dict[str, np.ndarray], slots: int) -> np.ndarray:
