@@ -484,7 +484,7 @@ def _logged_steps(
 
 def _order(map: FeatureMap, steps: _Steps) -> np.ndarray | None:
     """Who the others are, where logged steps tell another order than the team's."""
-    before, after = (np.asarray(_with_products(x, headed(map.names))) for x in (steps.before, steps.after))
+    before, after = (np.asarray(_with_products(jnp.asarray(x), headed(map.names))) for x in (steps.before, steps.after))
     return order_in(after - before, derived(map.names, map.plus.shape[0]))
 
 

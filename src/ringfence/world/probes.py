@@ -126,7 +126,7 @@ def _own_speed(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequenc
         put = states.copy()
         put[:, 0, index] = value * velocity / speed
         scores.append(np.median(np.asarray(_scores_of_all(barrier, states, put))[:, 0]))
-    name = f"own speed ({', '.join(names[d] for d in index)}), put into held-out states"
+    name = f"own speed ({', '.join(names[int(d)] for d in index)}), put into held-out states"
     return [_along(name, at, np.array(scores) / unit)]
 
 
@@ -145,7 +145,7 @@ def _own_place(barrier: Barrier | MinBarrier, states: np.ndarray, names: Sequenc
         put[:, 0, index] = np.repeat(places, len(some), 0)
         scores = _scores_of_all(barrier, before, put)
         rows.append(np.median(np.asarray(scores)[:, 0].reshape(SIDE, -1), 1))
-    return [_over(f"{', '.join(names[d] for d in index)}, put into held-out states", axes, np.array(rows) / unit)]
+    return [_over(f"{', '.join(names[int(d)] for d in index)}, put into held-out states", axes, np.array(rows) / unit)]
 
 
 def _near(barrier: Barrier | MinBarrier, logged: Logged) -> list[tuple[Cause, Edge]]:
