@@ -273,17 +273,6 @@ def test_a_controller_refuses_what_is_no_observation(trained, seen, state, said)
         pilot.act(seen, state)
 
 
-def test_settings_of_before_are_read_and_said():
-    bc = algos.get("bc")
-    with pytest.warns(FutureWarning, match="steps of bc is called num_updates now"):
-        assert algos.configured(bc, "default", {"steps": 20}) == algos.configured(bc, "default", {"num_updates": 20})
-    with pytest.raises(UserError, match="num_updates and steps are two names of one choice"):
-        algos.configured(bc, "default", {"steps": 20, "num_updates": 20})
-    mine = dataclasses.replace(bc, name="mine", presets={"default": {"steps": 30}})
-    with pytest.warns(FutureWarning, match="steps of mine's preset default"):
-        assert algos.configured(mine, "default", {"num_updates": 20}).num_updates == 20
-
-
 def test_names_of_variants_follow_values(trained):
     """Neither the order nor the spelling of options makes another variant; those that results hold keep their names."""
     run = Run(trained["icbf"].path)

@@ -186,14 +186,6 @@ def test_simulators_and_policies_that_cannot_be_collected(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_name_of_before_works_and_warns():
-    with pytest.warns(FutureWarning, match="record is called collect now"):
-        store = ringfence.record(Drift, lean, episodes=3, longest=7)
-    assert store.content == ringfence.collect(Drift, lean, episodes=3).content
-    with pytest.warns(FutureWarning, match="longest of record is called max_episode_steps"):
-        ringfence.record(Drift, lean, episodes=1, longest=7)
-
-
 def test_a_mistyped_card_is_refused_before_anything_is_played():
     with pytest.raises(StoreError, match="did you mean 'observation_names'"):
         ringfence.collect(pytest.fail, episodes=1, card={"observation_name": ["x"]})

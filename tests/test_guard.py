@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import ringfence
-from ringfence import guards, world
+from ringfence import world
 from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
@@ -25,7 +25,6 @@ from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant
 from ringfence.training import loop, worlds
-from ringfence.types import PolicyStep
 from ringfence.world.card import Avoidable, BarrierScores, Card, Verdict
 from tests.quick import QUICK_WORLD
 
@@ -485,40 +484,3 @@ def test_a_controller_may_decide_for_some_of_a_team(small_world, small_store):
     for wrong in (3, [0, -1], 1.0, []):
         with pytest.raises(UserError, match="must be agents, from 0 to 2"):
             Controller(still, driven=wrong, **strict)
-
-
-def test_names_of_before_in_guards_say_those_of_today(small_world):
-    with pytest.warns(FutureWarning, match=r"ringfence\.guards\.Pilot is called ringfence\.Controller now"):
-        assert guards.Pilot is Controller
-    with pytest.warns(FutureWarning, match=r"is called ringfence\.guard now"):
-        assert guards.guard is ringfence.guard
-    with pytest.warns(FutureWarning, match="BarrierSource now"):
-        assert guards.Danger is guards.barrier.Danger is BarrierSource
-    with pytest.raises(AttributeError, match=r"module 'ringfence\.guards' has no attribute 'nothing'"):
-        _ = guards.nothing
-    controller = ringfence.guard(lambda *_: np.zeros((3, 2)), small_world)
-    controller.act(np.zeros((3, 18)), np.zeros(18))
-    with pytest.warns(FutureWarning, match=r"info\['strange'\] is called info\['ood'\] now"):
-        assert controller.info["strange"] == controller.info["ood"]
-    with pytest.raises(KeyError, match="nothing"):
-        _ = controller.info["nothing"]
-
-
-def test_policies_of_before_are_understood(small_world, small_store):
-    """`start` is called `initial_state`; whose policy has the old name is played, and who calls it is told."""
-
-    class Before:
-        def start(self, batch):
-            return jnp.zeros(batch)
-
-        def act(self, memory, observations, state, key):
-            return memory + 1, PolicyStep(jnp.zeros((*observations.shape[:2], 2)), {})
-
-    with pytest.warns(FutureWarning, match="start of the policy Before is called initial_state now"):
-        guarded = ringfence.guard(Before(), small_world)
-    seen, state = small_store.observations[:2], small_store.state[:2]
-    carry, _ = eqx.filter_jit(guarded.act)(guarded.initial_state(2), seen, state, jax.random.key(0))
-    assert carry["inner"].tolist() == [1.0, 1.0]
-    for policy in (guarded, Constant(small_world.spec)):
-        with pytest.warns(FutureWarning, match="start of a policy is called initial_state now"):
-            jax.tree.map(np.testing.assert_array_equal, policy.start(2), policy.initial_state(2))

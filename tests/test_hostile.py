@@ -437,7 +437,7 @@ def world_file(tmp_path_factory):
 
 
 def rewritten(file: Path, out: Path, edit=lambda about: None, arrays=lambda arrays: None) -> Path:
-    """A World with other metadata or arrays and no digest, as an older version, or a stranger, would write it."""
+    """A World with other metadata or arrays and no digest, as a stranger would write it."""
     with safe_open(file, "numpy") as opened:
         about = json.loads(opened.metadata()["ringfence_world"])
         kept = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118
@@ -476,7 +476,7 @@ def test_worlds_of_strangers(what, world_file, tmp_path):
 
     with pytest.raises(UserError):
         world.load(rewritten(world_file, tmp_path / "w.safetensors", WORLDS[what]))
-    world.load(rewritten(world_file, tmp_path / "old.safetensors"))  # older ones tell no digest
+    world.load(rewritten(world_file, tmp_path / "old.safetensors"))  # without a digest, nothing else being wrong
 
 
 def test_a_world_of_numbers_that_are_none_is_refused(world_file, tmp_path):

@@ -81,17 +81,6 @@ def test_a_result_says_what_the_policy_does(run, logs, world):
     assert any("the guard steps in" in line for line in result.summary())
 
 
-def test_the_name_of_before_gives_what_it_gave(run, logs, world):
-    quick = {"states": 100, "transitions": 400, "updates": 20, "members": 2, "episodes": 8, "steps": 5}
-    with pytest.warns(FutureWarning, match="ringfence.ope"):
-        judged = ringfence.judge(run, logs, judge_world=world, **quick)
-    result = ringfence.ope(run, logs, evaluation_world=world, **QUICK)
-    assert judged["foreseen_unsafe"] == result.safety.predicted_violation_rate
-    assert judged["apart"] == result.behaviour.action_rmse and judged["steps_in"] is None
-    assert judged["played"]["return"]["mean"] == result.rollout.returns.mean
-    assert judged["cost_of_logs"]["high"] == result.values_of_logs.costs.high
-
-
 def test_others_logs_and_worlds_are_refused(run, logs, world):
     other = dataclasses.replace(logs, card=logs.card.updated(task="circle"))
     with pytest.raises(UserError, match="The run is of 'line', the logs are of 'circle'"):
@@ -107,9 +96,8 @@ def test_pages_of_logs_and_of_policies_open_anywhere(run, logs, world, tmp_path,
     monkeypatch.setattr(worlds, "fit", lambda *_, **__: world)
     file = logs.save(tmp_path / "line.h5")
     few = ["--states", "100", "--transitions", "400", "--updates", "20"]
-    app.main(["judge", str(run.path), str(file), *few, "--report", str(tmp_path / "ope.html")])  # as in 0.1.0
-    said, noted = capsys.readouterr()
-    assert "'judge' is called 'ope' now" in noted
+    app.main(["ope", str(run.path), str(file), *few, "--report", str(tmp_path / "ope.html")])
+    said = capsys.readouterr().out
     assert "that it was trained on" in said and "danger is predicted within 3 steps" in said
     bad = msgspec.structs.replace(world.card, verdict=Verdict("unfit", ("it errs",), ("log more",)))
     monkeypatch.setattr(worlds, "fit", lambda *_, **__: dataclasses.replace(world, card=bad))

@@ -235,12 +235,6 @@ def test_simulators_that_tell_nonsense(run, place, value, said):
         play(run, kind, episodes=1, max_episode_steps=20)
 
 
-def test_the_argument_of_before_still_ends_an_episode(run):
-    kind = type("Endless", (Odd,), {"place": 3, "value": staticmethod(lambda t: dict.fromkeys(t, False))})
-    with pytest.warns(FutureWarning, match="max_episode_steps"), pytest.raises(UserError, match="after 7 steps"):
-        play(run, kind, episodes=1, longest=7)
-
-
 def test_agents_have_names_of_their_own(run):
     class Twins(SimpleSpreadParallel):
         def __init__(self):

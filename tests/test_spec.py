@@ -8,7 +8,6 @@ import tyro
 
 from ringfence.bench.suites import SUITES
 from ringfence.cli.playing import Playing
-from ringfence.cli.renamed import rewritten
 from ringfence.errors import UserError
 from ringfence.loading.spec import PolicySpec
 
@@ -74,55 +73,6 @@ def test_names_of_results_are_understood():
         "low_temperature+shield-analytic-decentralized+target_return1.0+trust_radius2.0+horizon7"
     )
     assert PolicySpec.of(execution="decentralized").plan_options == (("execution", "decentralized"),)
-    for twice in ({"horizon": 7, "rows": 7}, {"barrier": "learned", "danger": "learned"}):
-        with pytest.raises(UserError, match="two names of one choice"):
-            PolicySpec.of(guard="shield", **twice)
-
-
-def test_options_of_before_are_read_and_said():
-    wanted = PolicySpec.of(guard="shield", horizon=7, terminal_value=False)
-    assert PolicySpec.parse("shield-learned+rows7+futureFalse") == wanted
-    with pytest.warns(FutureWarning, match="rows of the guard is called horizon now"):
-        assert PolicySpec.of(guard="shield", rows=7, terminal_value=False) == wanted
-
-
-def test_planners_of_before_are_read_and_said():
-    wanted = PolicySpec.of(planner="value_guided", cfg_scale=1.2, target_return=-1.0, sampling_steps=3)
-    assert PolicySpec.parse("climbing+steps3+guidance1.2+target-1.0") == wanted
-    assert PolicySpec.parse(wanted.name) == wanted and PolicySpec.parse("plain") == PolicySpec.of()
-    with pytest.warns(FutureWarning) as said:
-        assert PolicySpec.of(planner="climbing", guidance=1.2, target=-1.0, steps=3) == wanted
-    assert "planner 'climbing' is called 'value_guided' now" in str(said[0].message)
-    assert "guidance of the planner is called cfg_scale now" in str(said[1].message)
-
-
-def test_flags_of_before_are_rewritten(capsys):
-    for command in ("eval", "play", "export", "ope"):
-        assert rewritten([command, "run", "--steps", "3"])[2:] == ["--sampling-steps", "3"]
-        assert rewritten([command, "--guidance=1", "--target=2"])[1:] == ["--cfg-scale=1", "--target-return=2"]
-
-
-def test_barriers_and_executions_of_before_are_read_and_said():
-    wanted = PolicySpec.of(guard="shield", barrier="analytic", execution="decentralized")
-    assert PolicySpec.parse("shield-formula-own") == wanted
-    with pytest.warns(FutureWarning) as said:
-        assert PolicySpec.of(guard="shield", danger="formula", sight="own") == wanted
-    said = "; ".join(str(warning.message) for warning in said)
-    assert "danger of the guard is called barrier now" in said and "barrier=formula is called barrier=analytic" in said
-    assert "sight of the guard is called execution now" in said
-
-
-def test_commands_of_before_are_rewritten(capsys):
-    old = ["eval", "run", "--guard", "shield", "--danger", "formula", "--sight=own", "--planner", "steady"]
-    new = ["eval", "run", "--guard", "shield", "--barrier", "analytic", "--execution=decentralized", "--planner"]
-    assert rewritten(old) == [*new, "low_temperature"]
-    assert "'--danger' is called '--barrier' now" in capsys.readouterr().err
-    new = ["fit", "data.h5", "--execution", "decentralized"]
-    assert rewritten(["fit", "data.h5", "--sight", "own"]) == new == rewritten(new)
-    metres = ["data", "table", "data.csv", "--sight", "2.5"]  # how far agents see
-    assert rewritten(metres)[-2:] == ["--sight", "2.5"]
-    assert rewritten(["bench", "crossing", "--steps", "3"])[2:] == ["--num-updates", "3"]
-    assert rewritten([]) == []
 
 
 def test_what_a_result_is_called():

@@ -550,26 +550,6 @@ def test_a_mistyped_field_of_a_card_is_refused_where_it_is_written_by_hand(tmp_p
     assert EpisodeStore.from_episodes(*arrays, card=found.card).card.extra == found.card.extra
 
 
-def test_a_card_reads_as_the_dictionary_that_it_was(small_store):
-    card = dataclasses.replace(small_store, card={"task": "fleet", "wheels": 4}).card
-    for read, wanted in (
-        (lambda: card["task"], "fleet"),
-        (lambda: card["wheels"], 4),
-        (lambda: card.get("dt", 0.5), 0.5),
-        (lambda: "wheels" in card, True),
-        (lambda: "dt" in card, False),
-        (lambda: {**card, "task": "other"}, card.to_dict() | {"task": "other"}),
-        (lambda: card | {"task": "other"}, card.to_dict() | {"task": "other"}),
-        (lambda: {"a": 1} | card, {"a": 1} | card.to_dict()),
-        (lambda: list(card), list(card.to_dict())),
-        (lambda: dict(card.items()), card.to_dict()),
-    ):
-        with pytest.warns(FutureWarning, match="of a store"):
-            assert read() == wanted
-    with pytest.warns(FutureWarning, match=r"card\['wheels'\] of a store is called card.extra\['wheels'\] now"):
-        card["wheels"]
-
-
 def test_episodes_are_selected_by_flags_or_numbers(small_store):
     flags = np.arange(small_store.episodes) % 7 == 0
     one, two = small_store.select(flags), small_store.select(np.flatnonzero(flags))

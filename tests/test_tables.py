@@ -10,7 +10,6 @@ import pytest
 
 import ringfence
 from ringfence.cli import app
-from ringfence.cli.renamed import rewritten
 from ringfence.datasets.audit import odd_actions
 from ringfence.errors import StoreError, UserError
 from ringfence.logs.io.columns import numbers
@@ -370,30 +369,6 @@ def test_others_without_places_are_observed():
     store = EpisodeStore.from_table(table, **(NAMES | {"state": ["vx", "vy"]}))
     now = {name: table[name][:3] for name in ("vx", "vy")}
     np.testing.assert_allclose(observe(store.card, now), store.observations[0], atol=1e-6)
-
-
-def test_options_of_before_work_and_warn(tmp_path, capsys):
-    now = dict(neighbours=2, sensing_radius=2.5, min_episode_steps=3, max_episode_steps=7, max_speed=50.0)
-    before = dict(neighbours=2, sight=2.5, shortest=3, longest=7, fastest=50.0)
-    wanted = EpisodeStore.from_table(fleet(), **NAMES, **now)
-    with pytest.warns(FutureWarning, match="fastest of from_table is called max_speed now"):
-        assert EpisodeStore.from_table(fleet(), **NAMES, **before).content == wanted.content
-    with pytest.raises(UserError, match="two names of one choice"):
-        EpisodeStore.from_table(fleet(), **NAMES, longest=7, max_episode_steps=7)
-    old = ["--sight", "2.5", "--shortest=3", "--longest", "7", "--fastest", "50"]
-    new = ["--sensing-radius", "2.5", "--min-episode-steps=3", "--max-episode-steps", "7", "--max-speed", "50"]
-    assert rewritten(["data", "import-table", "f.csv", *old]) == ["data", "import-table", "f.csv", *new]
-    assert rewritten(["data", "import-bag", "run", *old[:5]]) == ["data", "import-bag", "run", *new[:5]]
-    assert "'--sight' is called '--sensing-radius' now" in capsys.readouterr().err
-
-
-def test_the_radius_in_cards_of_before_is_read():
-    store = EpisodeStore.from_table(fleet(), **NAMES, neighbours=2, sensing_radius=2.5)
-    assert store.card.sensing_radius == 2.5
-    before = {name: value for name, value in store.card.to_dict().items() if name != "sensing_radius"} | {"sight": 2.5}
-    assert dataclasses.replace(store, card=before).card == store.card
-    state = {name: np.array([0.0, 9.0]) for name in ("x", "y", "vx", "vy")}
-    np.testing.assert_array_equal(observe(before, state), observe(store.card, state))
 
 
 def test_the_command_line_imports_tables_and_bags(tmp_path, capsys):

@@ -1,15 +1,12 @@
 """The World: what is learned of the logs before and without a policy."""
 
 import dataclasses
-import json
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from safetensors import safe_open
 
 from ringfence import guards, world
 from ringfence.datasets import registry
@@ -41,27 +38,6 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
         worlds.load(tmp_path / "w.safetensors")
-
-
-def test_a_world_of_0_1_0_opens(tmp_path):
-    """Its settings, its card and its arrays have names of before, and are written under today's."""
-    file = Path(__file__).parent / "data" / "world-0.1.0.safetensors"
-    with safe_open(file, "numpy") as opened:
-        before = json.loads(opened.metadata()["ringfence_world"])["card"]
-        threshold = opened.get_tensor("strange")
-    opened = worlds.load(file)
-    card = opened.card
-    assert before["settings"]["sight"] == "own" and card.settings.execution == "decentralized"
-    assert card.settings.miscoverage == before["settings"]["missed"]
-    assert card.ood is not None and card.ood.threshold == before["strange"]["threshold"]
-    assert opened.ood_threshold == np.float32(threshold) and not card.unread
-    assert card.barrier is not None and card.prediction_error is not None
-    assert card.barrier.miscoverage == before["barrier"]["missed"]
-    assert card.barrier.predicted_false_safe == before["barrier"]["foreseen_false_safe"]
-    with pytest.warns(FutureWarning, match="is called card.ood now"):
-        assert card["strange"]["threshold"] == card.ood.threshold
-    again = worlds.load(world.save(opened, tmp_path / "again.safetensors"))
-    assert again.card == card and again.ood_threshold == opened.ood_threshold
 
 
 def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):

@@ -20,7 +20,6 @@ from ringfence.datasets.registry import TASKS
 from ringfence.datasets.task import Task
 from ringfence.envs import Crossing, SafeMuJoCo, SimpleSpread, System
 from ringfence.problem import constraints
-from ringfence.utils import stored
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "results"
@@ -382,7 +381,7 @@ def _rows(task: Task) -> list[str]:
         if not (RESULTS / suite / "table.csv").exists():  # not played in full yet
             continue
         found = defaultdict(list)
-        for row in stored.table(RESULTS / suite / "table.csv"):
+        for row in csv.DictReader((RESULTS / suite / "table.csv").open(newline="")):
             if row["task"] == task.name:
                 found[tuple(row[name] for name in NAMED)].append(row)
         if not found:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import importlib
 
-from ringfence.utils import moved
-
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # Loaded on first use, so that `import ringfence` and `ringfence --help` start at once.
 _WHERE = {
@@ -39,16 +37,10 @@ _WHERE = {
     "UserError": "ringfence.errors",
 }
 __all__ = list(_WHERE)
-# Names of 0.1.0, which warn where they are called.
-_OLD = {
-    "judge": "ringfence.evaluation.ope.judge",
-    "record": "ringfence.logs.collect",
-}
-moved.install()
 
 
 def __getattr__(name: str):
-    where = _WHERE.get(name) or _OLD.get(name)
+    where = _WHERE.get(name)
     if where is not None:
         module, _, other = where.partition(":")
         return getattr(importlib.import_module(module), other or name)

@@ -16,9 +16,7 @@ from ringfence.algos.returns import BC_BEST, BC_RETURN
 from ringfence.algos.td3bc import MA_TD3BC, MA_TD3BC_LAG
 from ringfence.errors import unknown
 from ringfence.types import Algorithm
-from ringfence.utils import stored
-from ringfence.utils.config import build_config, fields_of
-from ringfence.utils.renamed import renamed
+from ringfence.utils.config import build_config
 
 _BC, _CRITICS = (BC, BC_SAFE, BC_BEST, BC_RETURN), (MA_TD3BC, OMAR, MA_CQL, MA_TD3BC_LAG, FISOR)
 ALGORITHMS = {a.name: a for a in (ICBF, MADIFF, FLOW, MPC, NAIVE, *_BC, *_CRITICS)}
@@ -32,7 +30,5 @@ def get(name: str) -> Algorithm:
 
 
 def configured(algorithm: Algorithm, preset: str, changes: Mapping[str, Any]) -> Any:
-    """The config of a preset with changes to it. Names of before are understood with a warning."""
-    older = {old: new for old, new in stored.CONFIG.items() if old not in fields_of(algorithm.Config)}
-    chosen = renamed(algorithm.presets[preset], older, f"{algorithm.name}'s preset {preset}")
-    return build_config(algorithm.Config, chosen | renamed(changes, older, algorithm.name), algorithm.name)
+    """The config of a preset with changes to it."""
+    return build_config(algorithm.Config, {**algorithm.presets[preset], **changes}, algorithm.name)

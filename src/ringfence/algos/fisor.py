@@ -36,7 +36,6 @@ from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PolicyStep, PyTree, Spec
 from ringfence.utils.config import AtLeastOne, BatchSize, Count, Natural, NonNegative, Positive, Rows, Share, Width
-from ringfence.utils.renamed import HadStart
 
 DANGER = 25.0  # h of an unsafe state; a safe one has −1
 LEVEL_WIDTH = 16  # entries of the embedding of k
@@ -177,7 +176,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
     return update
 
 
-class Proposer(HadStart, eqx.Module):
+class Proposer(eqx.Module):
     """Draws actions per agent and takes the one that its danger critics find least dangerous."""
 
     actor: MLP

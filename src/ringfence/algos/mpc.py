@@ -10,11 +10,10 @@ import jax.numpy as jnp
 from ringfence.algos.untrained import untrained
 from ringfence.problem.bounds import Bounds
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
-from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 
 
-class Rest(HadStart, eqx.Module):
+class Rest(eqx.Module):
     """Proposes to do nothing."""
 
     spec: Spec = eqx.field(static=True)

@@ -11,7 +11,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import inspect
 import itertools
 import json
 import logging
@@ -44,9 +43,7 @@ from ringfence.proposals.options import PLANNERS, PlanOptions, plan_defaults
 from ringfence.training import loop, worlds
 from ringfence.training.runs import Run, write_json
 from ringfence.utils import schemas
-from ringfence.utils import stored as names
 from ringfence.utils.files import whole
-from ringfence.utils.renamed import renamed
 from ringfence.world import Settings
 
 _log = logging.getLogger(__name__)
@@ -54,7 +51,19 @@ _log = logging.getLogger(__name__)
 FORMAT = 1  # of a results folder
 DAMAGED = "has a damaged status.json; delete that file"
 STATES = ("done", "failed", "to do")
-_FIRST_NAMES = {new: old for old, new in names.CONFIG.items()}
+# What a cell's id is made of stays, so that what was made before a field came or got its name is found: a field is left
+# out at the value that means what there was without it, and stands under the name that it had first.
+_FIRST_NAMES = {"num_updates": "steps", "target_return": "target"}
+_WITHOUT = {
+    "drivers": 0,
+    "distinguish_agents": False,
+    "around": "nothing",
+    "noisy_input": "unit",
+    "guided": False,
+    "error": "output",
+    "clone_width": 384,
+    "clone_depth": 3,
+}
 
 
 @dataclass(frozen=True)
@@ -85,12 +94,12 @@ class Cell:
         count."""
         task = registry.get(self.task)
         config = dataclasses.asdict(self.config)
-        as_before = {k for k, v in names.LATER_CONFIG.items() if config.get(k) == v}
+        told = {k: v for k, v in config.items() if k not in _WITHOUT or v != _WITHOUT[k]}
         content = {
             "format": FORMAT,
             "data": [RECIPES, self.task, self.transitions or task.transitions, constraints.to_dict(task.hazard)],
             "algorithm": self.algorithm,
-            "config": {_FIRST_NAMES.get(k, k): v for k, v in config.items() if k not in as_before},
+            "config": {_FIRST_NAMES.get(k, k): v for k, v in told.items()},
             "seed": self.seed,
         }
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:10]
@@ -169,7 +178,7 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
     guard = stored.get("guard_options") or {}
     if not spec.guarded:
         return not guard
-    usual = names.guard_options(dataclasses.asdict(GuardOptions()))
+    usual = dataclasses.asdict(GuardOptions())
     asked = dict(spec.guard_options)
     played = {**usual, **guard}  # an option newer than the result had its default then
     newer = usual.keys() - guard.keys() - asked.keys()  # a named guard that has since learned more was that guard
@@ -177,7 +186,7 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
         wanted = dataclasses.asdict(oracle.options(spec.guard, task, asked))
         return bool(guard) and played == wanted | {name: played[name] for name in newer}
     options = GuardOptions(**options_of(spec.guard, spec.barrier, task.guard, **asked))
-    wanted = names.guard_options(dataclasses.asdict(options)) | {name: played[name] for name in newer}
+    wanted = dataclasses.asdict(options) | {name: played[name] for name in newer}
     if options.horizon_seconds:  # how many steps these are, the World knew
         wanted["horizon"] = played["horizon"]
     if task.guard_by_card:  # how far the guard looked, and whether beyond the logs, was the World's affair
@@ -185,8 +194,7 @@ def same_options(stored: dict, spec: PolicySpec, task: Task, defaults: dict) -> 
         wanted |= {name: played[name] for name in looked}
     world = Settings(**worlds.usual(task, worlds.execution_of(task, spec.execution)))
     fitted = stored.get("world_settings") or {}  # results of before say nothing of it
-    known = names.world_settings(dataclasses.asdict(world))
-    known = {k: v for k, v in known.items() if k not in ("labels", "barrier")}
+    known = {k: v for k, v in dataclasses.asdict(world).items() if k not in ("labels", "barrier")}
     return bool(guard) and played == wanted and all(fitted.get(k, v) == v for k, v in known.items())
 
 
@@ -303,13 +311,8 @@ def make_grid(
     only: Iterable[str] = (),
     num_updates: int | None = None,
     transitions: int | None = None,
-    **older: Any,
 ) -> Grid:
     """The grid of a suite, or of the named tasks and entries (`algorithm` or `algorithm:preset`) of it."""
-    older = renamed(older, {"steps": "num_updates"}, "make_grid")
-    num_updates = older.pop("num_updates", num_updates)
-    if older:
-        raise unknown("argument of make_grid()", next(iter(older)), inspect.signature(make_grid).parameters)
     if suite not in SUITES:
         raise unknown("suite", suite, SUITES)
     chosen = SUITES[suite]

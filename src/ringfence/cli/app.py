@@ -20,7 +20,6 @@ from ringfence.cli.console import Refusals, complain, console, plain_warnings
 from ringfence.cli.doctor import doctor
 from ringfence.cli.faults import NO_FAULTS, Wrong
 from ringfence.cli.playing import AS_IT_IS, Assignments, How, Playing, assignments
-from ringfence.cli.renamed import rewritten
 from ringfence.cli.replaying import AS_LOGGED, Replayed
 from ringfence.errors import Interrupted, UserError, whole_number
 from ringfence.utils import interrupts
@@ -618,7 +617,7 @@ GROUPS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 def main(arguments: list[str] | None = None) -> None:
-    arguments = rewritten(sys.argv[1:] if arguments is None else arguments)
+    arguments = sys.argv[1:] if arguments is None else arguments
     interrupts.listen()
     plain_warnings()
     for stream in (sys.stdout, sys.stderr):  # a terminal of few letters shows a question mark for the others

@@ -10,8 +10,6 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from ringfence.errors import UserError
-from ringfence.utils import stored
-from ringfence.utils.renamed import renamed
 
 # --set a=1 b=2 and --set a=1 --set b=2 mean the same.
 Assignments = Annotated[list[list[str]], tyro.conf.UseAppendAction, tyro.conf.arg(metavar="NAME=VALUE")]
@@ -66,7 +64,7 @@ class Playing:
 
         given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "set"}
         given = {name: value for name, value in given.items() if value is not None and value is not False}
-        assigned = renamed(assignments(self.set), stored.OPTIONS, "--set")
+        assigned = assignments(self.set)
         flags = {"episodes", "split", "num_recorded", "checkpoint", *_FLAGS_ALONE}
         for name, value in assigned.items():
             if name in flags:

@@ -48,7 +48,6 @@ from ringfence.types import Array, Key, Policy
 from ringfence.utils.files import whole, writable
 from ringfence.utils.precision import float64, in_float32
 from ringfence.utils.pytrees import digest_of, named_arrays, named_leaves
-from ringfence.utils.renamed import renamed
 
 FORMATS = ("onnx", "stablehlo")
 OPSET = 21  # of ONNX: onnxruntime 1.20 (2024) and younger read it
@@ -103,8 +102,6 @@ def export(
     if format == "onnx" and file.suffix not in ("", ".onnx"):
         raise UserError(f"'{file.name}' ends in {file.suffix}, and what is written is onnx; end it in .onnx.")
     _converter() if format == "onnx" else _packer()
-    options = renamed(options, {"step": "checkpoint"}, "export")
-    checkpoint = options.pop("checkpoint", checkpoint)
     resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     action = step_of(resolved.job, resolved.team)
     metadata = metadata_of(resolved, action)

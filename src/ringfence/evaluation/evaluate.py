@@ -20,13 +20,11 @@ from ringfence.types import Policy
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import renamed
 from ringfence.world.card import Card
 
 _log = logging.getLogger(__name__)
 
 Split = Literal["test", "validation"]
-OLD_ARGUMENTS = {"record": "num_recorded", "step": "checkpoint"}
 
 
 @in_float32
@@ -47,9 +45,6 @@ def evaluate(
     options are as in `load`. The result tells the `step` of the checkpoint that was played; where training is
     unfinished, a line on stderr says so.
     """
-    options = renamed(options, OLD_ARGUMENTS, "evaluate")
-    num_recorded = options.pop("num_recorded", num_recorded)
-    checkpoint = options.pop("checkpoint", checkpoint)
     return evaluate_spec(
         PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options),
         episodes=episodes,

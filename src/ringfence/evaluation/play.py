@@ -30,9 +30,7 @@ from ringfence.utils.compilation import keep_programs
 from ringfence.utils.files import writable
 from ringfence.utils.precision import float32
 from ringfence.utils.progress import Progress
-from ringfence.utils.renamed import renamed
 
-OLD_ARGUMENTS = {"longest": "max_episode_steps", "at_once": "num_envs"}
 OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary that need a benchmark's constants
 
 
@@ -77,9 +75,6 @@ def play(
     The summary is that of an evaluation (docs/evaluation.md), without what needs a benchmark's constants.
     """
     keep_programs()
-    options = renamed(options, OLD_ARGUMENTS, "play")
-    max_episode_steps = options.pop("max_episode_steps", max_episode_steps)
-    num_envs = options.pop("num_envs", num_envs)
     _check_sizes(episodes, num_envs, seed, max_episode_steps)
     _check_choices(early_ends, split)
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})

@@ -24,7 +24,6 @@ from ringfence.faults.policy import under_faults
 from ringfence.problem import constraints
 from ringfence.problem.homogeneous import local_features
 from ringfence.types import Array, Policy
-from ringfence.utils.renamed import policy_of_before
 
 RATES = {  # columns of what is counted in steps
     "infeasible": "infeasible_rate",
@@ -162,7 +161,7 @@ def evaluate_policy(
     episodes = whole_number("episodes", episodes, 1, 10**7)
     num_recorded = min(whole_number("num_recorded", num_recorded), episodes)
     begun = time.perf_counter()
-    policy = under_faults(policy_of_before(policy), faults, task)
+    policy = under_faults(policy, faults, task)
     played = rollout(policy, task.env, episodes, split, seed, num_recorded, label, quiet)
     result = summarise(played, task, unsafe_starts(task, played["states"][:, 0]))
     result |= {"protocol": PROTOCOL, "task": task.name, "split": split, "seed": seed}

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError
-from ringfence.utils import stored
 from ringfence.utils.files import read_npz, whole, within
 
 Recording = dict[str, np.ndarray]
@@ -24,8 +23,7 @@ Recording = dict[str, np.ndarray]
 def write(folder: Path, variant: str, played: Recording, episodes: int) -> None:
     """Keep the first episodes, if any; what was recorded before, and its film, would show another evaluation."""
     for kind in ("npz", "gif"):
-        while file := kept(folder, variant, kind):
-            file.unlink()
+        (folder / f"rollout-{variant}.{kind}").unlink(missing_ok=True)
     if episodes:
         with whole(folder / f"rollout-{variant}.npz") as temporary, open(temporary, "wb") as file:
             first: dict[str, Any] = {name: array[:episodes] for name, array in played.items()}
@@ -46,12 +44,9 @@ def read(folder: Path, variant: str) -> Recording | None:
 
 
 def kept(folder: Path, variant: str, kind: str) -> Path | None:
-    """The recording (npz) or the film (gif) of a variant, which an older version wrote under the name of then."""
+    """The recording (npz) or the film (gif) of a variant, if there is one."""
     file = folder / f"rollout-{variant}.{kind}"
-    if file.exists():
-        return file
-    files = sorted(folder.glob(f"rollout-*.{kind}"))
-    return next((f for f in files if stored.variant(f.stem.removeprefix("rollout-")) == variant), None)
+    return file if file.exists() else None
 
 
 def _check(arrays: Recording) -> None:

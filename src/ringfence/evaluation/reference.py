@@ -15,7 +15,7 @@ from ringfence.problem.homogeneous import PerAgent
 from ringfence.proposals.base import Constant
 from ringfence.training.runs import Run, write_json
 from ringfence.types import Policy
-from ringfence.utils import schemas, stored
+from ringfence.utils import schemas
 
 FILE = "reference.json"
 LOGS = "behaviour data"
@@ -23,9 +23,9 @@ SAFE = "data within the limit"
 
 
 def read(file: Path) -> dict[str, dict[str, Any]]:
-    """The reference rows of a file by name, under today's names."""
+    """The reference rows of a file by name."""
     damaged = "holds a damaged reference file; delete it and make it again"
-    return stored.results(schemas.read(file, schemas.References, damaged))
+    return {name: dict(row) for name, row in schemas.read(file, schemas.References, damaged).items()}
 
 
 def of_data(store: EpisodeStore, task: Task, kept: np.ndarray | None = None) -> dict[str, Any]:
@@ -112,7 +112,7 @@ def make(
     if file.exists():
         known = read(file)
         same = (SAFE in known) == safe.any() and _are_complete(known, task, episodes)
-        if same and stored.card(known[LOGS]["data"]) == store.card.to_dict():
+        if same and known[LOGS]["data"] == store.card.to_dict():
             return known
     rows = {LOGS: of_data(store, task) | {"data": store.card.to_dict()}}
     if safe.any():

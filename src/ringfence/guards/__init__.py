@@ -6,7 +6,6 @@ from ringfence.guards.barrier import BARRIERS, BarrierSource
 from ringfence.guards.filter import Guard
 from ringfence.guards.options import GUARDS, GuardOptions
 from ringfence.guards.policy import Guarded, options_of
-from ringfence.utils import renamed
 
 __all__ = [
     "BARRIERS",
@@ -17,5 +16,3 @@ __all__ = [
     "Guarded",
     "options_of",
 ]
-
-__getattr__ = renamed.names_of(__name__)

@@ -11,14 +11,12 @@ from ringfence.errors import UserError
 from ringfence.guards.shown import STEEP, Shown
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Array
-from ringfence.utils import renamed
 from ringfence.world import World
 from ringfence.world.barrier import Barrier, MinBarrier
 
 BARRIERS = ("learned", "analytic", "both")
 AHEAD = "what will be dangerous after the last row"
 BEYOND = "what the logs have not shown"
-__getattr__ = renamed.names_of(__name__)
 
 
 class BarrierSource(eqx.Module):

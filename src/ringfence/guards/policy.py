@@ -28,7 +28,6 @@ from ringfence.types import Array, Key, PolicyStep, Proposes, PyTree
 from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.precision import full_products
-from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.card import FARTHEST, Avoidable, Foresight
 from ringfence.world.verdict import require
@@ -43,7 +42,7 @@ Paid = float | Mapping[str, float]  # what a step cost, in all or by each constr
 Cost = Array | dict[str, Array]  # the same of a batch: (B,) or (B, N), or that by constraint
 
 
-class Guarded(HadStart, eqx.Module):
+class Guarded(eqx.Module):
     """A proposal under guard; itself a policy (types.Policy).
 
     A policy that proposes several steps has a method `propose`. One that gives one action at a time has its action

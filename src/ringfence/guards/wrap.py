@@ -24,11 +24,9 @@ from ringfence.problem.homogeneous import (
 from ringfence.problem.origins import Origins
 from ringfence.proposals.base import held
 from ringfence.types import Array, Key, Policy, PolicyStep, PyTree
-from ringfence.utils import stored
 from ringfence.utils.functions import of_both
 from ringfence.utils.given import NUMBERS, given_as
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import policy_of_before, renamed, renamed_values
 from ringfence.world import World
 
 _LOOKS_ON = {"correction_steps": 0, "select": True}  # options of a guard that corrects nothing: of one proposal
@@ -146,9 +144,6 @@ def under_guard(
     """A policy of the library, or any callable, under guard; the arguments are those of `ringfence.guard`."""
     if not isinstance(world, World):
         raise UserError(f"guard() got a {type(world).__name__} for a World; fit one with ringfence.fit(store).")
-    options = renamed(options, stored.GUARD_OPTIONS | {"danger": "barrier"}, "the guard")
-    barrier = renamed_values({"barrier": options.pop("barrier", barrier)}, stored.VALUES)["barrier"]
-    policy = policy_of_before(policy)
     if isinstance(policy, PerAgent):
         return PerAgent(build(policy.one, world, hazard, guard, barrier, anyway=anyway, **options), policy.agents)
     if isinstance(policy, Policy):

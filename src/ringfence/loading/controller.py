@@ -32,7 +32,6 @@ from ringfence.types import Key, Policy, PolicyStep, PyTree
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.given import given_as, refuse_other_order
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import Info
 from ringfence.world import World
 
 Seen = tuple[np.ndarray, np.ndarray | None]  # observations (N, O) and state (S,) of one environment
@@ -106,7 +105,7 @@ class Controller:
         if log is not None:
             self._source.policy = self.policy = explaining(self.policy)
             self.evidence = Evidence(log, self.policy, self._source.agents, promised)
-        self.info: dict[str, np.ndarray] = Info()
+        self.info: dict[str, np.ndarray] = {}
         self.last_action: np.ndarray | None = None
         self.reset()
 
@@ -191,7 +190,7 @@ class Controller:
                 action = self._watch.taken_over(*self.job.origins.measured(*seen), action.shape)
         if self.evidence is not None:
             self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
-        self._carry, self._key, self.info, self.last_action = carry, key, Info(info), action.copy()
+        self._carry, self._key, self.info, self.last_action = carry, key, info, action.copy()
         if observed_at is not None:
             self._stamps.acted()
         return action
@@ -304,7 +303,7 @@ class _TrainedRun:
         return self._act(self.policy, carry, *_batch(seen), key)
 
     def _reaches(self, seen: np.ndarray, state: np.ndarray | None) -> None:
-        """Refuse arrays too short for the entries that the run reads; older runs of own data say no widths."""
+        """Refuse arrays too short for the entries that the run reads."""
         beyond = self.job.feature_map.beyond(seen.shape[-1], None if state is None else len(state))
         if beyond is not None:
             raise UserError(f"This run reads {beyond}; pass what its data holds.")

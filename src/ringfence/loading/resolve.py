@@ -26,10 +26,8 @@ from ringfence.training import loop, worlds
 from ringfence.training.job import Job, widths_of
 from ringfence.training.runs import Run
 from ringfence.types import Policy, PyTree, Spec
-from ringfence.utils.config import build_config, fields_of
+from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
-from ringfence.utils.renamed import policy_of_before, renamed
-from ringfence.utils.stored import LATER_CONFIG
 from ringfence.world import World
 from ringfence.world.verdict import judge, require
 
@@ -89,8 +87,6 @@ def load(run: Run | str, checkpoint: int | None = None, planner: str = "default"
     are fields of PlanOptions and GuardOptions. The policy's `act` is a pure function: compile it with jax.jit, or use a
     `Controller`.
     """
-    options = renamed(options, {"step": "checkpoint"}, "load")
-    checkpoint = options.pop("checkpoint", checkpoint)
     found = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     return found.job, found.team
 
@@ -195,8 +191,7 @@ def load_job(run: Run, agents: int | None = None) -> Job:
     stored = run.config
     _refuse_lacking(run, stored)
     algorithm = algos.get(stored["algorithm"])
-    later = {k: v for k, v in LATER_CONFIG.items() if k in fields_of(algorithm.Config)}
-    config = build_config(algorithm.Config, {**later, **stored["config"]}, algorithm.name)
+    config = build_config(algorithm.Config, stored["config"], algorithm.name)
     spec = Spec.of(stored["spec"])
     hazard = constraints.from_dict(stored["hazard"])
     if stored["feature_map"] is None:
@@ -244,7 +239,7 @@ def _refuse_lacking(run: Run, stored: Mapping[str, Any]) -> None:
 def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: Spec) -> Task:
     """A task that exists only as data, as the run's card has it."""
     card = stored["data"]
-    low, high = stored.get("returns") or (0.0, 1.0)  # runs of before tell none
+    low, high = stored.get("returns") or (0.0, 1.0)
     return Task(
         stored["task"],
         None,
@@ -259,17 +254,12 @@ def _task_of_data(stored: Mapping[str, Any], hazard: constraints.Hazard, spec: S
 
 
 def _stored_widths(stored: Mapping[str, Any]) -> tuple[int | None, int | None]:
-    """Entries of an observation and of the state; runs of before say them by their names alone, if at all."""
-    if stored.get("widths"):
-        observation, state = stored["widths"]
-        return observation, state
-    observations = stored["data"].get("observation_names")
-    states = stored["data"].get("state_names")
-    return len(observations) if observations else None, len(states) if states else None
+    """Entries of an observation and of the state, where they are told."""
+    observation, state = stored.get("widths") or (None, None)
+    return observation, state
 
 
 def make_policy(job: Job, state: PyTree, options: Mapping[str, Any]) -> Policy:
     """The policy of a trained state with evaluation-time options (ignored by algorithms that do not plan)."""
     chosen = build_config(PlanOptions, {**plan_defaults(job.config), **options}, "the planner")
-    made = job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)
-    return policy_of_before(made)
+    return job.algorithm.make_policy(state, job.config, job.spec, job.feature_map, job.hazard, chosen)

@@ -17,9 +17,7 @@ from ringfence.guards import BARRIERS, GUARDS, GuardOptions
 from ringfence.loading.oracle import ORACLE
 from ringfence.proposals.options import DEFAULT, PLANNERS, PlanOptions
 from ringfence.training.runs import Run
-from ringfence.utils import stored
 from ringfence.utils.config import fields_of, read_text
-from ringfence.utils.renamed import deprecated, renamed, renamed_values
 from ringfence.world import World
 
 EXECUTIONS = ("centralized", "decentralized")
@@ -62,15 +60,7 @@ class PolicySpec:
     ) -> PolicySpec:
         """Names and options, each sorted to whom it belongs: `options` are fields of PlanOptions and GuardOptions.
         Unknown names are refused, and so is what nothing would read. `execution` is the guard's, and without one the
-        planner's.
-
-        Names of before are understood with a warning."""
-        choices = _choices(barrier, execution, options)
-        barrier = choices.get("barrier")
-        execution = choices.get("execution")
-        planner = _planner(planner)
-        options = renamed(options, stored.GUARD_OPTIONS, "the guard")
-        options = renamed(options, stored.PLANNER_OPTIONS, "the planner")
+        planner's."""
         guards = guard != "none" or any(f.name in options for f in dataclasses.fields(GuardOptions))
         if execution is not None and not guards:
             options["execution"] = execution
@@ -163,23 +153,6 @@ class PolicySpec:
         return replace(self, planner=DEFAULT, plan_options=())
 
 
-def _choices(barrier: str | None, execution: str | None, options: dict[str, Any]) -> dict[str, str]:
-    """What a guard is asked for beside its options, under today's names; those of before leave `options`."""
-    given = {"barrier": barrier, "execution": execution} | {name: options.pop(name, None) for name in stored.GUARD}
-    return renamed_values(
-        renamed({name: value for name, value in given.items() if value is not None}, stored.GUARD, "the guard"),
-        stored.VALUES,
-    )
-
-
-def _planner(name: str) -> str:
-    """The planner's name of today."""
-    if name not in stored.PLANNERS:
-        return name
-    deprecated(f"planner '{name}'", f"'{stored.PLANNERS[name]}'")
-    return stored.PLANNERS[name]
-
-
 def _refuse_unread(**choices: Any) -> None:
     """Of a guard, where there is none."""
     for name, given in choices.items():
@@ -228,7 +201,6 @@ _AGENTS = re.compile(r"agents(\d+)")
 
 def _part(part: str, name: str) -> Iterator[tuple[str, Any]]:
     """What one part of a name says, as arguments of `PolicySpec.of`."""
-    part = stored.choice(part)
     if part in PLANNERS:
         yield "planner", part
     elif found := _GUARD.fullmatch(part):

@@ -24,7 +24,6 @@ from ringfence.utils.files import writable
 from ringfence.utils.functions import of_both
 from ringfence.utils.given import given_as
 from ringfence.utils.progress import Progress
-from ringfence.utils.renamed import deprecated, renamed
 
 EACH = 100  # episodes after which what is there is kept
 
@@ -159,14 +158,6 @@ def _begun(store: EpisodeStore | None) -> int:
 def _skipped(store: EpisodeStore) -> int:
     """Episodes that a collection left out."""
     return int(store.card.extra.get("skipped_episodes", 0))
-
-
-def record(
-    make_env: Callable[[], Any], policy: Callable[..., np.ndarray] | None = None, **options: Any
-) -> EpisodeStore:
-    """`collect`, as 0.1.0 called it."""
-    deprecated("record", "collect")
-    return collect(make_env, policy, **renamed(options, {"longest": "max_episode_steps"}, "record"))
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import copy
 import difflib
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import msgspec
@@ -19,8 +19,7 @@ from ringfence.problem.bounds import stored as stored_bound
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
 from ringfence.types import as_tuples
-from ringfence.utils import schemas, stored
-from ringfence.utils.renamed import deprecated
+from ringfence.utils import schemas
 
 ARRAYS = ("observations", "actions", "rewards", "costs", "terminated", "truncated", "episode_ends")
 LARGEST = 1e15  # entry of an array: its square, and sums of that, are still numbers of 32 bits
@@ -99,38 +98,6 @@ class StoreCard(msgspec.Struct, frozen=True, kw_only=True, eq=False):
             return self.to_dict() == other.to_dict()
         return NotImplemented
 
-    # --- a dictionary, as cards of 0.1.0 were ---
-    def __getitem__(self, name: str) -> Any:
-        deprecated(f"card['{name}'] of a store", f"card.{name}" if name in FIELDS else f"card.extra['{name}']")
-        return self.to_dict()[name]
-
-    def get(self, name: str, default: Any = None) -> Any:
-        deprecated(f"card.get('{name}') of a store", f"card.{name}" if name in FIELDS else f"card.extra.get('{name}')")
-        return self.to_dict().get(name, default)
-
-    def __contains__(self, name: object) -> bool:
-        deprecated("`in` the card of a store", "card.to_dict()")
-        return name in self.to_dict()
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.keys())
-
-    def keys(self) -> list[str]:
-        deprecated("keys() of the card of a store", "card.to_dict()")
-        return list(self.to_dict())
-
-    def items(self) -> list[tuple[str, Any]]:
-        deprecated("items() of the card of a store", "card.to_dict()")
-        return list(self.to_dict().items())
-
-    def __or__(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        deprecated("`|` with the card of a store", "card.updated()")
-        return {**self.to_dict(), **fields}
-
-    def __ror__(self, fields: Mapping[str, Any]) -> dict[str, Any]:
-        deprecated("`|` with the card of a store", "card.to_dict()")
-        return {**fields, **self.to_dict()}
-
 
 FIELDS = tuple(name for name in StoreCard.__struct_fields__ if name not in ("extra", "written"))
 GivenCard = StoreCard | Mapping[str, Any]
@@ -171,7 +138,7 @@ def complete_card(given: GivenCard) -> StoreCard:
     if not isinstance(fields, dict):
         raise StoreError(f"The card is a {type(fields).__name__}; it must be a dictionary of fields.")
     defaults = StoreCard()
-    card: dict[str, Any] = {**{name: getattr(defaults, name) for name in ALWAYS}, **stored.card(fields)}
+    card: dict[str, Any] = {**{name: getattr(defaults, name) for name in ALWAYS}, **fields}
     for rule in CARD_RULES:
         rule(card)
     try:
@@ -188,7 +155,7 @@ def complete_card(given: GivenCard) -> StoreCard:
 def given_card(given: GivenCard) -> StoreCard:
     """The card of fields that somebody wrote by hand: what looks like a known field, mistyped, is refused. Cards in
     files are read by `complete_card` alone, whatever they hold."""
-    for name in stored.card(given) if isinstance(given, dict) else ():
+    for name in given if isinstance(given, dict) else ():
         near = difflib.get_close_matches(str(name), FIELDS, n=1, cutoff=LIKELY)
         if near and name not in FIELDS:
             raise StoreError(f"The card has '{name}', which is no field of it; did you mean '{near[0]}'?")

@@ -32,7 +32,7 @@ import numpy as np
 from ringfence.errors import StoreError, UserError, unknown
 from ringfence.logs.io.columns import Tables
 from ringfence.logs.io.table import read_layout, read_parts, read_table
-from ringfence.logs.io.table_schema import OLD_OPTIONS, TableSchema
+from ringfence.logs.io.table_schema import TableSchema
 from ringfence.logs.moving import moved
 from ringfence.logs.schema import ARRAYS, OPTIONAL, GivenCard, StoreCard, complete_card, given_card, validate
 from ringfence.problem import constraints
@@ -40,7 +40,6 @@ from ringfence.utils import arrays, schemas
 from ringfence.utils.files import whole
 from ringfence.utils.given import refuse_other_order
 from ringfence.utils.pytrees import digest_of
-from ringfence.utils.renamed import deprecated, renamed
 
 FORMAT = 1
 HDF5_BEGINS = b"\x89HDF\r\n\x1a\n"
@@ -278,11 +277,6 @@ class EpisodeStore:
             else np.moveaxis(self.constraints, 1, 0).reshape(-1, len(self.limits)),
         )
 
-    def apart(self) -> EpisodeStore:
-        """`split_agents`, as 0.1.0 called it."""
-        deprecated("EpisodeStore.apart", "split_agents")
-        return self.split_agents()
-
     # --- making ---
     @classmethod
     def from_episodes(cls, observations, actions, rewards, costs, *, state=None, terminated=None, card=None):
@@ -407,7 +401,7 @@ class EpisodeStore:
         `card` adds fields to the store's; its warnings begin with the `notes`.
         """
         if schema is None:
-            schema = TableSchema.of(renamed(options, OLD_OPTIONS, "from_table"))
+            schema = TableSchema.of(options)
         elif options:
             raise UserError(f"schema and {next(iter(options))} both say how the table is read; give one of them.")
         return cls.from_steps(**read_table(table, schema, notes=notes, card=card))
@@ -424,7 +418,7 @@ class EpisodeStore:
     ) -> EpisodeStore:
         """A table in a published format (`highd`, `interaction`, `syndrone`, `sumo`, `obsmat`), or a list of them;
         options as of `from_table`."""
-        columns, schema = read_layout(table, layout, renamed(options, OLD_OPTIONS, "from_layout"))
+        columns, schema = read_layout(table, layout, options)
         return cls.from_table(columns, schema, notes=notes, card=card)
 
     @classmethod
@@ -440,7 +434,6 @@ class EpisodeStore:
     ) -> tuple[EpisodeStore, EpisodeStore]:
         """Two stores of one table, to learn by and to judge by: the first `share` of its time, and the rest. They have
         the same entries, bounds and steps, and no episode is in both. Options as of `from_table` or `from_layout`."""
-        options = renamed(options, OLD_OPTIONS, "split_table")
         table, schema = (table, TableSchema.of(options)) if layout is None else read_layout(table, layout, options)
         steps, early = read_parts(table, schema, share, notes=notes, card=card)
         whole = cls.from_steps(**steps)

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 
 from ringfence.problem.features import FeatureMap, X
 from ringfence.types import Array, Key, ObservesCost, ObservesDelay, PolicyStep, PyTree
-from ringfence.utils.renamed import HadStart
 
 
-class PerAgent(HadStart, eqx.Module):
+class PerAgent(eqx.Module):
     """A policy of teams of one, played by every agent of a team of `agents`. Nobody hears of anybody."""
 
     one: Any

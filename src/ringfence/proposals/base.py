@@ -15,11 +15,10 @@ from ringfence.problem import normalise
 from ringfence.problem.features import FeatureMap, translation
 from ringfence.problem.normalise import Normaliser
 from ringfence.types import Array, Key, ObservesCost, Policy, PolicyStep, PyTree, Spec
-from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 
 
-class Direct(HadStart, eqx.Module):
+class Direct(eqx.Module):
     """An actor network on the present features, one per agent, squashed into the action bounds."""
 
     actor: Any
@@ -50,7 +49,7 @@ def from_unit(action: Array, spec: Spec) -> Array:
     return normalise.from_unit(spec.own(action), spec.action_low, spec.action_high)
 
 
-class Constant(HadStart, eqx.Module):
+class Constant(eqx.Module):
     """Does nothing, or acts uniformly at random: the reference rows of every table."""
 
     spec: Spec = eqx.field(static=True)

@@ -30,7 +30,6 @@ from ringfence.proposals.generator import Generator, generator
 from ringfence.proposals.guidance import cleared, lacking
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
-from ringfence.utils.renamed import HadStart
 from ringfence.world import World
 from ringfence.world.values import Critic, plan_value
 
@@ -38,7 +37,7 @@ ROUNDS = 2  # of guidance in every sampling step: one leaves a tenth of a collis
 MAX_SLOPE = 20.0  # bound on the norm of a guidance gradient, in standard deviations of the plan
 
 
-class Planner(HadStart, eqx.Module):
+class Planner(eqx.Module):
     """Receding-horizon diffusion planner."""
 
     networks: dict[str, Any]  # denoiser, inverse; mean, prior and barrier where there are such

@@ -32,19 +32,16 @@ from ringfence.training import worlds
 from ringfence.training.job import Job, make_job
 from ringfence.training.runs import LOGS, Run, write_json
 from ringfence.types import Array, Key, Metrics, PyTree
-from ringfence.utils import stored
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import fields_of
 from ringfence.utils.environment import environment
 from ringfence.utils.files import owned, whole
 from ringfence.utils.precision import in_float32
 from ringfence.utils.progress import Progress
-from ringfence.utils.renamed import renamed
 from ringfence.world import World
 from ringfence.world import save as save_world
 
 Arrays = dict[str, Array]
-OLD_ARGUMENTS = {"together": "vmap_seeds"}
 
 
 @in_float32
@@ -65,7 +62,7 @@ def train(
     on_chunk: Callable[[int, dict], None] | None = None,
     on_finish: Callable[[Run], None] | None = None,
     folder: Callable[[int], Path] | None = None,
-    **older: Any,
+    **others: Any,
 ) -> list[Run]:
     """Train `algorithm` on `data` for every seed; returns one finished run folder per seed.
 
@@ -77,14 +74,10 @@ def train(
     of a seed, for those who do not want `out`/<task>/<algorithm>/seed-<k>.
     """
     keep_programs()
-    older = renamed(older, OLD_ARGUMENTS, "train")
-    vmap_seeds = older.pop("vmap_seeds", vmap_seeds)
-    settings = fields_of(algos.get(algorithm).Config) if older else ()
-    for name in older:
-        if name in settings:
+    for name in others:
+        if name in fields_of(algos.get(algorithm).Config):
             raise UserError(f"{name} is a setting of {algorithm}, not an argument; give changes={{'{name}': ...}}.")
-    if older:
-        raise unknown("argument of train()", next(iter(older)), inspect.signature(train).parameters)
+        raise unknown("argument of train()", name, inspect.signature(train).parameters)
     _check_store(data)
     seeds = _seeds(seeds)
     _check_counts(chunk=chunk, checkpoint_every=checkpoint_every)
@@ -435,12 +428,7 @@ def _prepare(run: Run, job: Job, seed: int, data: EpisodeStore) -> None:
         card["content"] = data.content
     mine = json.loads(json.dumps(job.describe(seed, card)))
     if (run.path / "config.json").exists():
-        # What older runs do not tell.
-        older = {"revision": 1, "world": None} | {k: mine[k] for k in ("widths", "team", "returns")}
-        there = older | run.config
-        there["spec"] = {"homogeneous": False} | there.get("spec", {})
-        later = {k: v for k, v in stored.LATER_CONFIG.items() if k in mine["config"]}
-        there["config"] = later | there["config"]
+        there = run.config
         different = [k for k in mine if k != "data" and there.get(k) != mine[k]]
         different += [f"data's {name}" for name, *_ in other_data(there.get("data") or {}, mine["data"])]
         if different:

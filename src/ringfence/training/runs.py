@@ -25,7 +25,7 @@ from safetensors.numpy import save_file
 
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
-from ringfence.utils import schemas, stored
+from ringfence.utils import schemas
 from ringfence.utils.files import alone, regular, whole
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
 
@@ -63,7 +63,7 @@ class Run:
     def config(self) -> dict[str, Any]:
         """Contents of config.json."""
         remedy = "is no run folder that can be read; give the one that `ringfence train` made, or train it again"
-        return stored.config(schemas.read(self.path / "config.json", schemas.Config, remedy))
+        return dict(schemas.read(self.path / "config.json", schemas.Config, remedy))
 
     @property
     def agents(self) -> list[str] | None:
@@ -74,10 +74,12 @@ class Run:
 
     @property
     def results(self) -> dict[str, dict[str, Any]]:
-        """Evaluations by variant, under today's names; empty before the first `ringfence eval`."""
+        """Evaluations by variant; empty before the first `ringfence eval`."""
         file = self.path / "results.json"
         remedy = "holds a damaged results.json; delete that file and evaluate the run again"
-        return stored.results(schemas.read(file, schemas.Results, remedy)) if file.exists() else {}
+        if not file.exists():
+            return {}
+        return {variant: dict(result) for variant, result in schemas.read(file, schemas.Results, remedy).items()}
 
     @property
     def episodes(self) -> set[str] | None:

@@ -19,7 +19,6 @@ from ringfence.utils.precision import in_float32
 from ringfence.world import Settings, World
 from ringfence.world import load as load_world
 from ringfence.world.fit import fit_view
-from ringfence.world.settings import settings_named
 
 WORLD = "world.safetensors"  # in a run folder: the World that training read
 GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
@@ -29,7 +28,6 @@ def settings_for(store: EpisodeStore, task: Task | None = None, **changes) -> Se
     """The settings of a World of this data: the task's own where it has some, and labels from its costs if they tell
     safe steps from unsafe ones, else from its formula; without either, no barrier."""
     task = task or registry.from_store(store)
-    changes = settings_named(changes)
     execution = execution_of(task, changes.pop("execution", None))
     settings = usual(task, execution)
     costs = store.costs > 0
@@ -54,7 +52,7 @@ def usual(task: Task, execution: str) -> dict:
     """What a task asks of its World by default: the fields of `Settings` that are not as everywhere."""
     return {
         "view": "decentralized" if execution == "decentralized" else "pruned",
-        **settings_named(task.world),
+        **task.world,
         "execution": execution,
     }
 

@@ -45,7 +45,6 @@ class Spec(TypedDict, total=False):
     action_high: Bound
     episode_length: Positive
     homogeneous: bool
-    alike: bool  # of 0.1.0: homogeneous
     action_sizes: list[Positive] | None
 
 
@@ -137,22 +136,9 @@ class Constraint(TypedDict):
     violation_upper: NotRequired[Share]
     limit: NotRequired[float]
     limit_satisfied_rate: NotRequired[Share]
-    within: NotRequired[Share]  # of 0.1.0
 
 
-class Before(TypedDict, total=False):
-    """What 0.1.0 called columns that have another name now; `utils/stored.py` translates them."""
-
-    avoidable_cost: float
-    avoidable_interval: Interval
-    avoidable_violation_upper: Share
-    danger: str
-    sight: str
-    infeasible: float
-    strange: float
-
-
-class Result(Before, total=False):
+class Result(TypedDict, total=False):
     """A summary of episodes: an evaluation in results.json, or a reference row."""
 
     episodes: Positive

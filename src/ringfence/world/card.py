@@ -8,12 +8,10 @@ from typing import Any, Literal
 
 import msgspec
 
-from ringfence.utils import stored as named
 from ringfence.utils.config import build_config
 from ringfence.utils.numbers import percent, significant
-from ringfence.utils.renamed import deprecated
 from ringfence.world.causes import Cause, Edge, Found
-from ringfence.world.settings import Settings, settings_named
+from ringfence.world.settings import Settings
 
 FARTHEST = 15  # rows that a guard looks ahead by itself (benchmarks/proving.py plays more of them)
 JUDGED = 3  # steps ahead that the margin is calibrated for
@@ -207,11 +205,10 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Card:
         """The card of a file. What it does not name stays in `unread`; msgspec.ValidationError where a part is none."""
-        known = named.world_card(stored) | {"settings": settings_named(stored["settings"], warn=False)}
-        settings = build_config(Settings, known["settings"], "the World")
-        parts = {name: value for name, value in known.items() if name != "settings"}
+        settings = build_config(Settings, stored["settings"], "the World")
+        parts = {name: value for name, value in stored.items() if name != "settings"}
         card = msgspec.structs.replace(msgspec.convert(parts, cls), settings=settings)
-        return msgspec.structs.replace(card, unread=_beyond(known, card.to_json()))
+        return msgspec.structs.replace(card, unread=_beyond(stored, card.to_json()))
 
     def to_json(self) -> dict[str, Any]:
         """The card as files hold it."""
@@ -219,13 +216,6 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
         more = parts.pop("unread")
         known = {name: value for name, value in parts.items() if value not in (None, {})}
         return _joined(known, more)
-
-    def __getitem__(self, name: str) -> Any:
-        deprecated(f"card['{name}']", f"card.{named.WORLD_CARD.get(name, name)}")
-        return self.to_json()[named.WORLD_CARD.get(name, name)]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.to_json())
 
 
 def _beyond(stored: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:

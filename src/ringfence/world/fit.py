@@ -28,7 +28,6 @@ from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features, partners
 from ringfence.problem.normalise import varying
 from ringfence.types import Key, PyTree, Spec
-from ringfence.utils import stored
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.device import on_device
 from ringfence.utils.files import whole
@@ -71,9 +70,15 @@ PARTS = {
 }
 UPON = {"dynamics": (), "values": (), "label": ("dynamics",), "future": ("dynamics", "label")}
 
-# Names of the cache's files follow from the names of 0.1.0, so that what was fitted then is found.
-_NAME_OF_BEFORE = {new: old for old, new in stored.WORLD_SETTINGS.items()}
-_EXECUTION_OF_BEFORE = {new: old for old, new in stored.EXECUTIONS.items()}
+# What settings are called in the names of the cache's files.
+_CALLED = {
+    "execution": "sight",
+    "num_ensemble": "members",
+    "use_transition": "both_ends",
+    "miscoverage": "missed",
+    "predicted_share": "foreseen",
+}
+_EXECUTIONS = {"centralized": "all", "decentralized": "own"}
 
 T = TypeVar("T")
 Search = Callable[[World, Logged], float | None]  # share of what a guard's search calls safe, and the logs dangerous
@@ -532,13 +537,13 @@ class _Parts:
     def file(self, name: str, of: Sequence[str], content: list[Any]) -> Path:
         """Where what depends on the settings of the parts `of` and on `content` is kept."""
         names = [field for part in of for field in PARTS[part]]
-        fields = {_NAME_OF_BEFORE.get(field, field): getattr(self.settings, field) for field in names}
+        fields = {_CALLED.get(field, field): getattr(self.settings, field) for field in names}
         about = [
             FORMAT,
             name,
             content,
             self.settings.view,
-            _EXECUTION_OF_BEFORE[self.settings.execution],
+            _EXECUTIONS[self.settings.execution],
             fields,
             self.seed,
         ]

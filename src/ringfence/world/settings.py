@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
 from msgspec import Meta
 
 from ringfence.problem import features
-from ringfence.utils import stored
 from ringfence.utils.config import Count, NonNegative, Share, Width
-from ringfence.utils.renamed import renamed, renamed_values
 from ringfence.world import barrier as cbf
 
 
@@ -40,11 +37,3 @@ class Settings:
     future_discount: Annotated[float, Meta(ge=0, le=0.999)] = 0.97  # how far ahead danger is seen: 1 / (1 − it) steps
     expectile: Annotated[float, Meta(ge=0.5, le=1)] = 0.7  # of what the logs did, how near to the best
     miscoverage: float = 0.001  # share of unsafe steps that may be predicted at the default margin or above
-
-
-def settings_named(given: Mapping[str, Any], warn: bool = True) -> dict[str, Any]:
-    """Settings under today's names; without `warn` nothing is said, e.g. of a file that an older version wrote."""
-    known = {f.name for f in fields(Settings)}
-    names = {old: new for old, new in stored.WORLD_SETTINGS.items() if new in known}
-    values = {"execution": stored.EXECUTIONS}
-    return renamed_values(renamed(given, names, "the World", warn), values, warn)

@@ -17,7 +17,7 @@ from safetensors.numpy import load_file, save_file
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
-from ringfence.utils import schemas, stored
+from ringfence.utils import schemas
 from ringfence.utils.files import regular, whole
 from ringfence.utils.precision import in_float32
 from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
@@ -106,13 +106,13 @@ def _read(path: Path, map_of: MapOf) -> World:
     with safe_open(path, "numpy") as file:
         about = schemas.decode((file.metadata() or {})["ringfence_world"], schemas.World)
     raw = load_file(path)
-    if about.get("digest", _digest(raw, about)) != _digest(raw, about):  # older Worlds tell none
+    if about.get("digest", _digest(raw, about)) != _digest(raw, about):  # a stranger may tell none
         raise UserError(f"'{path}' holds another World than was written (its digest differs); fit or copy it again.")
     for name, array in raw.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise UserError(f"'{path}' holds numbers in '{name}' that are not finite; fit it again.")
     card = Card.from_json(about["card"])
-    spec = Spec.of(stored.spec(about["spec"]))
+    spec = Spec.of(about["spec"])
     settings = card.settings
     map = map_of(spec.task, settings.view, card.data.hazard) or features.from_dict(dict(about["map"]))
     if settings.execution == "decentralized":
@@ -125,5 +125,4 @@ def _read(path: Path, map_of: MapOf) -> World:
         raise UserError(f"'{path}' reads {beyond} in its logs; fit it again.")
     if map.plus.shape[0] != spec.n_agents:
         raise UserError(f"'{path}' is of {spec.n_agents} agents and sees {map.plus.shape[0]}; fit it again.")
-    arrays = stored.world_arrays(raw)
-    return as_tree(arrays, blank_world(map, spec, settings, names, card), path)
+    return as_tree(raw, blank_world(map, spec, settings, names, card), path)

@@ -21,10 +21,8 @@ from safetensors.numpy import load_file, save_file
 from ringfence.errors import UserError, unknown
 from ringfence.loading.run_worlds import GUARD, WORLD
 from ringfence.training.runs import Run, write_json
-from ringfence.utils import stored
 from ringfence.utils.files import whole, writable
 from ringfence.utils.pytrees import digest_of, named_arrays
-from ringfence.utils.renamed import deprecated
 from ringfence.world import World
 from ringfence.world import save as save_world
 
@@ -48,7 +46,7 @@ def pretrained(name: str, out: str | Path = "runs") -> Run:
     run = Run(Path(out) / name / f"seed-{metadata['config']['seed']}")
     config = run.path / "config.json"
     if config.exists():
-        if run.config != stored.config(metadata["config"]):
+        if run.config != metadata["config"]:
             raise UserError(f"'{run.path}' holds another run; choose another place with --out.")
         if run.checkpoints():
             return run
@@ -128,9 +126,3 @@ def _put_world(world: World, file: Path) -> Path:
 
 def _content(world: World) -> str:
     return digest_of(named_arrays(world).items())
-
-
-def get(name: str, out: str | Path = "runs") -> Run:
-    """`pretrained` as it was called in 0.1.0."""
-    deprecated("get of ringfence.zoo", "pretrained")
-    return pretrained(name, out)

@@ -15,7 +15,6 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import Entries, Entry
 from ringfence.problem.others import others
-from ringfence.utils import stored
 from ringfence.utils.given import refuse_other_order
 
 
@@ -32,7 +31,7 @@ def observe(
     here are refused. Agents who are homogeneous come in any number and order. Numbers are as they were measured: where
     the card tells origins, they are in double precision, and whoever acts on them takes the origins from them.
     """
-    fields = stored.card(card.to_dict() if isinstance(card, StoreCard) else card)
+    fields = card.to_dict() if isinstance(card, StoreCard) else card
     names: list[str] = list(fields.get("observation_names") or ())
     columns = {name: np.asarray(column, np.float64) for name, column in state.items()}
     goals = {name: np.asarray(column, np.float64) for name, column in (goal or {}).items()}

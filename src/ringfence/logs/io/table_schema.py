@@ -19,13 +19,6 @@ LISTS = ("state", "action", "goal", "cost", "header")
 PROJECTIONS = ("utm", "none")
 LONGITUDE = {"lon", "lng", "long", "longitude"}  # words in names of columns
 LATITUDE = {"lat", "latitude"}
-# Options as 0.1.0 called them.
-OLD_OPTIONS = {
-    "longest": "max_episode_steps",
-    "shortest": "min_episode_steps",
-    "fastest": "max_speed",
-    "sight": "sensing_radius",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
