@@ -9,21 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from ringfence.datasets import behaviour, matd3, registry
+from benchmarks.behaviour import snapshot, statistics
+from ringfence.datasets import behaviour, matd3, registry, replay
 from ringfence.datasets.behaviour import (
     BehaviourPolicy,
-    MATD3Config,
     collect,
     load_behaviour,
-    replay_episodes,
     resimulate,
     save_behaviour,
     shipped_policy,
-    snapshot,
-    statistics,
-    train_behaviour,
 )
+from ringfence.datasets.matd3 import MATD3Config
 from ringfence.datasets.recipes import spread
+from ringfence.datasets.replay import replay_episodes, train_behaviour
 from ringfence.envs.simple_spread import SimpleSpread
 from ringfence.errors import UserError
 
@@ -37,7 +35,7 @@ def run():
 
 
 @pytest.fixture(scope="module")
-def replay():
+def replayed():
     return replay_episodes(ENV, 3900)
 
 
@@ -67,10 +65,10 @@ def test_updates_move_the_critics_towards_the_reward():
     """With no future (discount 0) and enough updates, the critics' values approach the scaled rewards."""
     config = MATD3Config(hidden=32, envs=16, random_rounds=1, updates=400, batch=128, discount=0.0)
     key = jax.random.key(0)
-    learner, memory = behaviour._init_learner(ENV, config, key), behaviour._empty_memory(ENV, 16)
+    learner, memory = replay._init_learner(ENV, config, key), replay._empty_memory(ENV, 16)
     rounds = jnp.arange(1)
 
-    learner, memory, _ = behaviour._train_rounds(ENV, config, learner, memory, rounds, key[None])
+    learner, memory, _ = replay._train_rounds(ENV, config, learner, memory, rounds, key[None])
     states = jax.tree.map(lambda x: x[:, :-1].reshape(-1, *x.shape[2:]), memory.states)
     seen = ENV.observe(states)
     value = matd3.value(learner.critics, seen.reshape(len(seen), -1), memory.actions.reshape(-1, 3, 2))
@@ -82,10 +80,10 @@ def test_updates_move_the_critics_towards_the_reward():
 def test_any_number_of_agents(agents=5):
     env = SimpleSpread(n_agents=agents)
     key = jax.random.key(0)
-    learner, memory = behaviour._init_learner(env, TINY, key), behaviour._empty_memory(env, 8)
+    learner, memory = replay._init_learner(env, TINY, key), replay._empty_memory(env, 8)
     # Traced, not compiled: shapes are what may depend on the number of agents.
     traced = jax.eval_shape(
-        partial(behaviour._train_rounds, env, TINY), learner, memory, jnp.arange(2), jax.random.split(key, 2)
+        partial(replay._train_rounds, env, TINY), learner, memory, jnp.arange(2), jax.random.split(key, 2)
     )
     assert jax.tree.map(jnp.shape, traced[:2]) == jax.tree.map(jnp.shape, (learner, memory))
     data = collect(env, BehaviourPolicy(learner.actors, 0.1), 5, jax.random.key(1), batch=3)
@@ -120,7 +118,7 @@ def test_broken_files_are_refused(run, tmp_path):
     npz = behaviour.POLICIES / "simple_spread-medium-replay.npz"
     (tmp_path / "r.npz").write_bytes(npz.read_bytes()[:50_000])
     with pytest.raises(UserError, match="not a whole replay"):
-        behaviour._load_replay(tmp_path / "r.npz")
+        replay._load_replay(tmp_path / "r.npz")
 
 
 def test_bad_requests_are_refused():
@@ -189,7 +187,7 @@ def test_lineages_that_do_not_ship_are_refused():
     with pytest.raises(UserError, match="no lineage 5; the package ships 0 to 4"):
         shipped_policy("expert", lineage=5)
     with pytest.raises(UserError, match="1 to 780 episodes"):
-        behaviour.shipped_replay(ENV, 781, 1)
+        replay.shipped_replay(ENV, 781, 1)
 
 
 def test_random_tier_matches_the_public_returns():
@@ -199,26 +197,26 @@ def test_random_tier_matches_the_public_returns():
     assert found["contact_starts"] == pytest.approx(0.177, abs=0.03)
 
 
-def test_replay_matches_the_public_returns(replay):
-    found = statistics(replay)
-    assert found["episodes"] == 3900 and replay["actions"].size // 6 == 97_500
+def test_replay_matches_the_public_returns(replayed):
+    found = statistics(replayed)
+    assert found["episodes"] == 3900 and replayed["actions"].size // 6 == 97_500
     assert found["return_mean"] == pytest.approx(203.7, rel=0.05)
-    returns = replay["rewards"].mean(-1).sum(-1)
+    returns = replayed["rewards"].mean(-1).sum(-1)
     assert returns[:600].mean() < 170 and returns[-150:].mean() > 240  # in order, from random to medium
 
 
-def test_a_smaller_replay_keeps_the_mix(replay):
+def test_a_smaller_replay_keeps_the_mix(replayed):
     few = replay_episodes(ENV, 390)
-    whole = statistics(replay)
+    whole = statistics(replayed)
     error = whole["return_std"] / 390**0.5
     assert abs(statistics(few)["return_mean"] - whole["return_mean"]) < 3 * error
-    np.testing.assert_allclose(few["state"][[0, -1]], replay["state"][[0, -1]], atol=1e-4)
+    np.testing.assert_allclose(few["state"][[0, -1]], replayed["state"][[0, -1]], atol=1e-4)
 
 
-def test_replay_labels_follow_the_env(replay):
+def test_replay_labels_follow_the_env(replayed):
     dense = replay_episodes(SimpleSpread(reward="coverage"), 39)
     rows = np.linspace(0, 3899, 39).round().astype(int)
-    np.testing.assert_allclose(dense["state"], replay["state"][rows], atol=1e-4)
+    np.testing.assert_allclose(dense["state"], replayed["state"][rows], atol=1e-4)
     assert (dense["rewards"] <= 0).all()
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import ringfence.envs.mujoco as simulator
+from benchmarks import behaviour_robots as makers
 from ringfence.bench import unpack
 from ringfence.datasets import matd3, registry, robots
 from ringfence.datasets.make import make
@@ -168,19 +169,19 @@ def test_any_object_can_play_a_robot():
 def test_behaviour_learning_is_reproducible():
     env = SafeMuJoCo("2x3", episode_length=40)
     learner = MATD3Config(hidden=8, batch=16, discount=0.9, reward_scale=1.0)
-    config = robots.RobotsConfig(
+    config = makers.RobotsConfig(
         learner, robots=4, stretch=8, updates=4, random_steps=64, transitions=320, score_every=5, score_episodes=2
     )
     seen = []
-    one = robots.train(env, config, 0, seen.append)
-    two = robots.train(env, config, 0)
+    one = makers.train(env, config, 0, seen.append)
+    two = makers.train(env, config, 0)
     assert [s.seen for s in one] == [160, 320] == [s.seen for s in seen]
     assert [s.score for s in one] == [s.score for s in two] and np.isfinite([s.score for s in one]).all()
     assert one[0].actors.weights[0].shape == (2, 12, 8)
-    other = robots.train(env, config, 1)
+    other = makers.train(env, config, 1)
     assert other[-1].score != one[-1].score
     # Averages move less than what they are averages of.
-    calm = robots.train(env, replace(config, averaged=0.9), 0)
+    calm = makers.train(env, replace(config, averaged=0.9), 0)
     w = lambda found, k: found[k].actors.weights[0]  # noqa: E731
     assert 0 < np.abs(w(calm, 1) - w(calm, 0)).max() < np.abs(w(one, 1) - w(one, 0)).max()
 
@@ -192,40 +193,40 @@ def test_tiers_are_packed_from_runs_and_read_back(tmp_path):
         for run in ("one", "two"):
             key = jax.random.fold_in(jax.random.key(k), len(run) + (run == "two"))
             actors = matd3.init(MATD3Config(hidden=4), key, 4, env.observed.shape[1], 27, 2).actors
-            robots.keep(robots.Snapshot(actors, 100 * (k + 1), 10.0 * k), tmp_path / run, 0.1)
-    cards = robots.pack(env, [tmp_path / "one", tmp_path / "two"], tmp_path / "out")
+            makers.keep(makers.Snapshot(actors, 100 * (k + 1), 10.0 * k), tmp_path / run, 0.1)
+    cards = makers.pack(env, [tmp_path / "one", tmp_path / "two"], tmp_path / "out")
     assert set(cards) == {"good", "medium", "poor"}
     gaps = [abs(p["return"] - 2770.0) for p in cards["good"]["policies"]]
     assert gaps == sorted(gaps) and {p["run"] for p in cards["good"]["policies"]} == {"one", "two"}
     made = [
-        robots.Candidate(k, run, 0, e, None)
+        makers.Candidate(k, run, 0, e, None)
         for run, es in (("a", (100, 101, 80)), ("b", (95,)))
         for k, e in enumerate(es)
     ]
-    assert [c.earned for c in robots._in_turns(made, 100.0)] == [100, 95, 101, 80]
+    assert [c.earned for c in makers._in_turns(made, 100.0)] == [100, 95, 101, 80]
     policies = robots.shipped_policies(env, "good", tmp_path / "out")
     assert len(policies) == 4 and policies[0].noise == 0.2 and policies[0].info["published_level"] == 2770.0
     first = cards["good"]["policies"][0]
-    earned = robots.returns(env, policies[0].actors, env.simulate(32), 1).mean()
+    earned = makers.returns(env, policies[0].actors, env.simulate(32), 1).mean()
     assert earned == pytest.approx(first["return"], abs=0.051), "the card tells what the stored policy earns"
     (tmp_path / "few").mkdir()
     line = (tmp_path / "one" / "scores.jsonl").read_text().splitlines()[0]
     (tmp_path / "few" / "scores.jsonl").write_text(line)
     shutil.copy(tmp_path / "one" / "0000100.npz", tmp_path / "few")
     with pytest.raises(UserError, match="1 snapshots for 'good', 4 are needed"):
-        robots.pack(env, [tmp_path / "few"], tmp_path)
+        makers.pack(env, [tmp_path / "few"], tmp_path)
     with pytest.raises(UserError, match="--transitions 100 holds no bout of learning; give 256 or more"):
-        robots._train_and_keep(env, robots.RobotsConfig(transitions=100), 0, "good", tmp_path / "short")
+        makers._train_and_keep(env, makers.RobotsConfig(transitions=100), 0, "good", tmp_path / "short")
     assert not (tmp_path / "short").exists()
     with pytest.raises(UserError, match="scores.jsonl' does not exist"):
-        robots.pack(env, [tmp_path / "none"], tmp_path)
+        makers.pack(env, [tmp_path / "none"], tmp_path)
 
 
 @pytest.mark.parametrize("name", [t.name for t in registry.TASKS.values() if t.protocol])
 def test_tasks_and_their_limits(name):
     task = registry.get(name)
     policies = robots.shipped_policies(task.env, task.tier)
-    assert len(policies) == robots.MIXED and policies[0].info["level"] == task.tier
+    assert len(policies) == makers.MIXED and policies[0].info["level"] == task.tier
     earned = np.mean([p["return"] for p in policies[0].info["policies"]])
     rel = 0.15 if name.startswith("ant_2x4-poor") else 0.1
     assert earned == pytest.approx(task.published_return[0], rel=rel), "the levels of the public sets"

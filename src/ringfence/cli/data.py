@@ -428,18 +428,6 @@ def info(file: Positional[Path]) -> None:
         out.print(f"[yellow]warning[/] {escape(plain(warning))}", soft_wrap=True)
 
 
-def train_behaviour(out_dir: Annotated[Path, tyro.conf.arg(name="out")] = Path("policies")) -> None:
-    """Train MATD3 from scratch and write the behaviour policies and the replay that the package ships.
-
-    Args:
-        out_dir: folder for the files.
-    """
-    from ringfence.datasets.behaviour import train_tier_policies
-
-    for tier, facts in train_tier_policies(out_dir).items():
-        out.print(f"{tier:16} " + "  ".join(f"{k} {v:.4g}" for k, v in facts.items()), soft_wrap=True)
-
-
 COMMANDS = {
     "make": make,
     "import-table": import_table,
@@ -451,5 +439,4 @@ COMMANDS = {
     "import-hdf5": import_hdf5,
     "undelay": undelay,
     "info": info,
-    "train-behaviour": train_behaviour,
 }

@@ -1,28 +1,22 @@
-"""The policies that make the data: snapshots of a MATD3 learner, its replay, and the collection of episodes.
+"""The policies that made the data, and what they collect.
 
-The public Simple Spread data (OMAR, Pan et al. 2022) are four tiers of one such learner; here they are
+The public Simple Spread data (OMAR, Pan et al. 2022) are four tiers of one MATD3 learner; here they are
 
 * `random`: actions uniform in [-1, 1];
-* `medium-replay`: everything the learner did from scratch until it was about as good as `medium`;
+* `medium-replay`: everything the learner did from scratch until it was about as good as `medium` (`replay.py`);
 * `medium`, `expert`: two snapshots of the learner, rolled out with Gaussian exploration noise.
 
-One seeded run of `train_tier_policies` makes all of them, and its results are shipped under `policies/`. So are those
-of four more seeds, for pools of five learners as the public sets are:
-
-    python -m ringfence.datasets.behaviour
+The files under `policies/` are of five seeded learners, for pools as the public sets are; `benchmarks/behaviour.py`
+makes them.
 """
 
 from __future__ import annotations
 
 import json
-import os
-import zipfile
-import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -30,20 +24,19 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import DTypeLike
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors.numpy import save_file
 
 from ringfence.datasets import matd3
-from ringfence.datasets.matd3 import Learner, MATD3Config, Mlp, Transitions
+from ringfence.datasets.matd3 import Mlp
 from ringfence.envs.base import Env
-from ringfence.envs.simple_spread import SimpleSpread, SpreadState
 from ringfence.errors import CheckpointError, UserError, unknown
 from ringfence.types import Array, Key, PyTree
+from ringfence.utils.files import whole
 
 POLICIES = Path(__file__).parent / "policies"
-COMMAND = "python -m ringfence.datasets.behaviour"
-TIERS = ("random", "medium-replay", "medium", "expert")
+LEVELS = ("medium", "expert")  # tiers of a snapshot each
 LINEAGES = 5  # seeded learners whose policies ship; pooled tiers are of all of them
-REPLAY_TRANSITIONS = 97_500  # size of the public medium-replay set
+TIER_NOISE = 0.1  # std of the exploration noise in the medium and expert data (OMAR's default)
 FORMAT = 1  # version of the policy file
 
 
@@ -59,84 +52,13 @@ class BehaviourPolicy(eqx.Module):
         return matd3.noisy(matd3.act(self.actors, observations), self.noise, key)
 
 
-class BehaviourRun(NamedTuple):
-    """What a learner left behind. E episodes in the order of collection, K snapshots of the actors."""
-
-    actors: Mlp  # leading axes (K, N)
-    seen: np.ndarray  # (K,) transitions collected before each snapshot
-    returns: np.ndarray  # (K,) mean return of the episodes since the previous snapshot, noise included
-    initial: PyTree  # simulator states at reset, leading axis E
-    actions: np.ndarray  # (E, L, N, A) float16, exactly as executed
-
-
-class _Memory(NamedTuple):
-    """The replay buffer, by episode: it holds the whole run, so nothing is ever overwritten."""
-
-    states: PyTree  # (E, L+1, ...)
-    actions: Array  # (E, L, N, A)
-    rewards: Array  # (E, L, N)
-    terminated: Array  # (E, L)
-
-
-def train_behaviour(
-    env: Env,
-    config: MATD3Config,
-    key: Key,
-    transitions: int,
-    progress: Callable[[int, float], None] | None = None,
-) -> BehaviourRun:
-    """Train MATD3 from scratch for at least `transitions` environment steps and keep everything it did.
-
-    `progress(transitions_seen, mean_return)` is called after every snapshot. Memory grows with the run: about 200
-    bytes per transition for three agents.
-    """
-    per_round = env.episode_length * config.envs
-    rounds = -(-transitions // per_round)
-    if rounds < 1:
-        raise UserError(f"A behaviour run of {transitions} transitions is empty; ask for at least one.")
-    key, key_init = jax.random.split(key)
-    learner = _init_learner(env, config, key_init)
-    memory = _empty_memory(env, rounds * config.envs)
-    snapshots, seen, returns = [], [], []
-    done = 0
-    while done < rounds:
-        count = min(config.snapshot_every, rounds - done)
-        numbers = jnp.arange(done, done + count)
-        keys = jax.vmap(partial(jax.random.fold_in, key))(numbers)
-        learner, memory, scores = _train_rounds(env, config, learner, memory, numbers, keys)
-        done += count
-        snapshots.append(jax.tree.map(np.asarray, learner.actors))
-        seen.append(done * per_round)
-        returns.append(float(scores.mean()))
-        if progress is not None:
-            progress(seen[-1], returns[-1])
-    return BehaviourRun(
-        actors=jax.tree.map(lambda *x: np.stack(x), *snapshots),
-        seen=np.array(seen),
-        returns=np.array(returns, np.float32),
-        initial=jax.tree.map(lambda x: np.asarray(x[:, 0]), memory.states),
-        actions=np.asarray(memory.actions).astype(np.float16),
-    )
-
-
-def snapshot(run: BehaviourRun, k: int, noise: float) -> BehaviourPolicy:
-    """The policy of the run's snapshot `k`, acting with exploration noise of this std."""
-    return BehaviourPolicy(jax.tree.map(lambda x: jnp.asarray(x[k]), run.actors), noise)
-
-
 def save_behaviour(policy: BehaviourPolicy, path: str | Path, dtype: DTypeLike = np.float32) -> None:
     """Write the policy as safetensors; the file appears whole or not at all."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {f"weights.{k}": np.ascontiguousarray(w, dtype) for k, w in enumerate(policy.actors.weights)}
     tensors |= {f"biases.{k}": np.ascontiguousarray(b, dtype) for k, b in enumerate(policy.actors.biases)}
     card = {**policy.info, "format": FORMAT, "noise": policy.noise}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(save(tensors, metadata={"ringfence": json.dumps(card)}))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole(Path(path)) as temporary:
+        save_file(tensors, temporary, {"ringfence": json.dumps(card)})
 
 
 def load_behaviour(path: str | Path) -> BehaviourPolicy:
@@ -170,12 +92,12 @@ def shipped_policy(level: str, task: str = "simple_spread", lineage: int = 0) ->
 
     `lineage`: the seed of the learner that it is a snapshot of, 0 to 4; unpooled tiers are of 0.
     """
-    if level not in ("medium", "expert"):
-        raise unknown("behaviour level", level, ("medium", "expert"))
-    return load_behaviour(POLICIES / f"{task}-{level}{_suffix(lineage)}.safetensors")
+    if level not in LEVELS:
+        raise unknown("behaviour level", level, LEVELS)
+    return load_behaviour(POLICIES / f"{task}-{level}{suffix(lineage)}.safetensors")
 
 
-def _suffix(lineage: int) -> str:
+def suffix(lineage: int) -> str:
     """Of a file's name."""
     if not 0 <= lineage < LINEAGES:
         raise UserError(f"There is no lineage {lineage}; the package ships 0 to {LINEAGES - 1}.")
@@ -219,268 +141,6 @@ def resimulate(env: Env, initial: PyTree, actions: np.ndarray, batch: int = 2000
         return _rollout_actions(env, start, jnp.asarray(actions[rows], jnp.float32))
 
     return gather(chunk, episodes, batch)
-
-
-def replay_episodes(
-    env: SimpleSpread,
-    episodes: int = 3900,
-    seed: int = 0,
-    progress: Callable[[int, float], None] | None = None,
-) -> dict[str, np.ndarray]:
-    """`medium-replay`: what the learner did from scratch until it was about medium; same arrays as `collect`.
-
-    Seed 0 with the shipped physics (three agents, `velocity_first`) re-simulates the shipped actions, which frees
-    the data from differences of floating-point arithmetic between machines; anything else runs the learner. Fewer
-    than all 3900 episodes are spread evenly over the run, in order, so a small set has the mix of the whole. The
-    learner always learns from the `omar` reward; `env` decides which reward and cost are recorded.
-    """
-    total = REPLAY_TRANSITIONS // env.episode_length
-    if not 1 <= episodes <= total:
-        raise UserError(f"A medium-replay set holds 1 to {total} episodes, got {episodes}; the run is not longer.")
-    shipped = SimpleSpread()
-    physics = ("n_agents", "integrator", "episode_length", "half_width")
-    if seed == 0 and all(getattr(env, f) == getattr(shipped, f) for f in physics):
-        initial, actions = _load_replay(POLICIES / "simple_spread-medium-replay.npz")
-    else:
-        teacher = replace(env, reward="omar")
-        run = train_behaviour(teacher, MATD3Config(), jax.random.key(seed), REPLAY_TRANSITIONS, progress)
-        initial = run.initial
-        actions = run.actions
-    rows = np.linspace(0, total - 1, episodes).round().astype(int)
-    return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
-
-
-def shipped_replay(env: SimpleSpread, episodes: int, lineage: int) -> dict[str, np.ndarray]:
-    """`episodes` of the replay that ships of a lineage, spread evenly over its learning; same arrays as `collect`."""
-    if not 1 <= episodes <= REPLAY_SHARE:
-        raise UserError(f"A lineage gives 1 to {REPLAY_SHARE} episodes of its replay, got {episodes}; ask for fewer.")
-    initial, actions = _load_replay(POLICIES / f"simple_spread-medium-replay{_suffix(lineage)}.npz")
-    rows = np.linspace(0, len(actions) - 1, episodes).round().astype(int)
-    return resimulate(env, jax.tree.map(lambda x: x[rows], initial), actions[rows])
-
-
-def statistics(data: dict[str, np.ndarray]) -> dict[str, float]:
-    """Per-episode numbers of `collect`'s arrays: return (sum over time of the agents' mean reward) and cost.
-
-    `avoidable_cost` is the mean cost of the episodes that do not start in contact, the only ones that a policy
-    could have kept free of cost; `contact_starts` is the share of the others.
-    """
-    positions = data["state"][:, 0, : 2 * data["actions"].shape[2]].reshape(len(data["state"]), -1, 2)
-    gaps = np.linalg.norm(positions[:, :, None] - positions[:, None], axis=-1)
-    separate = np.all(gaps + 10.0 * np.eye(gaps.shape[-1]) >= 0.3, axis=(1, 2))
-    returns = data["rewards"].mean(-1).sum(-1)
-    cost = data["costs"].sum(-1)
-    return {
-        "episodes": len(returns),
-        "return_mean": float(returns.mean()),
-        "return_std": float(returns.std()),
-        "return_min": float(returns.min()),
-        "return_max": float(returns.max()),
-        "cost": float(cost.mean()),
-        "avoidable_cost": float(cost[separate].mean()) if separate.any() else 0.0,
-        "contact_starts": float(1.0 - separate.mean()),
-    }
-
-
-# ------------------------------------------------------------------------------------------------ the shipped tiers
-
-TARGETS = {"medium": 273.4, "expert": 531.0}  # mean returns of the public sets of seed 0
-POOL_TARGETS = {"medium": 259.85, "expert": 516.76}  # and of the public sets of seeds 0 to 4 together
-TIER_NOISE = 0.1  # std of the exploration noise in the medium and expert data (OMAR's default)
-LINEAGE = 375_000  # transitions of the run that the shipped tiers come from; it ends beyond the expert's level
-REPLAY_SHARE = 780  # episodes of the replay that ship of each lineage but the first, spread evenly over it
-ACTION_STEPS = 127  # of [0, 1], in those
-
-
-def target_return(level: str, lineage: int) -> float:
-    """The return that a lineage's snapshot is chosen by: the public set's for seed 0; for the others what makes the
-    pool's mean the public pool's."""
-    first = TARGETS[level]
-    return first if lineage == 0 else (LINEAGES * POOL_TARGETS[level] - first) / (LINEAGES - 1)
-
-
-def train_tier_policies(
-    folder: str | Path = POLICIES,
-    progress: Callable[[int, float], None] | None = None,
-    lineages: Sequence[int] = range(LINEAGES),
-) -> dict[str, dict[str, float]]:
-    """Make the shipped files: one learner for each seed; its first 97 500 transitions are the replay.
-
-    Of its snapshots, `medium` and `expert` are those whose return, with noise `TIER_NOISE`, is nearest to
-    `target_return` over 20 000 episodes. All but seed 0's are kept at half precision, and their replays as
-    `REPLAY_SHARE` episodes. Returns the statistics of each tier. A minute or two a seed on a core.
-    """
-    tiers = {}
-    for lineage in lineages:
-        tiers |= _train_lineage(lineage, Path(folder), progress)
-    return tiers
-
-
-def _train_lineage(
-    lineage: int, folder: Path, progress: Callable[[int, float], None] | None
-) -> dict[str, dict[str, float]]:
-    """The files of one seed, and their statistics."""
-    env = SimpleSpread()
-    suffix = _suffix(lineage)
-    dtype = np.float16 if lineage else np.float32
-    run = train_behaviour(env, MATD3Config(), jax.random.key(lineage), LINEAGE, progress)
-    run = run._replace(actors=jax.tree.map(lambda x: x.astype(dtype).astype(np.float32), run.actors))
-    policies = [snapshot(run, k, TIER_NOISE) for k in range(len(run.seen))]
-
-    def score(k: int, episodes: int) -> dict[str, float]:
-        return statistics(collect(env, policies[k], episodes, jax.random.key(1)))
-
-    rough = np.array([score(k, 2000)["return_mean"] for k in range(len(policies))])
-    tiers = {}
-    for level in TARGETS:
-        target = target_return(level, lineage)
-        scores = {int(k): score(k, 20_000) for k in np.argsort(np.abs(rough - target))[:4]}
-        best = min(scores, key=lambda k: abs(scores[k]["return_mean"] - target))
-        tiers[level + suffix] = {"seen": int(run.seen[best]), **scores[best]}
-        card = {
-            "task": "simple_spread",
-            "level": level,
-            "return": round(scores[best]["return_mean"], 2),
-            "transitions": int(run.seen[best]),
-            "command": COMMAND,
-        }
-        if lineage:
-            card["lineage"] = lineage
-        policy = replace(policies[best], info=card)
-        save_behaviour(policy, folder / f"simple_spread-{level}{suffix}.safetensors", dtype)
-    episodes = REPLAY_TRANSITIONS // env.episode_length
-    rows = np.arange(episodes)
-    if lineage:
-        rows = np.linspace(0, episodes - 1, REPLAY_SHARE).round().astype(int)
-    initial = jax.tree.map(lambda x: x[rows], run.initial)
-    actions = run.actions[rows]
-    if lineage:
-        actions = np.round(actions.astype(np.float32) * ACTION_STEPS).astype(np.int8)
-    _save_replay(initial, actions, folder / f"simple_spread-medium-replay{suffix}.npz")
-    tiers[f"medium-replay{suffix}"] = statistics(resimulate(env, initial, _of_steps(actions)))
-    return tiers
-
-
-def _of_steps(actions: np.ndarray) -> np.ndarray:
-    """Actions in [-1, 1] of a file that may hold them in steps of 1/127."""
-    return actions.astype(np.float32) / ACTION_STEPS if actions.dtype == np.int8 else actions
-
-
-def _save_replay(initial: SpreadState, actions: np.ndarray, path: Path) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp.npz")
-    try:
-        np.savez_compressed(temporary, position=initial.position, landmarks=initial.landmarks, actions=actions)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _load_replay(path: Path) -> tuple[SpreadState, np.ndarray]:
-    try:
-        with np.load(path) as file:
-            position, landmarks, actions = file["position"], file["landmarks"], file["actions"]
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error) as error:
-        raise CheckpointError(f"{path} is not a whole replay ({error}); make it again with `{COMMAND}`.") from error
-    return SpreadState(position, np.zeros_like(position), landmarks), _of_steps(actions)
-
-
-# ---------------------------------------------------------------------------------------------------- the learner
-
-
-@partial(jax.jit, static_argnums=(0, 1))  # dozens of small arrays: one compilation instead of one for each operation
-def _init_learner(env: Env, config: MATD3Config, key: Key) -> Learner:
-    n = env.n_agents
-    width = env.observation_dim
-    return matd3.init(config, key, n, width, n * width, env.action_dim)
-
-
-def _empty_memory(env: Env, episodes: int) -> _Memory:
-    length = env.episode_length
-    n = env.n_agents
-    state = jax.eval_shape(partial(env.reset, batch=1), jax.random.key(0))
-    return _Memory(
-        states=jax.tree.map(lambda s: jnp.zeros((episodes, length + 1, *s.shape[1:]), s.dtype), state),
-        actions=jnp.zeros((episodes, length, n, env.action_dim)),
-        rewards=jnp.zeros((episodes, length, n)),
-        terminated=jnp.zeros((episodes, length), bool),
-    )
-
-
-@partial(jax.jit, static_argnums=(0, 1), donate_argnums=(2, 3))
-def _train_rounds(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, rounds: Array, keys: Array
-) -> tuple[Learner, _Memory, Array]:
-    """For every round: one episode in each environment, then the updates. Returns the rounds' mean returns too."""
-
-    def one_round(carry, xs):
-        learner, memory = carry
-        number, key = xs
-        key_collect, key_update = jax.random.split(key)
-        fresh = _explore(env, config, learner.actors, number < config.random_rounds, key_collect)
-        memory = jax.tree.map(
-            lambda all, new: jax.lax.dynamic_update_slice_in_dim(all, new, number * config.envs, 0), memory, fresh
-        )
-        stored = (number + 1) * config.envs
-
-        def one_update(learner, xs):
-            index, key = xs
-            return _update(env, config, learner, memory, stored, index % config.delay == 0, key), None
-
-        # The random rounds only fill the buffer; the learner starts with the first round of its own.
-        steps = (jnp.arange(config.updates), jax.random.split(key_update, config.updates))
-        learner = jax.lax.cond(
-            number + 1 >= config.random_rounds,
-            lambda learner: jax.lax.scan(one_update, learner, steps)[0],
-            lambda learner: learner,
-            learner,
-        )
-        return (learner, memory), fresh.rewards.mean(-1).sum(-1).mean()
-
-    (learner, memory), scores = jax.lax.scan(one_round, (learner, memory), (rounds, keys))
-    return learner, memory, scores
-
-
-def _explore(env: Env, config: MATD3Config, actors: Mlp, uniform: Array, key: Key) -> _Memory:
-    """One episode in each of the config's environments, laid out as the buffer's rows."""
-    key_reset, key = jax.random.split(key)
-    first = env.reset(key_reset, config.envs)
-
-    def step(state, key):
-        key_noise, key_uniform = jax.random.split(key)
-        action = matd3.noisy(matd3.act(actors, env.observe(state)), config.noise, key_noise)
-        action = jnp.where(uniform, jax.random.uniform(key_uniform, action.shape, minval=-1.0, maxval=1.0), action)
-        # Executed at half precision, so that a replay file of half the size repeats the run exactly.
-        action = action.astype(jnp.float16).astype(jnp.float32)
-        after, transition = env.step(state, action)
-        return after, (after, action, transition.reward, transition.terminated)
-
-    _, (after, actions, rewards, terminated) = jax.lax.scan(step, first, jax.random.split(key, env.episode_length))
-    states = jax.tree.map(lambda a, b: jnp.swapaxes(jnp.concatenate([a[None], b]), 0, 1), first, after)
-    return _Memory(states, *(jnp.swapaxes(x, 0, 1) for x in (actions, rewards, terminated)))
-
-
-def _update(
-    env: Env, config: MATD3Config, learner: Learner, memory: _Memory, stored: Array, act: Array, key: Key
-) -> Learner:
-    """One critic update and, if `act`, one update of actors and targets."""
-    key_rows, key_noise = jax.random.split(key)
-    drawn = jax.random.randint(key_rows, (config.batch,), 0, stored * env.episode_length)
-    episode, step = jnp.divmod(drawn, env.episode_length)
-    observations = env.observe(jax.tree.map(lambda x: x[episode, step], memory.states))
-    next_observations = env.observe(jax.tree.map(lambda x: x[episode, step + 1], memory.states))
-    batch = Transitions(
-        observations=observations,
-        seen=observations.reshape(config.batch, -1),
-        actions=memory.actions[episode, step],
-        rewards=memory.rewards[episode, step],
-        terminated=memory.terminated[episode, step],
-        next_observations=next_observations,
-        next_seen=next_observations.reshape(config.batch, -1),
-    )
-    return matd3.update(config, learner, batch, act, key_noise)
-
-
-# ------------------------------------------------------------------------------------------------------- rollouts
 
 
 @partial(jax.jit, static_argnums=(0, 4))
@@ -541,15 +201,5 @@ def _check_actors(env: Env, actors: Mlp) -> None:
     if found != wanted:
         raise UserError(
             f"The behaviour policy is for (agents, observation, action) = {found}, the task has {wanted}; "
-            "train one for this task with train_behaviour."
+            "give one of this task."
         )
-
-
-def main() -> None:
-    """Remake the shipped files and print their statistics as JSON."""
-    tiers = train_tier_policies(progress=lambda seen, score: print(f"{seen:7d} transitions: return {score:.1f}"))
-    print(json.dumps(tiers, indent=1))
-
-
-if __name__ == "__main__":
-    main()

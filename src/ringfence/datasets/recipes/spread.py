@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from ringfence.datasets import behaviour as policies
+from ringfence.datasets import replay
 from ringfence.datasets.recipes import COLLECTION
 from ringfence.datasets.task import Card, Recipe, Task
 from ringfence.datasets.version import RECIPES
@@ -43,7 +44,7 @@ class Behaviour(eqx.Module):
 
 def references(task: Task) -> dict[str, Policy]:
     """The policy of `medium` and `expert`."""
-    if task.tier not in policies.TARGETS:
+    if task.tier not in policies.LEVELS:
         return {}
     return {"behaviour policy": Behaviour(policies.shipped_policy(task.tier))}
 
@@ -73,9 +74,9 @@ def played(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
     """A tier's episodes (E, L, ...), and by whom, in words."""
     if tier == "medium-replay":
         how = "the experience of an MATD3 learner from scratch up to the medium level, in order of collection"
-        return policies.replay_episodes(env, episodes, seed), how
+        return replay.replay_episodes(env, episodes, seed), how
     key = jax.random.fold_in(jax.random.key(COLLECTION), seed)
-    if tier in policies.TARGETS:
+    if tier in policies.LEVELS:
         policy = policies.shipped_policy(tier)
         how = f"MATD3 policy, Gaussian action noise {policy.noise:g}"
         return policies.collect(env, policy, episodes, key), how
@@ -98,11 +99,11 @@ def pooled(env: SimpleSpread, tier: str, episodes: int, seed: int) -> tuple[dict
 def _of_lineage(env: SimpleSpread, tier: str, episodes: int, seed: int, lineage: int) -> dict[str, np.ndarray]:
     """One learner's share of a pooled tier."""
     if tier == "medium-replay" and seed == 0:
-        return policies.shipped_replay(env, episodes, lineage)
+        return replay.shipped_replay(env, episodes, lineage)
     if tier == "medium-replay":
-        return policies.replay_episodes(env, episodes, policies.LINEAGES * seed + lineage)
+        return replay.replay_episodes(env, episodes, policies.LINEAGES * seed + lineage)
     key = jax.random.fold_in(jax.random.fold_in(jax.random.key(COLLECTION), seed), lineage)
-    policy = policies.shipped_policy(tier, lineage=lineage) if tier in policies.TARGETS else "random"
+    policy = policies.shipped_policy(tier, lineage=lineage) if tier in policies.LEVELS else "random"
     return policies.collect(env, policy, episodes, key)
 
 
