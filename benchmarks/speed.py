@@ -214,7 +214,7 @@ COLLECT = """
 import json, resource, sys, time
 start = time.perf_counter()
 import jax
-from ringfence.datasets.behaviour import collect, shipped_policy, statistics
+from ringfence.datasets.behaviour import collect, shipped_policy
 from ringfence.envs.simple_spread import SimpleSpread
 imported = time.perf_counter()
 env = SimpleSpread()
@@ -222,7 +222,7 @@ data = collect(env, shipped_policy("medium"), int(sys.argv[1]) // env.episode_le
 took = time.perf_counter() - imported
 peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 size = sum(x.nbytes for x in data.values()) / 2**20
-print(json.dumps([took, imported - start, peak, size, float(statistics(data)["return_mean"])]))
+print(json.dumps([took, imported - start, peak, size, float(data["rewards"].mean(-1).sum(-1).mean())]))
 """
 
 

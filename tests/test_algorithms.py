@@ -652,7 +652,7 @@ def test_what_can_be_played_is_played_and_the_others_are_named(small_store, trai
         ),
         (["--set", "replan=3", "--set", "replan=2"], "--set gives replan twice, 3 and 2"),
         (["--set", "sampling_steps=3", "--set", "num_samples=2", "horizon=x"], "horizon='x' cannot be read as int"),
-        (["--record", "-1"], "num_recorded=-1 must be a whole number"),
+        (["--num-recorded", "-1"], "num_recorded=-1 must be a whole number"),
         (["--checkpoint", "3"], "no checkpoint of step 3; take one of: 6, 12"),
     ],
 )

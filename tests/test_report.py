@@ -96,15 +96,17 @@ def runs(tmp_path) -> list[Run]:
     for seed in (0, 1):
         costs = rng.integers(0, 2, 20)
         results = {
-            "split": result(rng.normal(250, 30, 20), costs, costs > 0, options={"plans": 1}),
-            "split+plans4": result(rng.normal(260, 30, 20), np.zeros(20), options={"plans": 4}, plan_ms_p50=7.25),
+            "split": result(rng.normal(250, 30, 20), costs, costs > 0, options={"sampling_steps": 10}),
+            "split+sampling_steps4": result(
+                rng.normal(260, 30, 20), np.zeros(20), options={"sampling_steps": 4}, plan_ms_p50=7.25
+            ),
         }
         if seed == 0:
             results["split@validation"] = result([1.0, 2.0], [0, 1], split="validation")
         made.append(folder(tmp_path, seed=seed, results=results))
     made.append(folder(tmp_path, "bc", "default", results={"default": result([200, 210], [3, 4])}))
-    for name in ("split", "split+plans4"):
-        record(made[0], name, 4 if "plans" in name else 1)
+    for name in ("split", "split+sampling_steps4"):
+        record(made[0], name, 4 if "steps4" in name else 1)
     data = result([270.0, 272.0], [0, 1], split="data")
     del data["per_episode"], data["options"]
     idle = result([170.0, 172.0], [0, 0])
@@ -140,7 +142,7 @@ def test_what_is_no_row_is_refused(runs):
         sections(runs)
     write({})
     results = json.loads((runs[1].path / "results.json").read_text())
-    results["split"] = result([1.0, 2.0], [0, 1], options={"plans": 1})
+    results["split"] = result([1.0, 2.0], [0, 1], options={"sampling_steps": 10})
     (runs[1].path / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match="'split' were played for 2 and for 20 episodes"):
         sections(runs)
@@ -321,7 +323,7 @@ def test_players_keep_the_chosen_plan_first(runs):
     (section,) = sections(runs)
     many, one = player.players(section)
     assert (many["label"], one["label"]) == ("ICBF-Diffuser split+num_samples4", "ICBF-Diffuser split")
-    kept = np.load(runs[0].path / "rollout-split+plans4.npz")
+    kept = np.load(runs[0].path / "rollout-split+sampling_steps4.npz")
     shown = np.array(many["episodes"][1]["plans"]) / 1000
     step = 3
     expected = kept["plans"][1, step, kept["chosen"][1, step], ..., 2:4]

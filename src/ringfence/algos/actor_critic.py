@@ -111,11 +111,6 @@ def joint_actions(action: Array, own: Array) -> Array:
     return jnp.where(mine, own[:, None], action[:, None]).reshape(b, n, n * a)
 
 
-def soft_update(target: PyTree, params: PyTree, rate: float) -> PyTree:
-    """target + τ (params − target)."""
-    return jax.tree.map(lambda t, p: t + rate * (p - t), target, params)
-
-
 def start(networks, targets: tuple[str, ...], optimiser: Optimiser, frozen: PyTree) -> PyTree:
     """The state of a run: parameters made by `networks()`, copies of those named in `targets`, moments, step 0."""
 

@@ -14,7 +14,7 @@ from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData
 from ringfence.nets import MLP
-from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.nets.optim import Optimiser, fresh, stepped
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.normalise import Normaliser
@@ -60,7 +60,7 @@ def start(key: Key, spec: Spec, config: Config, data: WindowData | None, inputs:
     def networks() -> dict:
         sizes = (inputs, *[config.width] * config.depth, spec.action_dim)
         params = {"actor": MLP(ka, sizes, groups=spec.n_agents, final_scale=0.1, acts=spec)}
-        return fresh(_optimiser(config), params, "ema")
+        return fresh(Optimiser.of(config), params, "ema")
 
     return jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
 
@@ -98,7 +98,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
 
 def clone(config: Config, see: Callable[[Normaliser, Batch], Array]):
     """update(state, batch, key) of actors that read `see(normaliser, batch)` (B, N, inputs)."""
-    opt = _optimiser(config)
+    opt = Optimiser.of(config)
 
     def loss(params: PyTree, frozen: PyTree, batch: Batch) -> tuple[jax.Array, Metrics]:
         action = ac.act(params["actor"], see(frozen["normaliser"], batch))
@@ -107,19 +107,14 @@ def clone(config: Config, see: Callable[[Normaliser, Batch], Array]):
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         grads, metrics = jax.grad(loss, has_aux=True)(state["params"], state["frozen"], batch)
-        params, moments, norms = opt.update(grads, state["opt"], state["params"])
-        ema = average(state["ema"], params, config.ema, state["step"])
-        return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, metrics | norms
+        state, norms = stepped(state, grads, opt, config.ema)
+        return state, metrics | norms
 
     return update
 
 
 def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: BoundHazard, options=None) -> Direct:
     return Direct(state["ema"]["actor"], state["frozen"]["normaliser"], spec, feature_map)
-
-
-def _optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 BC = Algorithm(

@@ -28,7 +28,7 @@ from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData
 from ringfence.nets import MLP
 from ringfence.nets.embedding import sinusoidal
-from ringfence.nets.optim import Optimiser
+from ringfence.nets.optim import Optimiser, follow
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.problem.normalise import Normaliser
@@ -73,10 +73,6 @@ def check(config: Config, hazard: BoundHazard) -> None:
     diffusion.cosine_schedule(config.diffusion_steps)
 
 
-def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
-
-
 def init(
     key: Key,
     spec: Spec,
@@ -103,7 +99,7 @@ def init(
 
     scale = 1.0 if data is None else float(jnp.maximum(data.arrays["rewards"].std(), 1e-6))
     frozen = {"normaliser": ac.fit_states(data, spec, kn), "reward_scale": jnp.float32(scale)}
-    return ac.start(networks, ("reward", "danger", "actor"), optimiser(config), frozen)
+    return ac.start(networks, ("reward", "danger", "actor"), Optimiser.of(config), frozen)
 
 
 def expectile(error: Array, tau: float) -> Array:
@@ -125,7 +121,7 @@ def danger_of(hazard: BoundHazard, batch: Batch) -> Array:
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; one Adam step on every network."""
-    opt = optimiser(config)
+    opt = Optimiser.of(config)
     alpha_bar = diffusion.cosine_schedule(config.diffusion_steps)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
@@ -167,7 +163,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         state = {
             **state,
             "params": params,
-            "target": ac.soft_update(target, {k: params[k] for k in target}, config.target_rate),
+            "target": follow(target, {k: params[k] for k in target}, config.target_rate),
             "opt": moments,
             "step": state["step"] + 1,
         }

@@ -32,7 +32,7 @@ from ringfence.algos import actor_critic as ac
 from ringfence.algos import drivers
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData
-from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.nets.optim import Optimiser, fresh, stepped
 from ringfence.nets.residual import ResidualMLP
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
@@ -98,7 +98,7 @@ def init(
     def networks() -> dict:
         params = drivers.networks(kc, kp, config.drivers, seen, acts, config.width, config.depth)
         params["flow"] = ResidualMLP(kf, inputs, acts, config.width, config.depth, 0.1)
-        return fresh(_optimiser(config), params, "ema")
+        return fresh(Optimiser.of(config), params, "ema")
 
     state = jax.jit(networks)() | {"frozen": {"normaliser": ac.fit_states(data, spec, kw)}}
     return state | ({"world": from_world(world, config)} if follows(config) and world is not None else {})
@@ -176,15 +176,14 @@ def make_loss(config: Config):
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics; pure, one Adam step on both networks."""
-    loss, opt = make_loss(config), _optimiser(config)
+    loss, opt = make_loss(config), Optimiser.of(config)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         normaliser = state["frozen"]["normaliser"]
         world = state.get("world")
         grads, metrics = jax.grad(loss, has_aux=True)(state["params"], normaliser, batch, state["step"], key, world)
-        params, moments, norms = opt.update(grads, state["opt"], state["params"])
-        ema = average(state["ema"], params, config.ema, state["step"])
-        return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, metrics | norms
+        state, norms = stepped(state, grads, opt, config.ema)
+        return state, metrics | norms
 
     return update
 
@@ -200,10 +199,6 @@ def make_policy(state: PyTree, config: Config, spec: Spec, feature_map, hazard: 
         feature_map=feature_map,
         options=options,
     )
-
-
-def _optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 FLOW = Algorithm(

@@ -29,7 +29,7 @@ from ringfence.nets import MLP, build_denoiser, unet
 from ringfence.nets.agent_attention import HEADS
 from ringfence.nets.heads import infer_action
 from ringfence.nets.mean_plan import MeanPlan
-from ringfence.nets.optim import Optimiser, average, fresh
+from ringfence.nets.optim import Optimiser, fresh, stepped
 from ringfence.nets.team import planning_as
 from ringfence.problem import features, normalise
 from ringfence.problem.constraints import BoundHazard
@@ -233,7 +233,7 @@ def init(
             kc, kq = jax.random.split(jax.random.fold_in(key, 1))
             sizes = (config.clone_width, config.clone_depth)
             params |= drivers.networks(kc, kq, config.searched, seen, acts, *sizes)
-        return fresh(optimiser(config), params, "ema")
+        return fresh(Optimiser.of(config), params, "ema")
 
     if data is None:
         one = jnp.zeros(d)
@@ -253,10 +253,6 @@ def fit_normaliser(config: Config, data: WindowData, key: Key, windows: int = 81
     step = jax.random.randint(key, (min(windows, 4 * data.steps),), 0, data.steps)
     batch = at(data.arrays, step, config.horizon, config.history)
     return normalise.fit(np.asarray(batch.features), np.asarray(batch.valid), config.history, config.coordinates)
-
-
-def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, config.warmup, config.num_updates, config.grad_clip)
 
 
 def follows(config: Config) -> bool:
@@ -594,18 +590,16 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
             make_planning(config, feature_map),
             make_drawing(config, feature_map),
             inverse_dynamics,
-            optimiser(config),
+            Optimiser.of(config),
         )
     loss = make_loss(config, feature_map)
-    opt = optimiser(config)
+    opt = Optimiser.of(config)
 
     def update(state: PyTree, batch: Batch, key: Key) -> tuple[PyTree, Metrics]:
         (_, metrics), grads = jax.value_and_grad(loss, has_aux=True)(
             state["params"], state["frozen"] | state["world"], batch, state["step"], key
         )
-        params, moments, norms = opt.update(grads, state["opt"], state["params"])
-        ema = average(state["ema"], params, config.ema, state["step"])
-        state = {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}
+        state, norms = stepped(state, grads, opt, config.ema)
         return state, metrics | norms
 
     return update

@@ -20,7 +20,7 @@ from msgspec import Meta
 from ringfence.algos import actor_critic as ac
 from ringfence.errors import UserError
 from ringfence.logs.windows import WindowData
-from ringfence.nets.optim import Optimiser
+from ringfence.nets.optim import Optimiser, follow
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
@@ -71,10 +71,6 @@ def check(config: Config, hazard: BoundHazard) -> None:
         )
 
 
-def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, 0, config.num_updates, config.grad_clip, floor=1.0)
-
-
 def init(
     key: Key,
     spec: Spec,
@@ -90,7 +86,9 @@ def init(
     def networks() -> dict:
         return {"actor": ac.make_actor(ka, spec, config.width), "critic": ac.Critics(kq, *sizes)}
 
-    return ac.start(networks, ("actor", "critic"), optimiser(config), {"normaliser": ac.fit_states(data, spec, kw)})
+    return ac.start(
+        networks, ("actor", "critic"), Optimiser.of(config, floor=1.0), {"normaliser": ac.fit_states(data, spec, kw)}
+    )
 
 
 def rectified(critic: ac.Critics, x: Array, own: Array, noise: Array, config: Config, spec: Spec) -> Array:
@@ -188,7 +186,7 @@ def make_actor_slope(config: Config, spec: Spec):
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets."""
-    opt = optimiser(config)
+    opt = Optimiser.of(config, floor=1.0)
     uniform_density = -spec.action_dim * jnp.log(2.0)
     critic_slope = make_critic_slope(config)
     actor_slope = make_actor_slope(config, spec)
@@ -231,7 +229,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         state = {
             **state,
             "params": new,
-            "target": ac.soft_update(target, new, config.target_rate),
+            "target": follow(target, new, config.target_rate),
             "opt": {**actor_moments, **moments},
             "step": state["step"] + 1,
         }

@@ -27,7 +27,7 @@ from ringfence.datasets import registry
 from ringfence.errors import UserError
 from ringfence.logs.store import EpisodeStore, team
 from ringfence.logs.windows import NOT_ARRIVED, WindowData
-from ringfence.nets.optim import Optimiser
+from ringfence.nets.optim import Optimiser, follow
 from ringfence.problem import features
 from ringfence.problem.constraints import BoundHazard
 from ringfence.types import Algorithm, Array, Batch, Key, Metrics, PyTree, Spec
@@ -103,10 +103,6 @@ def cost_unit(config: Config, spec: Spec) -> float:
     return 1.0 if spec.task in registry.TASKS else config.limit
 
 
-def optimiser(config: Config) -> Optimiser:
-    return Optimiser(config.lr, 0, config.num_updates, config.grad_clip, floor=1.0)
-
-
 def init(
     key: Key,
     spec: Spec,
@@ -129,7 +125,7 @@ def init(
         return params
 
     targets = ("actor", "critic", "cost") if config.lagrange else ("actor", "critic")
-    state = ac.start(networks, targets, optimiser(config), {"normaliser": ac.fit_states(data, spec, kw)})
+    state = ac.start(networks, targets, Optimiser.of(config, floor=1.0), {"normaliser": ac.fit_states(data, spec, kw)})
     return state | {"multiplier": jnp.zeros(spec.n_agents)}
 
 
@@ -184,7 +180,7 @@ def make_actor_slope(config: Config, spec: Spec, allowed: float):
 
 def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, hazard: BoundHazard):
     """update(state, batch, key) -> state, metrics: critics, then actors, then targets and multiplier."""
-    opt = optimiser(config)
+    opt = Optimiser.of(config, floor=1.0)
     unit = cost_unit(config, spec)
     allowed = threshold(config, spec) / unit
     actor_slope = make_actor_slope(config, spec, allowed)
@@ -217,7 +213,7 @@ def make_update(config: Config, spec: Spec, feature_map: features.FeatureMap, ha
         slope, (more, excess) = actor_slope(params["actor"], critics, t, batch, scale)
         actor, actor_moments, actor_norms = opt.update({"actor": slope}, state["opt"], {"actor": params["actor"]})
         new = {"actor": actor["actor"], **critics}
-        moved = ac.soft_update(target, {k: new[k] for k in target}, config.target_rate)
+        moved = follow(target, {k: new[k] for k in target}, config.target_rate)
         opts = {"actor": actor_moments["actor"], **moments}
         if config.delay > 1:  # in between, actors and targets stay where they are
             go = state["step"] % config.delay == 0

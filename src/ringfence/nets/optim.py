@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +27,11 @@ class Optimiser:
     steps: int  # updates in all; the rate falls along a cosine to `floor`
     clip: float  # bound on the norm; 0: none
     floor: float = 0.1  # share of the rate that is left at the end; 1 keeps it constant
+
+    @classmethod
+    def of(cls, config: Any, floor: float = 0.1) -> Optimiser:
+        """The one that an algorithm's config asks for; one without `warmup` begins at its full rate."""
+        return cls(config.lr, getattr(config, "warmup", 0), config.num_updates, config.grad_clip, floor)
 
     def _adam(self) -> optax.GradientTransformation:
         warmup = min(self.warmup, max(self.steps // 10, 1))
@@ -68,6 +74,18 @@ def average(ema: PyTree, params: PyTree, decay: float, step: Array) -> PyTree:
     """Exponential moving average that follows closely at first and settles to `decay`."""
     d = jnp.minimum(decay, (1.0 + step) / (10.0 + step))
     return jax.tree.map(lambda a, p: d * a + (1.0 - d) * p, ema, params)
+
+
+def follow(slow: PyTree, fast: PyTree, rate: float) -> PyTree:
+    """slow + τ (fast − slow), of targets."""
+    return jax.tree.map(lambda s, f: s + rate * (f - s), slow, fast)
+
+
+def stepped(state: PyTree, grads: dict[str, PyTree], optimiser: Optimiser, decay: float) -> tuple[PyTree, Metrics]:
+    """The state of a run after a step of all its networks, whose averages follow, and the gradient norms."""
+    params, moments, norms = optimiser.update(grads, state["opt"], state["params"])
+    ema = average(state["ema"], params, decay, state["step"])
+    return {**state, "params": params, "ema": ema, "opt": moments, "step": state["step"] + 1}, norms
 
 
 def regress(

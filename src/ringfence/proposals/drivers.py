@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from ringfence.types import Array
+from ringfence.types import Array, Key
 
 
 def driver_scores(net: Any, seen: Array, score: Array, keep: Array) -> Array:
@@ -30,6 +31,21 @@ def classifier_free(answer: Callable[[Array, Array], Array], score: Array, scale
         return conditional
     free = answer(score, ~everyone)
     return free + scale * (conditional - free)
+
+
+def draw(prior: Any, seen: Array, key: Key, guided: Callable[[Callable[[Array, Array], Array]], Array]) -> Array:
+    """(B,) who drives at standardised states (B, N·D), drawn; `guided` answers by the return that is asked for."""
+    logits = guided(partial(driver_scores, prior, seen))
+    return drawn(logits, jax.random.normal(key, logits.shape))
+
+
+def several(own: Array, count: int, others: Callable[[int], Array]) -> Array:
+    """(B · count,) whose proposals to make: the episode's own driver's (B,) first, then of such as may drive here, whom
+    `others` draws, a number for each of B."""
+    if count == 1:
+        return own
+    rest = others(count - 1).reshape(len(own), count - 1)
+    return jnp.concatenate([own[:, None], rest], 1).reshape(-1)
 
 
 def drawn(logits: Array, normal: Array) -> Array:

@@ -8,9 +8,7 @@ With `barrier_guidance` w, every step moves â by w of a step to where a World's
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +19,7 @@ from ringfence.errors import UserError
 from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals.base import from_unit, rolled
-from ringfence.proposals.drivers import asked, classifier_free, drawn, driver_scores
+from ringfence.proposals.drivers import asked, classifier_free, draw, several
 from ringfence.proposals.guidance import cleared, lacking
 from ringfence.proposals.options import PlanOptions
 from ringfence.types import Array, Key, PolicyStep, PyTree, Spec
@@ -91,8 +89,9 @@ class FlowPolicy(eqx.Module):
         x = self.feature_map(observations, state)
         carry, key = self._with_driver(carry, x, key)
         batch = observations.shape[0]
-        others = self._drawn(jnp.repeat(x, count - 1, 0), jax.random.fold_in(key, 1)).reshape(batch, count - 1)
-        driver = jnp.concatenate([carry["driver"][:, None], others], 1).reshape(-1)
+        driver = several(
+            carry["driver"], count, lambda more: self._drawn(jnp.repeat(x, more, 0), jax.random.fold_in(key, 1))
+        )
 
         guides = None if self.world is None else jnp.repeat(self.world.map(observations, state), count, 0)
         seen, present = (jnp.repeat(m(observations, state), count, 0) for m in (self.feature_map, world.map))
@@ -150,9 +149,8 @@ class FlowPolicy(eqx.Module):
 
     def _drawn(self, x: Array, key: Key) -> Array:
         """(B,) who drives at features x (B, N, D), drawn."""
-        logits = self._guided(partial(driver_scores, self.networks["prior"], self._seen(x)), x.shape[0])
-        return drawn(logits, jax.random.normal(key, logits.shape))
+        return draw(self.networks["prior"], self._seen(x), key, lambda ask: self._guided(ask, x.shape[0]))
 
     def _seen(self, x: Array) -> Array:
-        """(B, N·D) what networks read of features (B, N, D); B may be 0, where a guard asks for one proposal alone."""
-        return self.normaliser.state(x).reshape(x.shape[0], math.prod(x.shape[1:]))
+        """(B, N·D) what networks read of features (B, N, D)."""
+        return self.normaliser.state(x).reshape(x.shape[0], -1)

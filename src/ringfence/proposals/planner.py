@@ -25,7 +25,7 @@ from ringfence.problem.features import FeatureMap
 from ringfence.problem.normalise import Normaliser
 from ringfence.proposals import diffusion
 from ringfence.proposals.base import from_unit
-from ringfence.proposals.drivers import classifier_free, drawn, driver_scores
+from ringfence.proposals.drivers import classifier_free, draw, several
 from ringfence.proposals.generator import Generator, generator
 from ringfence.proposals.guidance import cleared, lacking
 from ringfence.proposals.options import PlanOptions
@@ -131,8 +131,8 @@ class Planner(eqx.Module):
             )
         past, present = self._context(carry, observations, state)
         carry = self._with_driver(carry, present, key)
-        several = self._several(carry, present, key, count)
-        plans = self.plans(past, present, key, count, several, self._judged(observations, state))
+        who = self._several(carry, present, key, count)
+        plans = self.plans(past, present, key, count, who, self._judged(observations, state))
         flat = plans.reshape(-1, *plans.shape[2:])
         x, tracks, actions = flat[:, self.history], world.map.names == self.feature_map.names, []
         for row in range(self.history + 1, self.history + 1 + rows):
@@ -169,19 +169,18 @@ class Planner(eqx.Module):
         """(B · count,) whose plans to make: the episode's own driver's first, then of such as may drive here."""
         if not self.drivers:
             return None
-        if count == 1:
-            return carry["driver"]
-        others = self._drawn(jnp.repeat(present, count - 1, 0), jax.random.fold_in(key, 2))
-        own = carry["driver"][:, None]
-        return jnp.concatenate([own, others.reshape(len(own), count - 1)], 1).reshape(-1)
+        return several(
+            carry["driver"],
+            count,
+            lambda more: self._drawn(jnp.repeat(present, more, 0), jax.random.fold_in(key, 2)),
+        )
 
     def _drawn(self, present: Array, key: Key) -> Array:
         """(B,) who drives at states (B, N, D), drawn, for the return that is asked for."""
         batch = present.shape[0]
         seen = self.normaliser.state(present).reshape(batch, -1)
-        answer = partial(driver_scores, self.networks["prior"], seen)
-        logits = classifier_free(answer, jnp.full(batch, self.options.target_return), self.options.cfg_scale)
-        return drawn(logits, jax.random.normal(key, logits.shape))
+        target = jnp.full(batch, self.options.target_return)
+        return draw(self.networks["prior"], seen, key, lambda ask: classifier_free(ask, target, self.options.cfg_scale))
 
     def plans(
         self,

@@ -29,7 +29,7 @@ import numpy as np
 import optax
 
 from ringfence.nets.mlp import MLP
-from ringfence.nets.optim import regress
+from ringfence.nets.optim import follow, regress
 from ringfence.problem.constraints import lowest
 from ringfence.problem.entries import Entries
 from ringfence.problem.features import FeatureMap
@@ -434,15 +434,15 @@ def fit_future(
         error = goal - value
         return (jnp.where(error > 0, expectile, 1 - expectile) * error**2).mean()
 
-    def follow(pair: tuple[dict[str, MLP], dict[str, MLP]]) -> tuple[dict[str, MLP], dict[str, MLP]]:
+    def following(pair: tuple[dict[str, MLP], dict[str, MLP]]) -> tuple[dict[str, MLP], dict[str, MLP]]:
         net, slow = pair
-        return net, jax.tree.map(lambda s, n: s + rate * (n - s), slow, net)
+        return net, follow(slow, net, rate)
 
     near = on_device(close if len(close) else picked)
     data = arrays["features"], arrays["row"], arrays["terminated"], near, on_device(picked)
     words = "" if quiet else "barrier, what will be dangerous"
     pair = net, net
-    found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=follow)
+    found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=following)
     return eqx.tree_at(lambda b: b.future, barrier, found[0])
 
 
