@@ -119,7 +119,7 @@ def test_page_is_whole_and_self_contained(runs, tmp_path):
     text = page.read_text()
     assert not re.search(r"https?://|//cdn|@import|<script[^>]+src=|<link(?![^>]+href=\"data:)", text)
     assert "<title>A &amp; B</title>" in text and "by hand &lt;b&gt;" in text
-    for row in ("BC", "ICBF-Diffuser", "split+num_samples4", "behaviour data", "do-nothing"):
+    for row in ("BC", "ICBF-Diffuser", "split+sampling_steps4", "behaviour data", "do-nothing"):
         assert row in text
     assert "Validation results" in text and "return − 159.8" in text
     assert text.count("<tr class") == 6  # three methods, one on validation, two references
@@ -175,7 +175,11 @@ def test_a_run_that_is_older_than_a_field_had_its_default(runs):
 def test_seeds_are_pooled(runs):
     (section,) = sections(runs)
     bc, plain, chosen = section.tables["test"]
-    assert [r.label for r in (bc, plain, chosen)] == ["BC", "ICBF-Diffuser split", "ICBF-Diffuser split+num_samples4"]
+    assert [r.label for r in (bc, plain, chosen)] == [
+        "BC",
+        "ICBF-Diffuser split",
+        "ICBF-Diffuser split+sampling_steps4",
+    ]
     episodes = [r.results["split"]["per_episode"] for r in runs[:2]]
     returns, costs = (np.array([t[k] for t in episodes]) for k in ("return", "cost"))
     assert plain.seeds == (0, 1) and plain.episodes == 40
@@ -196,13 +200,13 @@ def test_commands_are_those_that_made_the_results(runs):
     """Runs that were played in the same words share a line."""
     results = runs[0].results
     results["split"]["command"] = ["play", "--env", "yard.py:Yard", "--agents", "5"]
-    del results["split+num_samples4"]["command"]
+    del results["split+sampling_steps4"]["command"]
     (runs[0].path / "results.json").write_text(json.dumps(results))
     (section,) = sections(runs)
     lines = provenance.commands(section, Path("r.html"))
     assert f"ringfence play {runs[0].path} --env yard.py:Yard --agents 5" in lines
     assert f"ringfence eval {runs[1].path} --episodes 20" in lines
-    assert sum(line.startswith("# of ") and "split+num_samples4" in line for line in lines) == 1
+    assert sum(line.startswith("# of ") and "split+sampling_steps4" in line for line in lines) == 1
     results["split"]["command"] = ["data", "make", "x", "--out", "/etc/passwd"]
     (runs[0].path / "results.json").write_text(json.dumps(results))
     with pytest.raises(UserError, match="made by 'data', which plays nothing"):
@@ -219,7 +223,7 @@ def test_training_is_a_line_for_seeds_that_follow_each_other(runs):
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
     said = (
-        r"ICBF-Diffuser split\+num_samples4 is the only one of 3 .*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
+        r"ICBF-Diffuser split\+sampling_steps4 is the only one of 3 .*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
     )
     assert re.search(f'class="headline">{said}', text)
 
@@ -322,7 +326,7 @@ def test_runs_without_results_are_refused(tmp_path):
 def test_players_keep_the_chosen_plan_first(runs):
     (section,) = sections(runs)
     many, one = player.players(section)
-    assert (many["label"], one["label"]) == ("ICBF-Diffuser split+num_samples4", "ICBF-Diffuser split")
+    assert (many["label"], one["label"]) == ("ICBF-Diffuser split+sampling_steps4", "ICBF-Diffuser split")
     kept = np.load(runs[0].path / "rollout-split+sampling_steps4.npz")
     shown = np.array(many["episodes"][1]["plans"]) / 1000
     step = 3

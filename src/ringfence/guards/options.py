@@ -53,7 +53,6 @@ class GuardOptions:
     proof: NonNegative = 0.0  # what every entry may be off by, while plans are still proved; 0: nothing is proved
     proof_rows: Samples = 10  # rows of the way out that is proved
     proof_residual: NonNegative = 0.0  # by which a predicted row of the own velocity may be off, in its own unit
-    proof_backup: bool = False  # where a plan is not proved, the last one that was goes on
 
     def __post_init__(self):
         check_bounds(self)

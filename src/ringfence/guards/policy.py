@@ -74,9 +74,6 @@ class Guarded(eqx.Module):
             shape = (batch, options.delay + options.max_age, spec.n_agents, spec.action_dim)
             carry["sent"] = jnp.broadcast_to(nothing, shape)  # the oldest first
             carry["observed_age"] = jnp.zeros((batch, spec.n_agents), jnp.int32)
-        if options.proof:
-            carry["proved_plan"] = jnp.zeros((batch, options.proof_rows, spec.n_agents, spec.action_dim))
-            carry["proved_left"] = jnp.zeros((batch, spec.n_agents), jnp.int32)  # rows of it that are left
         if constraints > 1:
             carry["costs"] = jnp.full((batch, constraints), jnp.nan, jnp.float32)
         return carry
@@ -136,9 +133,7 @@ class Guarded(eqx.Module):
             unseen = guard.options.delay + carry["observed_age"]
         found = guard.decide(acting, actions, carry["last"], margin, key, unseen, self.driven)
         action = found.plan[:, 0]
-        proof = {}
-        if guard.options.proof:
-            carry, action, proof = self._with_proof(carry, acting, found.plan, unseen)
+        proof = self._proved(acting, found.plan, unseen) if guard.options.proof else {}
         info = {
             "plans": found.rows,
             "chosen": found.chosen,
@@ -172,27 +167,11 @@ class Guarded(eqx.Module):
         """(B, N) of those for whom it is decided, and nothing of the others."""
         return x if self.driven is None else jnp.where(self.driven, x, nothing)
 
-    def _with_proof(
-        self, carry: PyTree, acting: Array, plan: Array, unseen: Array | None
-    ) -> tuple[PyTree, Array, dict[str, Array]]:
-        """(carry, actions (B, N, A), what is known): the plan's where it is proved, else those of the last plan that
-        was, as long as it has rows left (Sha 2001, the simplex architecture)."""
-        options = self.guard.options
-        prover = prover_of(self.guard.world, options)
-        whole = prover.continued(acting, plan)
-        new = prover.lower_bounds(acting, whole, unseen).min(1) >= 0
-        kept = jnp.concatenate([carry["proved_plan"][:, 1:], carry["proved_plan"][:, -1:]], 1)
-        left = jnp.maximum(carry["proved_left"] - 1, 0)
-        backup = ~new & (left > 0) & options.proof_backup
-        action = jnp.where(backup[..., None], kept[:, 0], plan[:, 0])
-        chosen = new[:, None, :, None]
-        kept = {
-            "proved_plan": jnp.where(chosen, whole, kept),
-            "proved_left": jnp.where(new, options.proof_rows, left * backup),
-        }
-        proved = new | backup
-        info = {"proved": proved.all(-1), "agent_proved": proved, "agent_backup": backup}
-        return {**carry, **kept}, action, info
+    def _proved(self, acting: Array, plan: Array, unseen: Array | None) -> dict[str, Array]:
+        """Say whose plan (B, K, N, A) is proved, and of which teams everybody's is."""
+        prover = prover_of(self.guard.world, self.guard.options)
+        proved = prover.lower_bounds(acting, prover.continued(acting, plan), unseen).min(1) >= 0
+        return {"proved": proved.all(-1), "agent_proved": proved}
 
     def when_it_acts(self, carry: PyTree, present: Array) -> Array:
         """(B, N, D) where the team will be when the action that is decided now takes effect: the World goes on from

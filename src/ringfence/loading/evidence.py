@@ -70,8 +70,6 @@ class Evidence:
             record["clearance"] = _numbers(info["agent_clearance"])
             record["infeasible"] = np.flatnonzero(info["agent_infeasible"]).tolist()
             record["ood"] = np.flatnonzero(info["agent_ood"]).tolist()
-        if "agent_backup" in info:
-            record["backup"] = np.flatnonzero(info["agent_backup"]).tolist()
         for name in ("covered", "proved", "alarm"):
             if name in info:
                 record[name] = bool(np.all(info[name]))
