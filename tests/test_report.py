@@ -223,7 +223,8 @@ def test_training_is_a_line_for_seeds_that_follow_each_other(runs):
 def test_headline_names_the_best_safe_method(runs, tmp_path):
     text = build_report(runs, tmp_path).read_text()
     said = (
-        r"ICBF-Diffuser split\+sampling_steps4 is the only one of 3 .*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
+        r"ICBF-Diffuser split\+sampling_steps4 is the only one of 3 "
+        r".*0\.0 % of 40 episodes \(2 seeds\), at most 13\.9 %"
     )
     assert re.search(f'class="headline">{said}', text)
 
