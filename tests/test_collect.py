@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -102,6 +106,104 @@ def test_an_interrupted_collection_goes_on(tmp_path, monkeypatch):
     assert np.abs(whole.actions).max() > 1.5
 
 
+def pushing(strength):
+    return lambda observations: np.full((2, 1), strength)
+
+
+class Pushing:
+    def __init__(self, strength):
+        self.strength = strength
+
+    def __call__(self, observations):
+        return np.full((2, 1), self.strength)
+
+    def reset(self):
+        self.steps = 0
+
+
+class Softer(Pushing):
+    def __call__(self, observations):
+        return np.full((2, 1), self.strength / 2)
+
+
+def pushed(strength, observations):
+    return np.full((2, 1), strength)
+
+
+def pushed_by(observations, strength):
+    return pushed(strength, observations)
+
+
+class Faster(Drift):
+    def __init__(self, gain=1.0):
+        self.gain = gain
+
+    def step(self, actions):
+        return super().step({a: self.gain * x for a, x in actions.items()})
+
+
+READ = np.array([0.25])
+
+
+def reading(observations):
+    return np.tile(READ, (2, 1))
+
+
+@pytest.mark.parametrize(
+    "make", [pushing, Pushing, lambda s: partial(pushed, s), lambda s: partial(pushed_by, strength=s)]
+)
+def test_another_policy_of_the_same_code_is_another_recording(tmp_path, make):
+    """What it captures, what it was given, and what it holds; the same values are the same policy."""
+    file = tmp_path / "d.h5"
+    first = ringfence.collect(Drift, make(0.25), episodes=2, out=file)
+    for episodes in (2, 3):
+        with pytest.raises(StoreError, match="of a policy whose code or values differ"):
+            ringfence.collect(Drift, make(0.5), episodes=episodes, out=file)
+    again = ringfence.collect(Drift, make(0.25), episodes=3, out=file)
+    assert (again.actions == 0.25).all() and (again.episodes, first.episodes) == (3, 2)
+
+
+def test_what_else_makes_another_recording(tmp_path, monkeypatch):
+    """A method that differs, a value that code reads by its name, settings of the simulator, and another cost."""
+    file = tmp_path / "d.h5"
+    ringfence.collect(Drift, Pushing(0.25), episodes=2, out=file)
+    with pytest.raises(StoreError, match="of Softer in Drift from seed 0"):
+        ringfence.collect(Drift, Softer(0.25), episodes=2, out=file)
+    with pytest.raises(StoreError, match="of a cost whose code"):
+        ringfence.collect(Drift, Pushing(0.25), episodes=2, out=file, cost=lambda infos: 1.0)
+
+    ringfence.collect(lambda: Faster(1.0), reading, episodes=2, out=tmp_path / "e.h5")
+    with pytest.raises(StoreError, match="of a simulator whose code or values differ"):
+        ringfence.collect(lambda: Faster(2.0), reading, episodes=2, out=tmp_path / "e.h5")
+    ringfence.collect(partial(Faster, 1.0), reading, episodes=2, out=tmp_path / "f.h5")
+    with pytest.raises(StoreError, match="of a simulator"):
+        ringfence.collect(partial(Faster, 2.0), reading, episodes=2, out=tmp_path / "f.h5")
+    monkeypatch.setitem(reading.__globals__, "READ", np.array([0.5]))
+    with pytest.raises(StoreError, match="of a policy"):
+        ringfence.collect(lambda: Faster(1.0), reading, episodes=2, out=tmp_path / "e.h5")
+
+
+def test_another_process_finds_the_same_content(tmp_path):
+    """Whatever addresses and the order of sets are there."""
+    code = """
+import functools, random, numpy as np
+from ringfence.utils.content import content_of
+class Policy:
+    names = {"a", "b", "c", "d"}
+    def __init__(self): self.w, self.rng, self.me = np.ones(3), np.random.default_rng(), self
+    def __call__(self, x): return np.tanh([y * self.w for y in x]).sum() + helper(x)
+def helper(x): return [z for z in x if (lambda q: q > 1)(z)]
+one = Policy(); one.rng.random(); one.lock = __import__("threading").Lock()
+print(content_of(one), content_of(one.__call__), content_of(functools.partial(helper, k=np.float32(2))))
+"""
+    runs = [
+        subprocess.run([sys.executable, "-c", code], env=os.environ | {"PYTHONHASHSEED": seed}, capture_output=True)
+        for seed in ("1", "2")
+    ]
+    assert runs[0].stdout and len(set(runs[0].stdout.split())) == 3, runs[0].stderr
+    assert runs[0].stdout == runs[1].stdout
+
+
 class Mapped(Drift):
     """The same, half a million metres from 0."""
 
@@ -122,8 +224,12 @@ def test_what_lies_far_from_0_is_kept_as_it_was_shown(tmp_path):
     assert any("moved towards 0" in said for said in far.card.warnings)
     measured, _ = far.card.origins.measured(far.observations, None)
     np.testing.assert_allclose(measured - [5e5, 0], near.observations, atol=1e-5)
+
+    def moved(observations, state):
+        return lean(observations - [5e5, 0], state)
+
     for episodes in (2, 4):
-        parts = ringfence.collect(Mapped, watch, episodes=episodes, out=tmp_path / "far.h5")
+        parts = ringfence.collect(Mapped, moved, episodes=episodes, out=tmp_path / "far.h5")
     assert parts.content == far.content and parts.card.origins == far.card.origins
 
 

@@ -93,7 +93,8 @@ class Controller:
             options = {name: promised.guard[name] for name in brought if name in promised.guard} | options
         self._watch = Watch(promised, on_alarm, fallback)
         self._stamps = Stamps(clock)
-        self._key = jax.random.key(whole_number("seed", seed, 0, LAST_SEED))
+        self._seed = whole_number("seed", seed, 0, LAST_SEED)
+        self._key = jax.random.key(self._seed)
         self._source = _source(run, planner, options)
         if driven is not None:
             self._source.policy = _deciding_for(driven, self._source)
@@ -120,6 +121,11 @@ class Controller:
     def agents(self) -> list[str] | None:
         """Whose row is whose, by the logs' names; None of those who are homogeneous, or whom nobody named."""
         return self._source.names
+
+    @property
+    def made_of(self) -> tuple[Policy, int]:
+        """The policy and its seed, whatever it remembers: by these `collect` knows it again."""
+        return self.policy, self._seed
 
     @in_float32
     def reset(self) -> None:

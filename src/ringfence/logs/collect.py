@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -20,6 +19,7 @@ from ringfence.logs.store import EpisodeStore
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.origins import FIELDS as ORIGINS
 from ringfence.problem.origins import Origins
+from ringfence.utils.content import content_of
 from ringfence.utils.files import writable
 from ringfence.utils.functions import of_both
 from ringfence.utils.given import given_as
@@ -50,8 +50,9 @@ def collect(
     there are none, 0. A dictionary of costs names constraints, whose limits per episode `card["constraints"]` holds (0
     by default).
 
-    With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy's name
-    and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept.
+    With `out` a store's file is written every hundred episodes, and a collection of the same simulator, policy, cost
+    and seed goes on from there; so does one that was refused or interrupted, since what was finished is kept. The same
+    are those of the same code and values; a policy that changes as it acts tells them by an attribute `made_of`.
     `max_episode_steps` without an end are refused. `early_ends` says what becomes of an episode that an agent leaves
     before its team: it is refused, cut there, or skipped and counted on the card. `card` adds fields to the store's.
     """
@@ -63,7 +64,14 @@ def collect(
     file = None if out is None else writable(out)
     env = made(make_env, "action_space")
     player = _Player.of(policy)
-    source = {"simulator": _called(env), "policy": player.name, "first_seed": seed}
+    if file is not None:
+        player.reset()  # what it remembers of other episodes is none of what it is made of
+    source = {
+        "simulator": _called(env),
+        "policy": player.name,
+        "first_seed": seed,
+        "made_of": {"simulator": content_of(make_env), "policy": content_of(policy), "cost": content_of(cost)},
+    }
     kept = _kept_before(file, source, episodes)
     if kept is not None and _begun(kept) >= episodes:
         return kept
@@ -173,10 +181,6 @@ class _Player:
         if policy is None:
             return cls("uniform", None, lambda: None)
         name = getattr(policy, "__qualname__", type(policy).__name__)
-        code = getattr(policy, "__code__", None)
-        if code is not None:  # two lambdas have one name
-            content = code.co_code + repr(code.co_consts).encode()
-            name += "-" + hashlib.blake2b(content, digest_size=3).hexdigest()
         return cls(name, of_both(getattr(policy, "act", policy)), getattr(policy, "reset", lambda: None))
 
 
@@ -383,9 +387,24 @@ def _kept_before(file: Path | None, source: dict[str, Any], episodes: int) -> Ep
         return None
     store = EpisodeStore.load(file)
     kept = store.card.extra.get("recorded")
+    kept = kept if isinstance(kept, dict) else {}
+    made_of = kept.get("made_of")
+    for part, content in source["made_of"].items():
+        if kept.get(part) == source.get(part) and isinstance(made_of, dict) and made_of.get(part) != content:
+            raise StoreError(
+                f"'{file}' holds another recording, of a {part} whose code or values differ; delete it or name another "
+                "file."
+            )
     if kept != source:
-        raise StoreError(f"'{file}' holds another recording ({kept}, not {source}); delete it or name another file.")
+        raise StoreError(
+            f"'{file}' holds another recording ({_said(kept)}, not {_said(source)}); delete it or name another file."
+        )
     return store if store.episodes <= episodes else store.select(np.arange(store.episodes) < episodes)
+
+
+def _said(source: Mapping[str, Any]) -> str:
+    """Of whom a recording is, in words."""
+    return f"of {source.get('policy')} in {source.get('simulator')} from seed {source.get('first_seed')}"
 
 
 def _has_state(env: Any, seed: int) -> bool:
