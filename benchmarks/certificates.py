@@ -100,8 +100,8 @@ def played(setting: str, margin: float, batch: int, episodes: int) -> dict[str, 
     """The shortfall of foresight of each episode behind the setting's faults, and whether it violated."""
     from ringfence.deploy import zoo
     from ringfence.evaluation.certify import shortfalls
+    from ringfence.evaluation.compensation import compensated
     from ringfence.evaluation.rollout import rollout
-    from ringfence.evaluation.stress import compensated
     from ringfence.faults import Faults
     from ringfence.faults.policy import under_faults
     from ringfence.loading.resolve import resolve

@@ -29,8 +29,8 @@ from stress import MIDDLE, each_alone, name_of
 
 import ringfence
 from ringfence.evaluation.certify import certify
+from ringfence.evaluation.compensation import known_to_guards
 from ringfence.evaluation.replay import ReplayResult
-from ringfence.evaluation.stress import known_to_guards
 from ringfence.faults import Faults
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem import constraints

@@ -130,7 +130,8 @@ def play(trial: Trial, episodes: int, out: Path, agents: int | None) -> None:
 def play_system(folder: Path, guard: str, episodes: int, out: Path) -> None:
     """A run behind few faults: without a guard, under one, and under one that knows of them."""
     from ringfence.deploy import zoo
-    from ringfence.evaluation.stress import known_to_guards, stress
+    from ringfence.evaluation.compensation import known_to_guards
+    from ringfence.evaluation.stress import stress
     from ringfence.faults import Faults
     from ringfence.training.runs import Run
 

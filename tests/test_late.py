@@ -7,9 +7,9 @@ import ringfence
 from ringfence.cli import app
 from ringfence.datasets.audit import audit
 from ringfence.errors import StoreError, UserError
+from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.ope import estimate
 from ringfence.evaluation.replay.judge import check_view
-from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing

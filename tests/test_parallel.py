@@ -18,6 +18,7 @@ from ringfence.envs import SimpleSpread
 from ringfence.envs.episode import Episode
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
+from ringfence.evaluation import stress
 from ringfence.evaluation.certify import certify
 from ringfence.evaluation.own_trials import Foresight
 from ringfence.evaluation.play import play_tables
@@ -257,7 +258,13 @@ def test_the_command_keeps_what_it_measured_for_reports(run, tmp_path, monkeypat
     results = Run(folder).results
     assert [*results] == ["default", "default@validation"]
     assert results["default"]["simulator"] == "theirs.py:Theirs" and results["default"]["guard"] == "none"
+    app.main(["stress", str(folder), "--env", "theirs.py:Theirs", "--episodes", "2", "--delay", "2", "--split", "test"])
+    (name, stressed), *_ = stress.results(Run(folder)).items()
+    assert name.startswith("default in theirs.py:Theirs behind ") and stressed["simulator"] == "theirs.py:Theirs"
+    behind = play(folder, SimpleSpreadParallel, episodes=2, faults={"delay": 2})
+    assert stressed["per_episode"] == behind["per_episode"] and stressed["faults"] == behind["faults"]
     again = play(folder, SimpleSpreadParallel, episodes=2)
+    assert again["per_episode"] != behind["per_episode"], "late actions are others"
     assert again["per_episode"] == results["default"]["per_episode"]
     assert results["default@validation"]["per_episode"] != results["default"]["per_episode"]
     app.main(["report", str(folder), "--out", "page.html"])
@@ -289,7 +296,7 @@ def test_a_file_may_be_called_as_a_module_is(tmp_path):
 @pytest.mark.parametrize(
     "command, said",
     [
-        (["stress", "--delay", "2", "--guard", "shield"], "`ringfence play RUN --env FILE.py:NAME --delay 2`"),
+        (["stress", "--delay", "2", "--guard", "shield"], "`ringfence stress RUN --env FILE.py:NAME --delay 2`"),
         (["certify", "--delay", "2", "--out", "c.json"], "a simulator of your own (--env FILE.py:NAME), or logs"),
     ],
 )

@@ -19,10 +19,10 @@ from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import NoSafeAction, UserError
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
+from ringfence.evaluation.compensation import compensated, compensation, own_acceleration
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import compensated, compensation, own_acceleration
 from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate, digest
 from ringfence.faults.monitor import Monitor

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ringfence.errors import UserError
-from ringfence.evaluation import stress
+from ringfence.evaluation import compensation, stress
 from ringfence.evaluation.protocol import PROTOCOL
 from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate
@@ -50,7 +50,7 @@ class Trial(NamedTuple):
         }
         for found in stress.results(run).values():
             if all(found.get(name) == value for name, value in wanted.items()):
-                known = stress.COMPENSATION if self.compensated else ()
+                known = compensation.COMPENSATION if self.compensated else ()
                 asked = {k: v for k, v in found["guard_options"].items() if k not in known}
                 return {**found, "guard_options": asked}
         return None
@@ -72,7 +72,8 @@ def _rows(out: Path, certificate: Certificate | None) -> Iterator[Row]:
         run = Run(file.parent)
         seed = run.config["seed"]
         for result in stress.results(run).values():
-            if "@" in result["variant"]:  # of validation resets, or of an earlier checkpoint
+            # of validation resets, of an earlier checkpoint, or of a simulator of somebody's own
+            if "@" in result["variant"] or "simulator" in result:
                 continue
             row = {**result, "faults": Faults.of(result["faults"]).name, "seed": seed}
             row["run"] = str(file.parent.relative_to(out))

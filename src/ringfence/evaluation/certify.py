@@ -24,12 +24,13 @@ from ringfence.datasets.task import Task
 from ringfence.envs.base import NativeEnv
 from ringfence.envs.episode import Cost
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.own_trials import Own
 from ringfence.evaluation.replay.judge import Body
 from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.rollout import FORESEEN, Played, rollout
 from ringfence.evaluation.statistics import upper_bound
-from ringfence.evaluation.stress import check_simulator, compensated
+from ringfence.evaluation.stress import check_simulator
 from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
 from ringfence.faults import Faults
 from ringfence.faults.certificate import Certificate, digest

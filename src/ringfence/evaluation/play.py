@@ -14,11 +14,11 @@ import numpy as np
 from ringfence.envs.episode import EARLY_ENDS, Cost, Episode
 from ringfence.errors import LAST_SEED, Interrupted, UserError, known, whole_number
 from ringfence.evaluation import protocol, recordings, rollout
+from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
 from ringfence.evaluation.places import recording, watching
 from ringfence.evaluation.player import Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
-from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.loading.controller import Controller
 from ringfence.problem.bounds import Bounds

@@ -107,7 +107,7 @@ def _of_run(resolved: Resolved, split: str) -> RunPlayer:
         action_dim=job.spec.action_dim,
         observation_names=_names_of(resolved),
         unsafe=_unsafe_by_formula(job.hazard, job.feature_map, job.task.homogeneous),
-        about={"step": resolved.step} | evaluate.about(resolved),
+        about={"step": resolved.step, "variant": resolved.variant(split)} | evaluate.about(resolved),
         limits=resolved.run.config["data"].get("constraints") or {},
         spec=resolved.spec,
         run=resolved.run,

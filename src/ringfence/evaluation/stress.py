@@ -3,39 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
-
+from ringfence.envs.episode import Cost
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.compensation import compensated_spec
 from ringfence.evaluation.evaluate import Split, about
+from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import evaluate_policy
+from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
 from ringfence.faults.certificate import digest
-from ringfence.guards import Guard
-from ringfence.guards.correction import ASKED
-from ringfence.guards.policy import rows_foreseen
 from ringfence.loading.resolve import load_job, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run, write_json
 from ringfence.utils import schemas
 from ringfence.utils.compilation import keep_programs
-from ringfence.utils.files import writable
+from ringfence.utils.files import alone, writable
 from ringfence.utils.precision import in_float32
-from ringfence.world import World
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
-# Options by which a guard knows of faults.
-COMPENSATION = ("delay", "max_age", "hold", "others_acceleration", "horizon")
 STRESSED_ELSEWHERE = (
-    "so `ringfence stress` has nothing to play in; play it behind faults in a simulator of your own: `ringfence play "
-    "RUN --env FILE.py:NAME --delay 2`."
+    "so `ringfence stress` has nothing to play in; name a simulator of your own: `ringfence stress RUN --env "
+    "FILE.py:NAME --delay 2`."
 )
-GuardOf = Callable[[PolicySpec], Guard]
-MAX_AGE = 8  # steps up to which a compensating guard makes good for observations that were lost
 
 
 @in_float32
@@ -48,10 +41,14 @@ def stress(
     planner: str = "default",
     checkpoint: int | None = None,
     compensate: bool = False,
+    make_env: Callable[[], Any] | None = None,
+    cost: Cost | None = None,
     quiet: bool = True,
     **options: Any,
 ) -> dict[str, Any]:
     """Evaluate a run behind faults, on the same resets as `evaluate`, and add the result to its stress.json.
+
+    With `make_env` it is played in a simulator of one's own, and `cost` is of its infos, both as in `play`.
 
     faults: a `Faults`, or its fields by name. `compensate` tells the guard of the delay, that observations may be old
     where they are dropped, that actions are held where agents act in turn, and what others can do meanwhile; by
@@ -59,9 +56,17 @@ def stress(
     """
     faults = faults if isinstance(faults, Faults) else Faults.of(faults or {})
     options |= {"checkpoint": checkpoint, "planner": planner}
-    return stress_spec(
-        PolicySpec.of(run, **options), faults, episodes=episodes, split=split, compensate=compensate, quiet=quiet
-    )
+    spec = PolicySpec.of(run, **options)
+    how: dict[str, Any] = {"episodes": episodes, "split": split, "compensate": compensate, "quiet": quiet}
+    if make_env is None:
+        if cost is not None:
+            raise UserError("cost is of the infos of a simulator of one's own; give make_env=, or leave cost out.")
+        return stress_spec(spec, faults, **how)
+    file = writable(Run.of(run).path / FILE)
+    result = play(run, make_env, faults=faults, cost=cost, **how, **options)
+    result |= {"faults": dataclasses.asdict(faults), "asked": spec.name, "compensated": compensate}
+    result |= {"simulator": name_of(make_env)}
+    return _added(file, result, f"{result['variant']} in {result['simulator']}", faults)
 
 
 def stress_spec(
@@ -79,7 +84,6 @@ def stress_spec(
     check_simulator(spec, STRESSED_ELSEWHERE)
     resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
-    kept = results(resolved.run)
     name = f"{resolved.variant(split)} behind {faults.name}" + (", which it knows" if compensate else "")
     seed = resolved.run.config["seed"]
     result, _ = evaluate_policy(
@@ -89,7 +93,14 @@ def stress_spec(
     result |= {"asked": spec.name, "compensated": compensate} | about(resolved)
     if resolved.guard is not None:
         result["digests"] = {"policy": digest(resolved.proposal), "world": digest(resolved.guard.world)}
-    write_json(file, kept | {name: result})
+    return _added(file, result, resolved.variant(split), faults)
+
+
+def _added(file: Path, result: dict[str, Any], played: str, faults: Faults) -> dict[str, Any]:
+    """The result, beside the others of a run by what was played."""
+    name = f"{played} behind {faults.name}" + (", which it knows" if result["compensated"] else "")
+    with alone(file.with_name(".results.lock")):
+        write_json(file, results(Run(file.parent)) | {name: result})
     return result
 
 
@@ -106,96 +117,3 @@ def results(run: Run) -> dict[str, dict[str, Any]]:
     """What a run's stress.json holds, by who played and behind which faults; nothing where there is none."""
     file = run.path / FILE
     return schemas.read(file, dict[str, dict[str, Any]], "is damaged; delete that file") if file.exists() else {}
-
-
-def compensated(
-    run: Run | str | None, faults: Faults, options: Mapping[str, Any], guard_of: GuardOf | None = None
-) -> dict[str, Any]:
-    """Options of a guard that knows of faults; `guard_of` makes that of a spec without a run."""
-    compensation(faults, options)  # what cannot be is refused in these words first
-    return {**options, **_missing_options(PolicySpec.of(run, **options), faults, guard_of or _guard_of_run)}
-
-
-def compensated_spec(spec: PolicySpec, faults: Faults) -> PolicySpec:
-    """The same choices with a guard that knows of faults."""
-    return spec.with_guard_options(**_missing_options(spec, faults, _guard_of_run))
-
-
-def _guard_of_run(spec: PolicySpec) -> Guard:
-    guard = resolve(spec).guard
-    assert guard is not None, "checked before"
-    return guard
-
-
-def _missing_options(spec: PolicySpec, faults: Faults, guard_of: GuardOf) -> dict[str, Any]:
-    """Options of a spec's guard that it lacks to know of faults, for the World that it reads."""
-    given = dict(spec.guard_options)
-    found = compensation(faults, {"guard": spec.guard, **given})
-    late = bool({"delay", "max_age"} & {*found, *given})
-    seldom = _steps_between(faults) > 1 and not {"horizon", "horizon_seconds"} & {*given}
-    if not late and not seldom:
-        return found
-    guard = guard_of(spec)
-    own = guard.world.card.data.action_delay  # of the machine itself
-    if "delay" in found:
-        found["delay"] += own
-    if "max_age" in found:
-        found["max_age"] = min(found["max_age"], max(rows_foreseen(guard.world) - found.get("delay", own), 0))
-    if late and "others_acceleration" not in given:
-        found["others_acceleration"] = own_acceleration(guard.world)
-    rows = min(math.ceil(ASKED * _steps_between(faults) - 1e-9), rows_foreseen(guard.world))
-    if seldom and rows > guard.options.horizon:
-        found["horizon"] = rows
-    return found
-
-
-def _mean_age(jitter: int) -> float:
-    """Steps by which what is done is late in the mean, where an action may be late by up to `jitter`, each as likely,
-    and a newer one overtakes it: the sum of the chances that none of the last k has arrived."""
-    left = [(jitter - k) / (jitter + 1) for k in range(jitter)]
-    return float(np.cumprod(left).sum())
-
-
-def _steps_between(faults: Faults) -> float:
-    """Steps from one decision to the next that is another, or from one observation to the next, in the mean."""
-    return max(1 / (1 - faults.asynchrony), 1 / (1 - faults.drop))
-
-
-def known_to_guards(faults: Faults) -> bool:
-    """Whether a guard that knows of these faults has other options than one that does not."""
-    return bool(compensation(faults, {"guard": "shield"})) or _steps_between(faults) > 1
-
-
-def compensation(faults: Faults, options: Mapping[str, Any]) -> dict[str, Any]:
-    """What faults alone say to a guard, as its options."""
-    guarded = options.get("guard", "none") != "none"
-    if not guarded:
-        raise UserError("compensate is read by nothing without a guard; name one with guard=, e.g. shield.")
-    delay = faults.delay + round(_mean_age(faults.jitter))
-    found = {
-        "delay": delay,
-        "max_age": max(MAX_AGE - delay, 0) if faults.drop else 0,
-        "hold": round(1 / (1 - faults.asynchrony)),
-    }
-    twice = sorted(found.keys() & options.keys())
-    if twice:
-        raise UserError(f"compensate and {twice[0]} both tell the guard of it; give one of them.")
-    usual = {"delay": 0, "max_age": 0, "hold": 1}
-    return {name: value for name, value in found.items() if value != usual[name]}
-
-
-def own_acceleration(world: World) -> float:
-    """m/s² that an agent can change its velocity by, as the World predicts it of one in the mean of the logs; 0 where
-    it does not know how long a step takes. Others of its kind can do as much."""
-    names = world.map.names
-    speeds = [names.index(f"own.v{axis}") for axis in "xyz" if f"own.v{axis}" in names]
-    if world.map.dt is None or not speeds:
-        return 0.0
-    spec = world.spec
-    pushes = np.concatenate([np.eye(spec.action_dim), -np.eye(spec.action_dim)]).astype(np.float32)
-    before = jnp.broadcast_to(world.dynamics.mean, (len(pushes), spec.n_agents, len(names)))
-    before = before.at[..., np.array(speeds)].set(0.0)
-    action = jnp.broadcast_to(jnp.asarray(pushes)[:, None], (len(pushes), spec.n_agents, spec.action_dim))
-    after, _ = world.dynamics.step(before, action)
-    change = np.asarray((after - before)[..., np.array(speeds)])
-    return round(float(np.linalg.norm(change, axis=-1).max()) / world.map.dt, 2)

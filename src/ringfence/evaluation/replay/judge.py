@@ -13,13 +13,13 @@ import numpy as np
 from ringfence.datasets import registry
 from ringfence.datasets.task import Task
 from ringfence.errors import LAST_SEED, UserError, known, whole_number
+from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.replay.drivers import DRIVERS
 from ringfence.evaluation.replay.motion import kinematics_of
 from ringfence.evaluation.replay.result import Film, ReplayResult, Row
 from ringfence.evaluation.replay.scene import NOBODY, Motion, motion_of, names_of, require_replayable, windows_of
 from ringfence.evaluation.replay.stage import Driven, Stage
 from ringfence.evaluation.rollout import FORESEEN
-from ringfence.evaluation.stress import compensated
 from ringfence.faults import Faults
 from ringfence.guards import GUARDS, Guard
 from ringfence.guards.policy import Guarded, build
