@@ -435,7 +435,7 @@ def test_broken_checkpoints_are_refused(trained, small_store, tmp_path, caplog):
 
 
 def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
-    from ringfence.training import runs
+    from ringfence.utils import pytrees
 
     run = Run(tmp_path / "copy")
     shutil.copytree(trained["bc"].path, run.path)
@@ -444,7 +444,7 @@ def test_full_disk_keeps_the_last_checkpoint(trained, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(runs, "save_file", full)
+    monkeypatch.setattr(pytrees, "save_file", full)
     with pytest.raises(UserError, match="free some space"):
         run.save_checkpoint(99, {"x": jnp.zeros(2)})
     assert [s for s, _ in run.checkpoints()] == before

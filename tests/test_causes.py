@@ -31,12 +31,22 @@ from ringfence.world import (
     save,
     verdict,
 )
-from ringfence.world.card import Avoidable, BarrierScores, Card, Data, Foresight, PredictionError, Verdict
+from ringfence.world.card import (
+    Avoidable,
+    BarrierScores,
+    Card,
+    Data,
+    Foresight,
+    PredictionError,
+    ValueScores,
+    Verdict,
+)
 from ringfence.world.cause_nets import FAR, LEAST, blank, scores, values_of, with_margin
 from ringfence.world.causes import Cause, Edge, Found
 from ringfence.world.cells import Cells
 from ringfence.world.heading import Heading
 from ringfence.world.logged import Logged, held_out, labels_of
+from ringfence.world.look import look_of
 from tests.quick import QUICK_WORLD, judge_in_full
 
 N, STEPS = 3, 40
@@ -557,7 +567,7 @@ def test_a_world_that_is_unfit_is_refused_unless_one_insists():
     chance = np.random.default_rng(3)
     world = fit(store_of(80, lambda why: chance.random(why.shape[:3]) < 0.02), **QUICK_WORLD)
     assert world.card.verdict.word == "unfit" and world.card.causes == {"": Found()}, "no cause explains chance"
-    assert "name the entries that tell danger, or log them" in world.card.verdict.remedies
+    assert any(remedy.startswith("log what tells danger") for remedy in world.card.verdict.remedies), "all are named"
     still = lambda observations, state: np.zeros((N, 2))  # noqa: E731
     with pytest.raises(UserError, match="'walks' is unfit to guard by: only .*anyway=True"):
         guard(still, world)
@@ -579,6 +589,20 @@ def test_verdicts_give_their_reasons():
     for changes, word, reason in cases:
         found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, **changes)))
         assert found.word == word and found.reasons == (reason,) and found.remedies
+    of_cause = Cause("own.x", ((0,),))
+    for told, recall, word in ((0.59, 0.96, "unfit"), (0.9, 0.96, "weak"), (0.59, 1.0, "fit"), (0.96, 0.96, "fit")):
+        causes = {"": Found((of_cause,), told)}
+        found = verdict.judge(Card(data=data, barrier=msgspec.structs.replace(good, recall=recall), causes=causes))
+        assert found.word == word and (word == "fit" or f"tell only {told:.1%} of the danger" in found.reasons[0])
+        assert word == "fit" or "a sum or an area over the team" in found.remedies[0]
+    for names, remedy in (
+        (("obs0", "obs1"), "name the entries that tell danger, or log them"),
+        (("own.x", "own.y"), "log what tells danger, if it is not among the entries, or give a formula"),
+    ):
+        known = PredictionError(steps_ahead=(1,), error_of_change=(0.1,), by_entry=dict.fromkeys(names, (0.1,)))
+        missed = msgspec.structs.replace(good, recall=0.5)
+        found = verdict.judge(Card(data=data, barrier=missed, prediction_error=known))
+        assert found.remedies[0].startswith(remedy)
     for error, word, reason in (
         (0.95, "weak", "constant velocity errs by 90%"),
         (1.3, "unfit", "err by 1.3 times as much as what they predict changes at all"),
@@ -587,6 +611,30 @@ def test_verdicts_give_their_reasons():
         blind = PredictionError(steps_ahead=(1,), error_of_change=(error,), by_entry={}, coasting=(0.9,))
         found = verdict.judge(Card(data=data, barrier=good, prediction_error=blind))
         assert found.word == word and reason in found.reasons[0]
+
+
+def test_the_number_that_is_too_few_is_said():
+    """Entries into danger, of which there is one: its episode is unsafe for thirty steps."""
+
+    def four_stay_in_danger(why):
+        unsafe = np.zeros(why.shape[:3], bool)
+        unsafe[:4, 10:] = True
+        return unsafe
+
+    scores = fit(store_of(80, four_stay_in_danger), **QUICK_WORLD).card.barrier
+    assert scores.warning.startswith("too few held-out steps enter danger (1) to say how well")
+
+
+@pytest.mark.verdicts
+def test_values_that_are_worse_than_none_are_not_climbed(small_world):
+    """By `anyway` they are; who does not climb them is not asked."""
+    card = msgspec.structs.replace(small_world.card, values=ValueScores(0.5, -0.274), verdict=Verdict("fit"))
+    misled = dataclasses.replace(small_world, card=card)
+    assert "returns-to-go are predicted worse than by their mean: guards that climb them" in str(card)
+    still = lambda observations, state: np.zeros((3, 2))  # noqa: E731
+    with pytest.raises(UserError, match="returns-to-go worse than by their mean, and this guard climbs them"):
+        guard(still, misled, guard="full")
+    assert guard(still, misled, guard="full", anyway=True) and guard(still, misled, guard="shield")
 
 
 def test_a_world_of_before_says_that_it_has_no_verdict():
@@ -798,11 +846,15 @@ def test_no_card_asks_for_more_rows_than_a_planner_plans():
 def test_a_guard_looks_as_far_as_the_card_asks(fitted):
     from ringfence.guards.policy import by_card
 
+    def asked(card):
+        card = msgspec.structs.replace(card, look=look_of(card))
+        return by_card(dataclasses.replace(fitted, card=card), "shield", {})
+
     def seen(rows, avoided, error):
         barrier = BarrierScores(avoidable=Avoidable(before=(1, 3, 10), avoided=avoided, rows=rows))
         prediction = PredictionError(steps_ahead=(8,), error_of_change=(error,), by_entry={})
         card = Card(data=Data("walks", {}), barrier=barrier, prediction_error=prediction)
-        return by_card(dataclasses.replace(fitted, card=card), "shield", {})
+        return asked(card)
 
     assert seen(10, (0.1, 0.4, 0.9), 0.1) == {"horizon": 10}
     assert seen(3, (0.1, 0.9, 0.9), 0.1) == {}, "three rows see nearly all"
@@ -812,7 +864,7 @@ def test_a_guard_looks_as_far_as_the_card_asks(fitted):
         read = [Foresight(str(error), (4, 10, 20), error, error, 1.0) for error in errors]
         error = PredictionError(steps_ahead=(8,), error_of_change=(0.8,), by_entry={}, read=tuple(read))
         card = Card(data=Data("walks", {}), barrier=BarrierScores(widening=wide), prediction_error=error)
-        return by_card(dataclasses.replace(fitted, card=card), "shield", {}).get("horizon")
+        return asked(card).get("horizon")
 
     assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.3)) == 15
     assert foreseen((0.1, 0.1, 0.2), (0.0, 0.1, 0.4)) == 10, "as far as all that is read is foreseen"

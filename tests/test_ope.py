@@ -81,6 +81,13 @@ def test_a_result_says_what_the_policy_does(run, logs, world):
     assert any("the guard steps in" in line for line in result.summary())
 
 
+def test_a_guard_without_a_world_is_refused_before_one_is_fitted(run, logs, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(worlds, "fit", lambda *_, **__: pytest.fail("a World was fitted"))
+    with pytest.raises(SystemExit):
+        app.main(["ope", str(run.path), str(logs.save(tmp_path / "line.h5")), "--guard", "shield"])
+    assert "needs the World of its data, which is not there" in capsys.readouterr().err
+
+
 def test_others_logs_and_worlds_are_refused(run, logs, world):
     other = dataclasses.replace(logs, card=logs.card.updated(task="circle"))
     with pytest.raises(UserError, match="The run is of 'line', the logs are of 'circle'"):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -100,3 +103,26 @@ def test_bounds_hold_as_narrow_as_they_are():
         true = true @ np.asarray(weight[0], float) + np.asarray(bias[0], float)
         true = np.maximum(true, 0) if layer < 2 else true
     assert ((low <= true) & (true <= high)).all() and (high - low).mean() < 1e-3
+
+
+def test_a_forked_process_is_refused_where_it_would_wait_for_ever():
+    """After its parent has worked, not before; a child of its own kind goes on."""
+    code = """
+import os
+from ringfence.errors import UserError
+from ringfence.utils.precision import in_float32
+@in_float32
+def work():
+    return 5
+def forked():
+    child = os.fork()
+    if not child:
+        try:
+            os._exit(work())
+        except UserError as error:
+            os._exit(7 if "spawn" in str(error) else 8)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+print(forked(), work(), forked(), work())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split() == ["5", "5", "7", "5"], done.stderr

@@ -1,18 +1,23 @@
 """The World: what is learned of the logs before and without a policy."""
 
 import dataclasses
+import shutil
+import types
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from safetensors import SafetensorError
 
 from ringfence import guards, world
+from ringfence.cli import app
 from ringfence.datasets import registry
 from ringfence.envs import SimpleSpread
 from ringfence.errors import UserError
 from ringfence.guards.wrap import Nothing
+from ringfence.loading import run_worlds
 from ringfence.problem import constraints, features
 from ringfence.problem.features import FeatureMap
 from ringfence.training import worlds
@@ -38,6 +43,61 @@ def test_a_world_is_fitted_once_and_survives_its_file(small_store, small_world, 
     (tmp_path / "w.safetensors").write_bytes(b"none")
     with pytest.raises(UserError, match="is no World that can be read"):
         worlds.load(tmp_path / "w.safetensors")
+
+
+def test_a_world_of_other_data_in_the_cache_is_not_taken(small_store, tmp_path, monkeypatch):
+    """Nor a part of one, which somebody has put under its name."""
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
+    other = dataclasses.replace(small_store, costs=np.roll(small_store.costs, 3, 0))
+    theirs = worlds.fit(other, **QUICK_WORLD)
+    names = {file.name for file in (tmp_path / "worlds").iterdir()}
+    mine = worlds.fit(small_store, **QUICK_WORLD)
+    added = {file.name for file in (tmp_path / "worlds").iterdir()} - names
+    for kind in ("world", "future"):
+        (here,) = (name for name in added if name.startswith(kind))
+        (there,) = (name for name in names if name.startswith(kind))
+        shutil.copy(tmp_path / "worlds" / there, tmp_path / "worlds" / here)
+    again = worlds.fit(small_store, **QUICK_WORLD)
+    assert again.card.data.content == small_store.content != theirs.card.data.content
+    for a, b in zip(jax.tree.leaves(mine), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_world_of_other_data_in_a_run_is_refused(small_store, small_world, tmp_path):
+    """Though its task is called the same, and its agents act alike."""
+    world.save(small_world, tmp_path / "guard.safetensors")
+    config = {"task": small_store.card.task, "seed": 0, "spec": {"action_dim": 2}}
+    mine, others = (
+        types.SimpleNamespace(path=tmp_path, config=config | {"data": {"content": content}})
+        for content in (small_store.content, "another")
+    )
+    assert run_worlds.for_guard(mine, "centralized").card == small_world.card
+    with pytest.raises(UserError, match="is a World of '.*', the run is of other data"):
+        run_worlds.for_guard(others, "centralized")
+
+
+@pytest.mark.parametrize("change", [{"miscoverage": 2}, {"miscoverage": -1}, {"miscoverage": "nan"}, {"discount": 1.5}])
+def test_settings_are_refused_before_any_data_is_made(change, capsys, monkeypatch):
+    monkeypatch.setattr("ringfence.datasets.make.make", lambda *_, **__: pytest.fail("data were made"))
+    (name,) = change
+    with pytest.raises(SystemExit):
+        app.main(["fit", "simple_spread-expert", "--set", f"{name}={change[name]}"])
+    assert f"{name}=" in capsys.readouterr().err
+
+
+def test_a_cache_that_takes_no_world_is_said(small_store, monkeypatch, tmp_path):
+    """Before anything is fitted, or, where the disk fills meanwhile, in a sentence; either names what to set."""
+    full = SafetensorError("Error while serializing: No space left on device (os error 28)")
+    with monkeypatch.context() as patch:
+        patch.setenv("RINGFENCE_HOME", "/proc/nothing")
+        patch.setattr("ringfence.world.fit.Logged.of", lambda *_: pytest.fail("it was begun"))
+        with pytest.raises(UserError, match="could not be written.*; set RINGFENCE_HOME to another folder"):
+            worlds.fit(small_store, **QUICK_WORLD)
+    monkeypatch.setenv("RINGFENCE_HOME", str(tmp_path))
+    monkeypatch.setattr("ringfence.utils.pytrees.save_file", lambda *_, **__: (_ for _ in ()).throw(full))
+    with pytest.raises(UserError, match="No space left.*free some space or set RINGFENCE_HOME"):
+        worlds.fit(small_store, **QUICK_WORLD)
+    assert not list(tmp_path.rglob("*.safetensors")) and not list(tmp_path.rglob("*.part"))
 
 
 def test_two_loads_of_a_world_are_one_to_the_compiler(small_world, tmp_path):

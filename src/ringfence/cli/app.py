@@ -130,9 +130,10 @@ def fit(
     from ringfence.training import worlds
 
     report = None if report is None else writable(report)
-    store = _store(data)
+    out_file = None if out_file is None else writable(out_file)
     settings: dict[str, Any] = dict(assignments(set))
-    print("Some minutes: values, rewards, dynamics, danger now and to come, then the card.", file=sys.stderr)
+    worlds.check(seed, settings)
+    store = _store(data)
     made = worlds.fit(store, seed=seed, execution=execution, quiet=False, **settings)
     out.print(lines(str(made.card)), soft_wrap=True)
     if out_file is not None:
@@ -336,9 +337,11 @@ def stress(
     checkpoint: int | None = None,
     wrong: Wrong = NO_FAULTS,
     compensate: bool = False,
+    env: str | None = None,
     playing: How = AS_IT_IS,
 ) -> None:
-    """Play a trained policy behind faults, on the resets of `ringfence eval`; kept in the run's stress.json.
+    """Play a trained policy behind faults, on the resets of `ringfence eval` or in a simulator of your own; kept in the
+    run's stress.json.
 
     Args:
         runs: run folders, or folders that hold some.
@@ -347,7 +350,9 @@ def stress(
         checkpoint: step of the one that is played; the last one by default.
         compensate: tell the guard of late actions, old observations and actions that are held, which it then makes
             good for.
+        env: what makes a simulator of your own, as FILE.py:NAME or MODULE:NAME. It is run.
     """
+    from ringfence.evaluation.simulators import simulator
     from ringfence.evaluation.stress import stress as run_stress
 
     faults = wrong.faults()
@@ -358,6 +363,7 @@ def stress(
         "split": split,
         "checkpoint": checkpoint,
         "compensate": compensate,
+        "make_env": None if env is None else simulator(env),
         "quiet": False,
     }
     names = ("guard", "return", "cost", "unsafe episodes (95 % ≤)", "infeasible")
@@ -503,13 +509,13 @@ def ope(
     sizes = {"states": states, "transitions": transitions, "updates": updates, "seed": seed}
     evaluation.check_sizes(**sizes)
     store = _store(data)
-    evaluation.check(found, store)
-    world = worlds.fit(store, seed=seed + 1, execution=PolicySpec.of(found, **given).execution, quiet=False)
-    result = evaluation.ope(found, store, evaluation_world=world, quiet=False, **sizes, **given)
+    result = evaluation.ope(found, store, quiet=False, **sizes, **given)
     for line in result.summary():
         out.print(lines(line), soft_wrap=True)
     if report is not None:
-        print(build_ope(report, world.card, audit(store), result))
+        execution = PolicySpec.of(found, **given).execution
+        evaluated_by = worlds.fit(store, seed=seed + 1, execution=execution)  # the one that did, from the cache
+        print(build_ope(report, evaluated_by.card, audit(store), result))
 
 
 def replay(

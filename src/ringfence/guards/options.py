@@ -9,6 +9,7 @@ from msgspec import Meta
 
 from ringfence.errors import UserError
 from ringfence.utils.config import NonNegative, check_bounds
+from ringfence.world.card import JUDGED
 
 Samples = Annotated[int, Meta(ge=1, le=10_000)]
 Rounds = Annotated[int, Meta(ge=0, le=10**6)]
@@ -35,7 +36,7 @@ class GuardOptions:
     correction_steps: Rounds = 0  # rounds of correction; 0: none
     correction_restarts: Few = 0  # times that one which falls short is begun again from fixed plans
     max_correction: Distance = 2.0  # how far the shield may take an action from what it was; 2: anywhere
-    horizon: Samples = 3  # predicted rows that are judged
+    horizon: Samples = JUDGED  # predicted rows that are judged
     horizon_seconds: Horizon = 0.0  # the same in seconds, where logs say how long a step is; 0: as many as `horizon`
     condition: Literal["margin", "retain"] = "margin"  # retain: h(ŝ_{k+1}) ≥ (1 − α) h(ŝ_k)
     alpha: Fall = 0.5  # share of what is left of the distance that one step may use up

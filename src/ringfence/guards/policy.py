@@ -29,12 +29,9 @@ from ringfence.utils.config import build_config
 from ringfence.utils.given import cost_given
 from ringfence.utils.precision import full_products
 from ringfence.world import World
-from ringfence.world.card import FARTHEST, Avoidable, Foresight
-from ringfence.world.verdict import require
+from ringfence.world.card import FARTHEST, Look
+from ringfence.world.verdict import require, require_values
 
-LITTLE = 0.9  # of what could be avoided: where three rows avoid less, V sees in time what they do not
-BEARABLE = 0.3  # error of predictions as a share of what changes, or of what is read, up to which more rows count
-KEPT = 0.9  # of the safe steps: cars and discs are at 0.94 and more, robots, whose logs are too fast, at 0 to 0.8
 HORIZONS = ("horizon", "horizon_seconds")  # two ways to say how far a guard looks
 BY_CARD = ("shield", "adapt", "full")  # guards that do what the card asks for
 
@@ -287,51 +284,18 @@ def by_card(world: World, name: str, changes: Mapping[str, Any]) -> dict[str, An
         return {}
     asked = {"within_logs": True} if Shown.known(world) else {}
     if not {*HORIZONS, "terminal_value"} & set(changes):
-        asked |= _far_sighted(world, GUARDS[name].get("horizon", GuardOptions().horizon))
+        asked |= _far_sighted(world.card.look or Look(), GUARDS[name].get("horizon", GuardOptions().horizon))
     return asked
 
 
-def _far_sighted(world: World, least: int) -> dict[str, Any]:
-    """As many rows as what the barrier reads is predicted well for; else as many as avoiding takes, and at least so
-    many, where all that changes is, or the value of danger after the last row, where that leaves nearly all safe steps
-    their margin."""
-    if (foreseen := _rows_foreseen_well(world)) > least:
-        return {"horizon": foreseen}
-    scores = world.card.barrier
-    if scores is None or scores.avoidable is None or not _too_late(scores.avoidable):
-        return {}
-    error = world.card.prediction_error
-    if error is not None and error.error_of_change[-1] <= BEARABLE:
-        return {"horizon": max(min(scores.avoidable.rows, FARTHEST), least)}
-    return {"terminal_value": True} if scores.ahead_kept >= KEPT else {}
-
-
-def _rows_foreseen_well(world: World) -> int:
-    """Rows, FARTHEST at most, for which all that the barrier reads is predicted well; margins widen along them."""
-    error = world.card.prediction_error
-    read = () if error is None else error.read
-    if not read or world.card.barrier is None or not _widens(world):
-        return 0
-    steps = [k for at, k in enumerate(read[0].steps_ahead) if all(_is_foreseen(one, at) for one in read)]
-    return min(max(steps, default=0), FARTHEST)
-
-
-def _is_foreseen(one: Foresight, at: int) -> bool:
-    return one.error[at] <= BEARABLE * one.deviation
-
-
-def _widens(world: World) -> bool:
-    """Whether the World says what rows ahead ask for; those of before do not."""
-    card = world.card
-    return all(one.widening for one in (card.constraints or {"": card.barrier}).values() if one is not None)
-
-
-def _too_late(avoidable: Avoidable) -> bool:
-    """Whether the rows that a guard predicts avoid little of the danger that could have been avoided, e.g. where
-    braking takes longer."""
-    horizon = GuardOptions().horizon
-    seen = [share for before, share in zip(avoidable.before, avoidable.avoided) if before <= horizon]
-    return max(seen, default=0.0) < LITTLE * max(avoidable.avoided)
+def _far_sighted(look: Look, least: int) -> dict[str, Any]:
+    """As many rows as what the barrier reads is predicted well for; else as many as avoiding danger takes, and at least
+    so many, or the value of danger after the last row."""
+    if look.rows > least:
+        return {"horizon": look.rows}
+    if look.avoiding:
+        return {"horizon": max(look.avoiding, least)}
+    return {"terminal_value": True} if look.terminal_value else {}
 
 
 def build(
@@ -362,6 +326,8 @@ def build(
             f"guard='{name}' does nothing; name one that does: {', '.join(g for g in GUARDS if g != name)}."
         )
     _refuse_far(options, world)
+    if options.optimizer_steps:
+        require_values(world.card, anyway)
     if options.others_acceleration and world.map.dt is None:
         raise UserError(
             "others_acceleration needs a World of agents that see for themselves and know how long a step takes; leave "

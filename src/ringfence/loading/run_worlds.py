@@ -21,13 +21,12 @@ def of_run(run: Run, quiet: bool = True) -> World:
 
 
 def _kept(run: Run, file: Path) -> World:
-    """A World in the run's folder, which must be of the run's task."""
+    """A World in the run's folder, which must be of the run's data."""
     found = load(file)
-    task = run.config["task"]
-    if found.card.data.task != task or found.spec.action_dim != run.config["spec"]["action_dim"]:
+    if not _is_of_same_data(run, found) or found.spec.action_dim != run.config["spec"]["action_dim"]:
         raise UserError(
-            f"'{file}' is a World of '{found.card.data.task}', the run is of '{task}'; put the run's own World there, "
-            "or delete that file."
+            f"'{file}' is a World of '{found.card.data.task}', the run is of other data ('{run.config['task']}'); put "
+            "the run's own World there, or delete that file."
         )
     _of_same_origins(run, found)
     return found
@@ -84,6 +83,12 @@ def of_data(run: Run, execution: str | None, quiet: bool = True) -> World:
     return fit(store, seed=config["seed"], execution=execution, quiet=quiet)
 
 
+def _is_of_same_data(run: Run, world: World) -> bool:
+    """Whether a World is of the task of a run, and of the same arrays, where the run tells which these are."""
+    there = world.card.data
+    return run.config["task"] == there.task and run.config["data"].get("content") in (None, there.content)
+
+
 def _of_same_origins(run: Run, world: World) -> None:
     """Refuse a World of logs that were moved otherwise: it would take other numbers for the same place."""
     origins = Origins.of(run.config["data"])
@@ -98,14 +103,10 @@ def _of_same_origins(run: Run, world: World) -> None:
 
 def _of_same(run: Run, world: World, execution: str) -> None:
     """Refuse a World of other data, or of another execution."""
-    config = run.config
-    here = config["data"].get("content")
-    there = world.card.data
-    apart = config["task"] != there.task or (here is not None and here != there.content)
-    if apart:
+    if not _is_of_same_data(run, world):
         raise UserError(
-            f"The World is of '{there.task}', the run '{run.path}' of other data ('{config['task']}'); fit one to the "
-            "data that the run was trained on."
+            f"The World is of '{world.card.data.task}', the run '{run.path}' of other data ('{run.config['task']}'); "
+            "fit one to the data that the run was trained on."
         )
     _of_same_origins(run, world)
     if world.alone != (execution == "decentralized"):

@@ -21,13 +21,12 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
 
 from ringfence.errors import CheckpointError, UserError
 from ringfence.types import PyTree
 from ringfence.utils import schemas
 from ringfence.utils.files import alone, regular, whole
-from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
+from ringfence.utils.pytrees import as_tree, digest_of, named_arrays, save_named
 
 _log = logging.getLogger(__name__)
 
@@ -141,12 +140,8 @@ class Run:
         """Write the state's arrays; a full disk or an interruption leaves the previous checkpoint as it was."""
         final = self.path / "ckpt" / f"step-{step:08d}.safetensors"
         arrays = named_arrays(state)
-        with whole(final) as temporary:
-            try:
-                # one entry: safetensors writes several in any order, and a run is the same to the byte
-                save_file(arrays, temporary, {"digest": digest_of(sorted(arrays.items()))})
-            except SafetensorError as error:  # its own wrapping of the operating system's error
-                raise OSError(str(error)) from error
+        # one entry: safetensors writes several in any order, and a run is the same to the byte
+        save_named(final, arrays, {"digest": digest_of(sorted(arrays.items()))})
         for _, old in self.checkpoints()[:-KEEP]:
             old.unlink(missing_ok=True)
         return final

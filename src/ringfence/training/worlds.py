@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from ringfence.datasets import registry
 from ringfence.datasets.audit import odd_danger, odd_names
@@ -16,9 +18,10 @@ from ringfence.problem import constraints, features
 from ringfence.utils.compilation import keep_programs
 from ringfence.utils.config import build_config
 from ringfence.utils.precision import in_float32
+from ringfence.utils.progress import Parts
 from ringfence.world import Settings, World
 from ringfence.world import load as load_world
-from ringfence.world.fit import fit_view
+from ringfence.world.fit import expected, fit_view
 
 WORLD = "world.safetensors"  # in a run folder: the World that training read
 GUARD = "guard.safetensors"  # and the one that guards, where that is kept there and is another
@@ -57,6 +60,13 @@ def usual(task: Task, execution: str) -> dict:
     }
 
 
+def check(seed: int, changes: Mapping[str, Any]) -> int:
+    """The seed, if it is one and if these are settings of a World; refused before any data is made or read."""
+    usual = {"execution"} if changes.get("execution") is None else set()  # as the task has it
+    build_config(Settings, {name: changes[name] for name in changes.keys() - usual}, "the World")
+    return whole_number("seed", seed, 0, LAST_SEED)
+
+
 @in_float32
 def fit(
     store: EpisodeStore,
@@ -75,19 +85,21 @@ def fit(
     keep_programs()
     if not isinstance(store, EpisodeStore):
         raise UserError(f"fit() got data of type {type(store).__name__}; pass an EpisodeStore.")
-    seed = whole_number("seed", seed, 0, LAST_SEED)
+    seed = check(seed, changes)
     require_resolved(store)
     task = task or registry.from_store(store)
     settings, store = settings_for(store, task, **changes), task.logs(store)
-    map = task.feature_map(settings.view, store, team=settings.execution == "centralized")
-    spec = task.spec(map, store)
     needed = settings.labels == "formula" and settings.barrier
     for note in odd_names(store) if needed else odd_danger(store, task):
         warnings.warn(note, stacklevel=3)  # before minutes are spent
-    bind = constraints.bind if needed else constraints.bind_or_none
-    hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
-    how = {"hazard": hazard, "seed": seed, "cached": cached, "quiet": quiet}
-    return fit_view(store, map, spec, settings, **how, search=searched.false_safe)
+    with Parts(f"World of '{store.card.task}'", expected(settings, len(store.limits)), quiet) as bar:
+        with bar.part("reading"):
+            map = task.feature_map(settings.view, store, team=settings.execution == "centralized")
+            spec = task.spec(map, store)
+            bind = constraints.bind if needed else constraints.bind_or_none
+            hazard = bind(task.hazard, spec.feature_names, spec.n_agents)
+        how = {"hazard": hazard, "seed": seed, "cached": cached, "bar": bar}
+        return fit_view(store, map, spec, settings, **how, search=searched.false_safe)
 
 
 @in_float32

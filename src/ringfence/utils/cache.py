@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
@@ -21,3 +22,11 @@ def cache_dir() -> Path:
     if not found.is_absolute():
         raise UserError("This user has no home folder to keep data in; set RINGFENCE_HOME to a folder.")
     return found
+
+
+def elsewhere(path: Path) -> str:
+    """What helps where a file cannot be written: who chose its place chooses another."""
+    with suppress(UserError):
+        if path.absolute().is_relative_to(cache_dir().absolute()):
+            return "set RINGFENCE_HOME to another folder"
+    return "choose another place"

@@ -16,6 +16,7 @@ import numpy as np
 from filelock import FileLock
 
 from ringfence.errors import UserError
+from ringfence.utils.cache import elsewhere
 
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)  # a file system without locks: one process is up to the user
 LONGEST = 200  # bytes of a name: what is written beside it has a longer one
@@ -43,7 +44,7 @@ def whole(path: str | os.PathLike) -> Iterator[Path]:
     except OSError as error:
         _remove(temporary)
         why = str(error).splitlines()[0]  # some libraries say it in many lines
-        raise UserError(f"'{path}' could not be written ({why}); free some space or choose another place.") from error
+        raise UserError(f"'{path}' could not be written ({why}); free some space or {elsewhere(path)}.") from error
     except BaseException:
         _remove(temporary)
         raise
@@ -66,9 +67,9 @@ def writable(path: str | os.PathLike) -> Path:
     if not kind_fits:
         raise UserError(f"'{path}' is no regular file; choose another place.")
     if not holds:
-        raise UserError(f"'{path}' could not be written: '{above}' is a file, no folder; choose another place.")
+        raise UserError(f"'{path}' could not be written: '{above}' is a file, no folder; {elsewhere(path)}.")
     if not allowed:
-        raise UserError(f"'{path}' could not be written: '{above}' may not be written to; choose another place.")
+        raise UserError(f"'{path}' could not be written: '{above}' may not be written to; {elsewhere(path)}.")
     if any(len(os.fsencode(part)) > LONGEST for part in path.parts):
         raise UserError(f"'{path}' could not be written (File name too long); choose another name.")
     try:
@@ -76,7 +77,7 @@ def writable(path: str | os.PathLike) -> Path:
             return path
     except OSError as error:
         raise UserError(
-            f"'{path}' could not be written: '{above}' takes no file ({error.strerror}); choose another place."
+            f"'{path}' could not be written: '{above}' takes no file ({error.strerror}); {elsewhere(path)}."
         ) from None
 
 

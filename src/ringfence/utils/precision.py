@@ -15,13 +15,16 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
+from ringfence.utils.forks import refuse_forked
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 @contextmanager
 def float32() -> Iterator[None]:
-    """While it is open, JAX makes numbers of 32 bits, and multiplies them as such."""
+    """While it is open, JAX makes numbers of 32 bits, and multiplies them as such; not in a forked process."""
+    refuse_forked()
     with jax.enable_x64(False), full_products():
         yield
 

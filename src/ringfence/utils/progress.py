@@ -1,9 +1,15 @@
-"""Progress of long work: a bar on a terminal, plain lines elsewhere."""
+"""Progress of long work: a bar on a terminal, plain lines elsewhere. What is done within other work is shown by its
+bar."""
 
 from __future__ import annotations
 
 import sys
+import threading
 import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar, Token
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -23,40 +29,122 @@ SHOWN = (
 )
 
 
+TRUST = 20.0  # s for which what was expected is believed: a part begins by compiling
+SILENT = 4.0  # s after which something is said, however long a step takes
+
+_outer: ContextVar[Progress | None] = ContextVar("outer", default=None)
+
+
 class Progress:
     """Counts to `total`; `advance` may carry metrics, of which the telling ones are shown."""
 
+    even = True  # each that is counted takes about as long
+
     def __init__(self, label: str, total: int, done: int = 0, quiet: bool = False):
-        self.label, self.total, self.done, self.quiet = label, total, done, quiet
-        self.terminal = sys.stderr.isatty() and not quiet
+        self.label, self.total, self.done = label, total, done
+        self.outer = _outer.get()
+        self.speaks = not quiet and self.outer is None
+        self.terminal = self.speaks and sys.stderr.isatty()
+        self.note = ""
         self.started = self.spoke = time.monotonic()
 
-    def __enter__(self) -> Progress:
+    def __enter__(self) -> Self:
+        self.token: Token = _outer.set(self)
         if self.terminal:
+            left = (TimeRemainingColumn(),) if self.even else ()
             self.bar = Rich(
                 TextColumn("{task.description}"),
                 BarColumn(),
                 MofNCompleteColumn(),
                 TimeElapsedColumn(),
-                TimeRemainingColumn(),
+                *left,
                 TextColumn("{task.fields[note]}"),
                 console=Console(stderr=True),
             )
             self.bar.start()
             self.task = self.bar.add_task(self.label, total=self.total, completed=self.done, note="")
+        if self.speaks:
+            self.over = threading.Event()
+            threading.Thread(target=self._beat, daemon=True).start()
         return self
 
     def __exit__(self, *_) -> None:
+        _outer.reset(self.token)
+        if self.speaks:
+            self.over.set()
         if self.terminal:
             self.bar.stop()
 
     def advance(self, count: int, metrics: dict[str, float] | None = None) -> None:
+        """So many are done; a Ctrl-C that was swallowed is raised here."""
         interrupts.check()
         self.done += count
-        note = "  ".join(f"{k.split('/')[-1]} {metrics[k]:.3g}" for k in SHOWN if metrics and k in metrics)
+        self.note = "  ".join(f"{k.split('/')[-1]} {metrics[k]:.3g}" for k in SHOWN if metrics and k in metrics)
+        if self.outer is not None:
+            self.outer.within(self.label, self.done / max(self.total, 1))
+        self._show(self.done >= self.total)
+
+    def within(self, label: str, share: float) -> None:
+        """What is done of work within this."""
+
+    def _beat(self) -> None:
+        while not self.over.wait(SILENT / 4):
+            self._show()
+
+    def _show(self, at_once: bool = False) -> None:
         if self.terminal:
-            self.bar.update(self.task, completed=self.done, note=note)
-        elif not self.quiet and (time.monotonic() - self.spoke > 10 or self.done >= self.total):
+            self.bar.update(self.task, completed=self.done, note=self.note)
+        elif self.speaks and (at_once or time.monotonic() - self.spoke > SILENT):
             self.spoke = time.monotonic()
             elapsed = self.spoke - self.started
-            print(f"{self.label}: {self.done}/{self.total}, {elapsed:.0f} s  {note}", file=sys.stderr, flush=True)
+            line = f"{self.label}: {self.done}/{self.total}, {elapsed:.0f} s  {self.note}\n"
+            print(line, end="", file=sys.stderr, flush=True)  # in one piece: two threads speak
+
+
+class Parts(Progress):
+    """Work in several parts, in per cent, and what is left: by how long each is expected to take, in seconds, and how
+    long those took that are done."""
+
+    def __init__(self, label: str, expected: Iterable[tuple[str, float]], quiet: bool = False):
+        super().__init__(label, 100, quiet=quiet)
+        self.expected = list(expected)  # of what is to be done
+        self.seconds: dict[str, float] = {}  # that parts took, by name
+        self.finished = 0.0  # expected seconds of what is done
+        self.now, self.of_now, self.share = "", 0.0, 0.0
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """While it is open, that part is worked at."""
+        self.now, self.of_now, self.share = name, self.skip(name), 0.0
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            took = time.monotonic() - began
+            self.seconds[name] = self.seconds.get(name, 0.0) + took
+            self.finished += self.of_now or took
+            self.now, self.of_now = "", 0.0
+        interrupts.check()
+        self._show(at_once=not self.expected)
+
+    def skip(self, name: str) -> float:
+        """That part need not be done any more; the seconds that it was expected to take, 0 where it was not."""
+        found = next((k for k, (other, _) in enumerate(self.expected) if other == name), None)
+        return 0.0 if found is None else self.expected.pop(found)[1]
+
+    def within(self, label: str, share: float) -> None:
+        self.share = share
+        self._show()
+
+    def _show(self, at_once: bool = False) -> None:
+        done = self.finished + self.share * self.of_now
+        rest = sum(seconds for _, seconds in self.expected) + (1.0 - self.share) * self.of_now
+        spent = time.monotonic() - self.started
+        pace = (spent + TRUST) / (done + TRUST)  # seconds of these for one that was expected
+        self.done = round(100 * done / max(done + rest, 1e-9))
+        self.note = f"{self.now}, about {_in_words(pace * rest)} left" if rest else ""
+        super()._show(at_once)
+
+
+def _in_words(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from safetensors.numpy import load_file
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save_file
 
 from ringfence.errors import CheckpointError
 from ringfence.types import PyTree
+from ringfence.utils.files import whole
 
 
 def named_leaves(tree: PyTree) -> list[tuple[str, Any]]:
@@ -35,6 +37,15 @@ def digest_of(arrays: Iterable[tuple[str, np.ndarray]]) -> str:
         digest.update(f"{name} {array.shape} {array.dtype}".encode())
         digest.update(np.ascontiguousarray(array).data)
     return digest.hexdigest()
+
+
+def save_named(file: Path, arrays: dict[str, np.ndarray], metadata: Mapping[str, str] | None = None) -> None:
+    """Write a file of named arrays, whole or not at all."""
+    with whole(file) as temporary:
+        try:
+            save_file(arrays, temporary, dict(metadata or {}))
+        except SafetensorError as error:  # its own wrapping of the operating system's error
+            raise OSError(str(error)) from error
 
 
 def load_named(file: str | Path, template: PyTree) -> PyTree:

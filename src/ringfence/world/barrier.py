@@ -343,7 +343,6 @@ def fit_label(
     updates: int,
     width: int,
     batch: int = 512,
-    quiet: bool = True,
 ) -> Barrier:
     """ℓ fitted to labels. data: features (M, N, D), predicted (T, N, D), row (T,), label (T,) or (T, N) bool of steps;
     `unsafe` and `safe` index the steps to learn from. A quarter of every batch is unsafe.
@@ -379,7 +378,7 @@ def fit_label(
 
     rows = 2**31 - 1
     net = networks(key_nets, shape, width)
-    words = "" if quiet else "barrier, what is dangerous now"
+    words = "barrier, what is dangerous now"
     given = (*data, on_device(unsafe), on_device(safe))
     found = regress(objective, net, given, rows, key_fit, updates, batch, 2e-3, words, decay=1e-4)
     return eqx.tree_at(lambda b: b.label, barrier, found)
@@ -405,7 +404,6 @@ def fit_future(
     updates: int,
     batch: int = 512,
     rate: float = 0.02,
-    quiet: bool = True,
 ) -> Barrier:
     """V by in-sample backups y = (1 − γ) ℓ + γ min(ℓ, V̄(s')), y = ℓ where the task ended, with an upper expectile over
     what the logs did, V̄ a slow copy. It begins as ℓ, which it never exceeds; from fresh weights where ℓ reads both ends
@@ -440,7 +438,7 @@ def fit_future(
 
     near = on_device(close if len(close) else picked)
     data = arrays["features"], arrays["row"], arrays["terminated"], near, on_device(picked)
-    words = "" if quiet else "barrier, what will be dangerous"
+    words = "barrier, what will be dangerous"
     pair = net, net
     found = regress(objective, pair, data, 2**31 - 1, key_fit, updates, batch, 1e-3, words, after=following)
     return eqx.tree_at(lambda b: b.future, barrier, found[0])

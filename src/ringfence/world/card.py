@@ -19,6 +19,7 @@ NO_ERROR = 0.01  # of the deviation of what is predicted: less is exact enough
 WIDENED = (5, 10, 15)  # rows ahead of which its words say what they ask for
 LITTLE = 0.05  # margins, of which they say nothing
 SHOWN = 3  # things that a barrier reads, beside distances, whose prediction its words show
+NO_CLIMB = ": guards that climb them (refine, full) are refused"
 UNKNOWN = math.nan  # a number that held-out episodes say nothing of; files leave it out
 
 
@@ -87,6 +88,11 @@ class ValueScores(Part, frozen=True):
 
     reward_r2: float = UNKNOWN
     value_r2: float = UNKNOWN
+
+    @property
+    def misleads(self) -> bool:
+        """Whether returns-to-go are predicted worse than by their mean, so that nothing is gained by climbing them."""
+        return self.value_r2 < 0
 
 
 class Threshold(Part, frozen=True):
@@ -172,6 +178,14 @@ class BarrierScores(Part, frozen=True):
     maps: tuple[ProbeMap, ...] = ()
 
 
+class Look(Part, frozen=True):
+    """How guards look ahead by themselves, in rows."""
+
+    rows: int = 0  # for which all that the barrier reads is predicted well
+    avoiding: int = 0  # else: that avoiding danger takes, where the usual ones come too late; 0: the usual ones
+    terminal_value: bool = False  # else: the value of danger is judged after the last row
+
+
 class Card(msgspec.Struct, frozen=True, kw_only=True):
     """What is known of a World: its data, settings and seed, and how good it is on held-out episodes, e.g.
     `card.barrier.recall`. `print(card)` says it in words.
@@ -194,6 +208,7 @@ class Card(msgspec.Struct, frozen=True, kw_only=True):
     barrier: BarrierScores | None = None
     verdict: Verdict | None = None
     constraints: dict[str, BarrierScores] | None = None  # by name, where the logs name several
+    look: Look | None = None  # None: of before; what reads a file decides it
     unread: dict[str, Any] = {}  # what else a file says of it
 
     def __hash__(self) -> int:
@@ -277,7 +292,8 @@ def _of_prediction(card: Card) -> Iterator[str]:
         yield from _of_foresight(card.prediction_error.read)
     if card.values is not None:
         yield (
-            f"Rewards of steps {_explained(card.values.reward_r2)}, returns-to-go {_explained(card.values.value_r2)}."
+            f"Rewards of steps {_explained(card.values.reward_r2)}, returns-to-go {_explained(card.values.value_r2)}"
+            f"{NO_CLIMB if card.values.misleads else ''}."
         )
     if card.ood is not None:
         yield (
@@ -300,7 +316,11 @@ def _of_foresight(read: tuple[Foresight, ...]) -> Iterator[str]:
 
 
 def _explained(share: float) -> str:
-    return "do not vary" if math.isnan(share) else f"are explained to {percent(share, 3)} of their variance"
+    if math.isnan(share):
+        return "do not vary"
+    if share < 0:
+        return "are predicted worse than by their mean"
+    return f"are explained to {percent(share, 3)} of their variance"
 
 
 def _of_barrier(card: Card) -> Iterator[str]:
@@ -328,7 +348,8 @@ def _of_barrier(card: Card) -> Iterator[str]:
     if not math.isnan(scores.searched):
         yield (
             "A guard that searches for actions, where drivers want anything, finds some that keep the margin; of the "
-            f"steps where these lead, the logs call {percent(scores.searched)} dangerous."
+            f"steps where these lead, the logs call {percent(scores.searched)} dangerous, by own places and distances "
+            "alone: other danger is not counted."
         )
     if card.constraints is None:
         yield (

@@ -135,7 +135,6 @@ def fit_causes(
     updates: int,
     width: int,
     batch: int = 512,
-    quiet: bool = True,
 ) -> tuple[Score, ...]:
     """Scores of the causes that were found, with these cells, from the same data as `barrier.fit_label`."""
     key_nets, key_fit = jax.random.split(key)
@@ -175,7 +174,7 @@ def fit_causes(
     beyond = [(on_device(values, np.float32), on_device(unknown, np.float32)) for values, unknown in places]
     given = (*data, on_device(unsafe), on_device(safe), beyond)
     begun = _Learning(nets, jnp.float32(HOT))
-    words = "" if quiet else "barrier, what is dangerous now"
+    words = "barrier, what is dangerous now"
     return regress(objective, begun, given, 2**31 - 1, key_fit, updates, batch, 2e-3, words, 1e-4, cooled).nets
 
 

@@ -145,7 +145,6 @@ def fit_dynamics(
     num_ensemble: int,
     updates: int,
     width: int,
-    label: str = "",
 ) -> Dynamics:
     """The ensemble of a data set: features (M, N, D); actions (T, N, A) of the T steps, each from row `row` (T,) to the
     next. The loss is Huber's, in standard deviations of the step: it keeps the kicks of contacts, which dwarf
@@ -183,6 +182,7 @@ def fit_dynamics(
         return jax.vmap(of)(nets, pick.reshape(num_ensemble, -1)).sum()
 
     data = features, actions, row, *(partners.seen_in(map.mirrored, features, model.scale) if map.mirrored else ())
+    label = "forward dynamics, what actions do"
     return model.by_members(regress(loss, nets, data, len(row), key_fit, updates, BATCH * num_ensemble, 4e-3, label))
 
 

@@ -19,19 +19,19 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import save_file
+from safetensors import SafetensorError, safe_open
 
 from ringfence.errors import UserError
 from ringfence.logs import late
 from ringfence.logs.store import EpisodeStore, team
 from ringfence.problem import constraints, features, partners
 from ringfence.problem.normalise import varying
-from ringfence.types import Key, PyTree, Spec
+from ringfence.types import Key, Spec
 from ringfence.utils.cache import cache_dir
 from ringfence.utils.device import on_device
-from ringfence.utils.files import whole
-from ringfence.utils.pytrees import load_named, named_arrays
+from ringfence.utils.files import whole, writable
+from ringfence.utils.progress import Parts
+from ringfence.utils.pytrees import load_named, named_arrays, save_named
 from ringfence.world import barrier as cbf
 from ringfence.world import cause_search, dynamics, impacts, margins, validate, values
 from ringfence.world.card import Card, Data
@@ -41,6 +41,7 @@ from ringfence.world.causes import Found
 from ringfence.world.cells import Cells
 from ringfence.world.heading import AHEAD, Heading
 from ringfence.world.logged import Logged, held_out, labels_of, unsafe_of
+from ringfence.world.look import look_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 from ringfence.world.storage import blank_barrier, blank_world, load, save
@@ -93,7 +94,7 @@ def fit_view(
     hazard: constraints.BoundHazard | None = None,
     seed: int = 0,
     cached: bool = True,
-    quiet: bool = True,
+    bar: Parts | None = None,
     search: Search | None = None,
 ) -> World:
     """The World of a store in the view `map` of `spec`; from the cache where it has been fitted before.
@@ -102,7 +103,7 @@ def fit_view(
     out of every part; the card says how good the World is on them, and by `search` what a guard would find in it.
     """
     formula = None if hazard is None or settings.labels != "formula" else constraints.to_dict(hazard.hazard)
-    parts = _Parts(settings, seed, formula, cached)
+    parts = _Parts(settings, seed, formula, cached, bar or Parts("", (), quiet=True))
     content = [
         validate.VERSION,
         cause_search.VERSION,
@@ -124,9 +125,11 @@ def fit_view(
     content += [AHEAD] if heading else []
     content += ["with what is relative to it"] if heading and not set(heading.about) <= set(map.follows) else []
     file = parts.file("world", list(PARTS), content)
-    if cached and (kept := _kept_world(file, map)) is not None:
+    if cached and (kept := _kept_world(file, map, store, settings, seed)) is not None:
         return kept
-    world = _fitted(store, map, spec, hazard, parts, quiet, search)
+    if cached:
+        writable(file)
+    world = _fitted(store, map, spec, hazard, parts, search)
     if cached:
         save(world, file)
     return world
@@ -138,7 +141,6 @@ def _fitted(
     spec: Spec,
     hazard: constraints.BoundHazard | None,
     parts: _Parts,
-    quiet: bool,
     search: Search | None,
 ) -> World:
     begun = time.perf_counter()
@@ -154,23 +156,24 @@ def _fitted(
         moved += f"less {_digest(map.plus)} {_digest(map.minus)}"
 
     world = blank_world(map, spec, settings)
-    value = _values(logged, moved, world.values, parts, quiet)
+    value = _values(logged, moved, world.values, parts)
     thrown = impacts.count(logged, parts.seed) if labels and settings.labels == "costs" else 0
     steps = logged.fitted_steps
     if thrown:
         steps = steps[~logged.unsafe[steps]]
         moved += f"{impacts.VERSION} landed {_digest(logged.unsafe)}"
-    acts = _dynamics(logged, steps, moved, world.dynamics, parts, quiet)
+    acts = _dynamics(logged, steps, moved, world.dynamics, parts)
     if map.mirrored:
-        acts = _with_partners(acts, logged, steps, moved, parts, quiet)
+        acts = _with_partners(acts, logged, steps, moved, parts)
         moved += "partners" if acts.map.mirrored else ""
     if thrown:
         logged = impacts.landed(logged, acts)
-    barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts, quiet)
+    barrier, found_by = _barrier(logged, tuple(labels), moved, acts, parts)
     world = World(acts, value, barrier, jnp.ones(()), map, spec, settings.execution == "decentralized", Card())
 
-    found = validate.validate(world, logged, whole, settings.miscoverage, settings.loss)
-    seconds = parts.seconds | {"in all": time.perf_counter() - begun}
+    with parts.bar.part("card"):
+        found = validate.validate(world, logged, whole, settings.miscoverage, settings.loss)
+    seconds = parts.bar.seconds | {"in all": time.perf_counter() - begun}
     card = Card(
         format=FORMAT,
         data=_data(store, logged, thrown, bool(acts.map.mirrored)),
@@ -189,10 +192,11 @@ def _fitted(
     threshold = jnp.asarray(found.ood.threshold, jnp.float32)
     acts = dataclasses.replace(acts, ahead=dynamics.slowest(map, card.data.ranges))
     world = dataclasses.replace(world, dynamics=acts, barrier=found.barrier, ood_threshold=threshold, card=card)
-    wrong = None if search is None else search(world, logged)
+    with parts.bar.part("search"):
+        wrong = None if search is None else search(world, logged)
     if wrong is not None and card.barrier is not None:
         card = msgspec.structs.replace(card, barrier=msgspec.structs.replace(card.barrier, searched=round(wrong, 4)))
-    card = msgspec.structs.replace(card, verdict=judge(card))
+    card = msgspec.structs.replace(card, verdict=judge(card), look=look_of(card))
     return dataclasses.replace(world, card=card)
 
 
@@ -259,6 +263,16 @@ def _unsafe_cost(store: EpisodeStore, name: str) -> float:
     return float(cost[cost > 0].mean(dtype=np.float64)) if (cost > 0).any() else 1.0
 
 
+def expected(settings: Settings, constraints: int) -> list[tuple[str, float]]:
+    """The parts of a World, and about how many seconds each takes on two cores: a bar is to say what is left."""
+    found = [("reading", 1.0), ("values", settings.value_updates * 3e-3)]
+    found += [("dynamics", settings.dynamics_updates * settings.num_ensemble * 4e-4)]
+    for _ in range(max(1, constraints) * settings.barrier):
+        found += [("causes", 5.0)] * settings.causes
+        found += [("label", settings.barrier_updates * 1.5e-3), ("future", settings.future_updates * 3e-3)]
+    return [*found, ("card", 8.0), ("search", 4.0)]
+
+
 # --- parts ---
 
 
@@ -268,7 +282,6 @@ def _dynamics(
     moved: str,
     blank: dynamics.Dynamics,
     parts: _Parts,
-    quiet: bool,
 ) -> dynamics.Dynamics:
     """Of these steps."""
     settings = parts.settings
@@ -283,27 +296,26 @@ def _dynamics(
             num_ensemble=settings.num_ensemble,
             updates=settings.dynamics_updates,
             width=settings.dynamics_width,
-            label="" if quiet else "forward dynamics, what actions do",
         )
 
     return parts.get("dynamics", [moved], blank, fit)
 
 
 def _with_partners(
-    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: str, parts: _Parts, quiet: bool
+    plain: dynamics.Dynamics, logged: Logged, steps: np.ndarray, moved: str, parts: _Parts
 ) -> dynamics.Dynamics:
     """The dynamics that read what those do who are in lists of the nearest, if they predict held-out windows better
     than plain ones: in long lists they learn by heart who does what."""
     settings = parts.settings
     action = logged.arrays["actions"].shape[-1]
     blank = dynamics.blank_dynamics(logged.map, action, settings.num_ensemble, settings.dynamics_width)
-    told = _dynamics(logged, steps, f"{moved} {partners.VERSION} {logged.map.mirrored}", blank, parts, quiet)
+    told = _dynamics(logged, steps, f"{moved} {partners.VERSION} {logged.map.mirrored}", blank, parts)
     errors = [validate.prediction_error(each, logged, np.random.default_rng(4)) for each in (told, plain)]
     ours, theirs = (np.mean(error.error_of_change) for error in errors)
     return told if ours < theirs else plain
 
 
-def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, quiet: bool) -> values.Values:
+def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts) -> values.Values:
     settings = parts.settings
     alone = settings.execution == "decentralized"
 
@@ -317,7 +329,6 @@ def _values(logged: Logged, moved: str, blank: values.Values, parts: _Parts, qui
             updates=settings.value_updates,
             period=logged.longest,
             alone=alone,
-            quiet=quiet,
         )
 
     return parts.get("values", [moved, logged.store.digest("rewards")], blank, fit)
@@ -363,45 +374,39 @@ def _digest(array: np.ndarray) -> str:
 
 
 def _barrier(
-    logged: Logged, names: tuple[str, ...], moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool
+    logged: Logged, names: tuple[str, ...], moved: str, acts: dynamics.Dynamics, parts: _Parts
 ) -> tuple[cbf.Barrier | cbf.MinBarrier | None, dict[str, Found]]:
     """The barrier of all constraints, and the causes of the danger of each; None where there are none."""
     searches = {name: _Search(logged.by(name), parts.seed) for name in names}
-    labels = {name: _label_of(search, moved, acts, parts, quiet) for name, search in searches.items()}
+    labels = {name: _label_of(search, moved, acts, parts) for name, search in searches.items()}
     causes = {name: found for name, (found, _) in labels.items()}
-    each = [
-        _with_future(labels[name][1], search, moved, causes[name], parts, quiet) for name, search in searches.items()
-    ]
+    each = [_with_future(labels[name][1], search, moved, causes[name], parts) for name, search in searches.items()]
     if not each:
         return None, causes
     return cbf.MinBarrier(tuple(each), names) if logged.several else each[0], causes
 
 
-def _label_of(
-    search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Parts, quiet: bool
-) -> tuple[Found, cbf.Barrier]:
+def _label_of(search: _Search, moved: str, acts: dynamics.Dynamics, parts: _Parts) -> tuple[Found, cbf.Barrier]:
     """The causes of one constraint's danger, and ℓ by them; no causes, and ℓ by networks on all entries, where held-out
     steps say that these tell more."""
     found = _causes(search, moved, parts)
-    label = _labelled(search, moved, acts, found, parts, quiet)
+    label = _labelled(search, moved, acts, found, parts)
     if not found.causes:
         return found, label
     recall = validate.recall(label, search.logged)
     if not recall < ENOUGH:
         return found, label
-    plain = _labelled(search, moved, acts, Found(), parts, quiet)
+    plain = _labelled(search, moved, acts, Found(), parts)
     if validate.recall(plain, search.logged) > recall:
         return Found(), plain
     return found, label
 
 
-def _labelled(
-    search: _Search, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts, quiet: bool
-) -> cbf.Barrier:
+def _labelled(search: _Search, moved: str, acts: dynamics.Dynamics, found: Found, parts: _Parts) -> cbf.Barrier:
     """ℓ of one constraint."""
     content = _about(search, moved, found)
     template = eqx.filter_eval_shape(blank_barrier, search.logged.map, parts.settings, found)
-    return parts.get("label", content, template, lambda key: _label(search, acts, parts.settings, found, key, quiet))
+    return parts.get("label", content, template, lambda key: _label(search, acts, parts.settings, found, key))
 
 
 def _about(search: _Search, moved: str, found: Found) -> list[Any]:
@@ -417,9 +422,7 @@ def _about(search: _Search, moved: str, found: Found) -> list[Any]:
     ]
 
 
-def _with_future(
-    label: cbf.Barrier, search: _Search, moved: str, found: Found, parts: _Parts, quiet: bool
-) -> cbf.Barrier:
+def _with_future(label: cbf.Barrier, search: _Search, moved: str, found: Found, parts: _Parts) -> cbf.Barrier:
     """ℓ and V of one constraint."""
     settings = parts.settings
     logged = search.logged
@@ -435,16 +438,13 @@ def _with_future(
             discount=settings.future_discount,
             expectile=settings.expectile,
             updates=settings.future_updates,
-            quiet=quiet,
         )
 
     template = eqx.filter_eval_shape(blank_barrier, logged.map, settings, found)
     return parts.get("future", _about(search, moved, found), template, fit)
 
 
-def _label(
-    search: _Search, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key, quiet: bool
-) -> cbf.Barrier:
+def _label(search: _Search, acts: dynamics.Dynamics, settings: Settings, found: Found, key: Key) -> cbf.Barrier:
     """ℓ of a data set, with the statistics that it reads by."""
     logged = search.logged
     key_states, key_fit = jax.random.split(key)
@@ -468,7 +468,6 @@ def _label(
             share=settings.predicted_share,
             updates=settings.barrier_updates,
             width=settings.barrier_width,
-            quiet=quiet,
         )
         nets = margins.in_own_margins(nets, acts, logged, np.random.default_rng(0))
         return dataclasses.replace(blank, causes=nets)
@@ -483,7 +482,6 @@ def _label(
         share=settings.predicted_share,
         updates=settings.barrier_updates,
         width=settings.barrier_width,
-        quiet=quiet,
     )
 
 
@@ -532,7 +530,7 @@ class _Parts:
     seed: int
     formula: dict[str, Any] | None  # the hazard that labels states
     cached: bool
-    seconds: dict[str, float] = dataclasses.field(default_factory=dict)  # that making took
+    bar: Parts
 
     def file(self, name: str, of: Sequence[str], content: list[Any]) -> Path:
         """Where what depends on the settings of the parts `of` and on `content` is kept."""
@@ -560,9 +558,8 @@ class _Parts:
                 return msgspec.json.decode(file.read_bytes(), type=kind)
             except (OSError, msgspec.MsgspecError):
                 pass
-        begun = time.perf_counter()
-        made = make()
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+        with self.bar.part(name):
+            made = make()
         if self.cached:
             with whole(file) as temporary:
                 Path(temporary).write_bytes(msgspec.json.encode(made))
@@ -572,35 +569,37 @@ class _Parts:
         """The part of that name; made, and then kept, where it is not there."""
         file = self.file(name, [*UPON[name], name], content)
         if self.cached and (kept := _read(file, template)) is not None:
+            self.bar.skip(name)
             return kept
-        begun = time.perf_counter()
-        made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+        with self.bar.part(name):
+            made = make(jax.random.fold_in(jax.random.key(self.seed), list(PARTS).index(name)))
         if self.cached:
-            _write(file, made)
+            save_named(file, named_arrays(made), {"key": file.stem})
         return made
 
 
-def _write(file: Path, tree: PyTree) -> None:
-    with whole(file) as temporary:
-        save_file(named_arrays(tree), temporary)
-
-
 def _read(file: Path, template: T) -> T | None:
-    """A cached part; None where there is none, or a damaged one."""
+    """A cached part; None where there is none, a damaged one, or another's: those of before tell no key."""
     if not file.exists():
         return None
     try:
-        return load_named(file, template)
+        with safe_open(file, "numpy") as opened:
+            key = (opened.metadata() or {}).get("key", file.stem)
+        return load_named(file, template) if key == file.stem else None
     except (SafetensorError, OSError, UserError):
         return None
 
 
-def _kept_world(file: Path, map: features.FeatureMap) -> World | None:
-    """A cached World; None likewise."""
+def _kept_world(
+    file: Path, map: features.FeatureMap, store: EpisodeStore, settings: Settings, seed: int
+) -> World | None:
+    """A cached World; None likewise, and of one of other data, settings or seed, which somebody has put there."""
     if not file.exists():
         return None
     try:
-        return load(file, lambda *_: map)
+        found = load(file, lambda *_: map)
     except UserError:
         return None
+    card = found.card
+    same = (card.data.content, card.settings, card.seed) == (store.card.content or store.content, settings, seed)
+    return found if same else None

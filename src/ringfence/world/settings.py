@@ -36,4 +36,5 @@ class Settings:
     future_updates: Count = 4000  # of the value of danger
     future_discount: Annotated[float, Meta(ge=0, le=0.999)] = 0.97  # how far ahead danger is seen: 1 / (1 − it) steps
     expectile: Annotated[float, Meta(ge=0.5, le=1)] = 0.7  # of what the logs did, how near to the best
-    miscoverage: float = 0.001  # share of unsafe steps that may be predicted at the default margin or above
+    # share of unsafe steps that may be predicted at the default margin or above
+    miscoverage: Annotated[float, Meta(ge=0, le=0.5)] = 0.001

@@ -10,21 +10,23 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import msgspec
 import numpy as np
 from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from ringfence.errors import UserError
 from ringfence.problem import features
 from ringfence.types import Spec
 from ringfence.utils import schemas
-from ringfence.utils.files import regular, whole
+from ringfence.utils.files import regular
 from ringfence.utils.precision import in_float32
-from ringfence.utils.pytrees import as_tree, digest_of, named_arrays
+from ringfence.utils.pytrees import as_tree, digest_of, named_arrays, save_named
 from ringfence.world import barrier as cbf
 from ringfence.world import dynamics, values
 from ringfence.world.card import Card
 from ringfence.world.causes import Found
+from ringfence.world.look import look_of
 from ringfence.world.model import World
 from ringfence.world.settings import Settings
 
@@ -71,10 +73,9 @@ def save(
         "spec": world.spec.to_dict(),
         "card": world.card.to_json(),
     }
-    with whole(path) as temporary:
-        arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
-        about["digest"] = _digest(arrays, about)
-        save_file(arrays, temporary, {"ringfence_world": json.dumps(about)})
+    arrays = {name: kept(array, name) for name, array in named_arrays(world).items()}
+    about["digest"] = _digest(arrays, about)
+    save_named(path, arrays, {"ringfence_world": json.dumps(about)})
     return path
 
 
@@ -112,6 +113,7 @@ def _read(path: Path, map_of: MapOf) -> World:
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise UserError(f"'{path}' holds numbers in '{name}' that are not finite; fit it again.")
     card = Card.from_json(about["card"])
+    card = card if card.look is not None else msgspec.structs.replace(card, look=look_of(card))
     spec = Spec.of(about["spec"])
     settings = card.settings
     map = map_of(spec.task, settings.view, card.data.hazard) or features.from_dict(dict(about["map"]))

@@ -240,11 +240,8 @@ def _barrier_scores(
     ends = entries(logged, bad)
     ends = rng.choice(ends, min(WINDOWS, len(ends)), replace=False)
     predicted = scores_of_ends(lambda *step: _score(barrier, *step), dynamics, logged, ends)
-    if count_entries(logged, bad) < FEW or len(predicted) < 2 * OUTLIERS:
-        warning = (
-            f"too few held-out steps are unsafe ({len(ends)}) to say how well danger is recognised, or to set a margin"
-        )
-        return BarrierScores(warning=warning), UNJUDGED
+    if few := _too_few(count_entries(logged, bad), len(predicted)):
+        return BarrierScores(warning=f"{few} to say how well danger is recognised, or to set a margin"), UNJUDGED
     if unit is None:
         unit = max(least, calibrated(predicted, now[~truth], max(miscoverage, OUTLIERS / len(predicted))))
     share = float(unsafe[held].mean())
@@ -270,6 +267,15 @@ def _barrier_scores(
         maps=asked.maps,
     )
     return scores, unit
+
+
+def _too_few(entries: int, predicted: int) -> str:
+    """What there is too little of to judge a barrier by; nothing where there is enough."""
+    if entries < FEW:
+        return f"too few held-out steps enter danger ({entries})"
+    if predicted < 2 * OUTLIERS:
+        return f"too few held-out steps into danger are predicted ({predicted})"
+    return ""
 
 
 def recall(barrier: Barrier, logged: Logged) -> float:

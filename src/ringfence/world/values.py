@@ -83,7 +83,6 @@ def fit_values(
     updates: int,
     period: int,
     alone: bool = False,
-    quiet: bool = True,
 ) -> Values:
     """Values of a data set's `arrays` (windows.py) by the steps in `picked` (K,); `period` as in `fit_critic`. Agents
     that are `alone` learn what each of them earns, (T, N) rewards and `returns_to_go`, the others what the team does,
@@ -91,9 +90,7 @@ def fit_values(
     key_critic, key_reward, key_net = jax.random.split(key, 3)
     rewards = team_mean(arrays["rewards"], alone)
     seen, arrived, returns = _targets(arrays, rewards, picked)
-    critic = fit_critic(
-        seen, arrived, returns, key_critic, updates, period=period, weight=map.critic_weight, quiet=quiet
-    )
+    critic = fit_critic(seen, arrived, returns, key_critic, updates, period=period, weight=map.critic_weight)
     net = _reward_net(key_net, map, arrays["actions"].shape[-1])
 
     def loss(net: MLP, data: tuple[Array, ...], pick: Array) -> Array:
@@ -106,7 +103,7 @@ def fit_values(
 
     some = (np.asarray(x)[np.asarray(picked)] for x in (arrays["actions"], arrays["row"], rewards))  # on the host
     data = arrays["features"], *(on_device(x) for x in some)
-    label = "" if quiet else "rewards, what steps are worth"
+    label = "rewards, what steps are worth"
     reward = regress(loss, net, data, len(picked), key_reward, updates, 512, 4e-3, label)
     return Values(critic, reward, discount, map.joint, alone)
 
@@ -169,7 +166,6 @@ def fit_critic(
     batch: int = 512,
     period: int = 1,
     weight: tuple[float, ...] | None = None,
-    quiet: bool = True,
 ) -> Critic:
     """The critic of a data set: features (M, N, D), rewards (M,) of arriving in each row and returns to go (M,) of the
     team, which is the mean over agents; or (M, N) of each agent.
@@ -192,7 +188,7 @@ def fit_critic(
         return (((out if each else out.mean(-2)) - goal) ** 2).mean()
 
     data = features, targets
-    label = "" if quiet else "critic, what states are worth"
+    label = "critic, what states are worth"
     critic["net"] = regress(
         loss, critic["net"], data, len(features), jax.random.fold_in(key, 1), updates, batch, 4e-3, label
     )

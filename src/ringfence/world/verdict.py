@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from typing import Literal
 
 from ringfence.errors import UserError
 from ringfence.logs.late import Lateness
 from ringfence.world.card import BarrierScores, Card, Verdict
+from ringfence.world.causes import Found
 
 Word = Literal["fit", "weak", "unfit"]
 ENTRIES = (5, 30)  # held-out entries into danger: with fewer than these nothing, or little, is known
 RECALL = (0.8, 0.95)  # share of unsafe steps found with 1 false alarm in 100
+TOLD = (0.8, 0.95)  # share of unsafe steps that causes tell, where the barrier does not find nearly all by them
+NEARLY_ALL = 0.99  # of the unsafe steps
 KEPT = (0.2, 0.6)  # share of safe steps that keep the margin: a guard fights most actions below it
 FORESEEN = (0.5, 0.95)  # share of entries into danger that are predicted to have less than the margin
 AVOIDABLE = (0.0, 0.3)  # share of entries into danger that other actions could have avoided, as it predicts
 NOTHING = 1.0  # error of predictions as a share of what changes: to predict that nothing changes errs by as much
 PROBED = (0.95, 0.99)  # share of states with somebody inside the radius that are called unsafe
+UNNAMED = re.compile(r"(obs|state)\d+\b")  # entries that nobody named
+FORMULA = "give a formula of danger (hazard), e.g. where it is a sum or an area over the team"
 
 
 def judge(card: Card) -> Verdict:
@@ -25,9 +31,13 @@ def judge(card: Card) -> Verdict:
     if card.barrier is None:
         reason = "it knows no danger: no step of its logs costs, or every step, or it was fitted without a barrier"
         return Verdict("unfit", (reason,), ("log steps of both kinds, or give a formula of danger",))
-    found = list(_barrier(card.barrier, ""))
+    untold = _remedy_of_untold(card)
+    found = list(_barrier(card.barrier, "", untold))
     for name, scores in (card.constraints or {}).items():
-        found += _barrier(scores, f" of '{name}'")
+        found += _barrier(scores, f" of '{name}'", untold)
+    scores = card.constraints or {"": card.barrier}
+    for name, causes in card.causes.items():
+        found += _told(causes, scores.get(name, card.barrier).recall, f" of '{name}'" if name else "")
     found += _prediction(card)
     found += _late(Lateness(card.data.late))
     worst: Word = "fit"
@@ -38,14 +48,14 @@ def judge(card: Card) -> Verdict:
     return Verdict(worst, tuple(r for r, _ in shown), tuple(dict.fromkeys(m for _, m in shown)))
 
 
-def _barrier(scores: BarrierScores, of: str) -> Iterator[tuple[Word, str, str]]:
+def _barrier(scores: BarrierScores, of: str, untold: str) -> Iterator[tuple[Word, str, str]]:
     """(word, reason, remedy) of what is amiss."""
     if scores.warning:
         yield "unfit", f"{scores.warning}{of}", "log more episodes with danger"
         return
     checks = (
         (scores.entries, ENTRIES, "{:.0f} held-out steps enter danger", "log more episodes with danger"),
-        (scores.recall, RECALL, "{:.1%} of unsafe steps are found", "name the entries that tell danger, or log them"),
+        (scores.recall, RECALL, "{:.1%} of unsafe steps are found", untold),
         (scores.margin_kept, KEPT, "{:.1%} of safe steps keep the margin", "log more, and more careful, episodes"),
         (
             1 - scores.miscoverage,
@@ -60,6 +70,21 @@ def _barrier(scores: BarrierScores, of: str) -> Iterator[tuple[Word, str, str]]:
         word = _word(value, limits)
         if word != "fit":
             yield word, f"only {words.format(value)}{of}", remedy
+
+
+def _told(causes: Found, recall: float, of: str) -> Iterator[tuple[Word, str, str]]:
+    """What causes leave out: a score of theirs may find much of it, in the logs, and holds nobody off the rest."""
+    word = _word(causes.explained, TOLD)
+    if causes.causes and word != "fit" and recall < NEARLY_ALL:
+        yield word, f"its causes tell only {causes.explained:.1%} of the danger{of}", FORMULA
+
+
+def _remedy_of_untold(card: Card) -> str:
+    """What helps where danger is not found: what has no name may tell it; else few named entries cannot."""
+    names = () if card.prediction_error is None else card.prediction_error.by_entry
+    if not names or any(UNNAMED.match(name) for name in names):
+        return "name the entries that tell danger, or log them"
+    return f"log what tells danger, if it is not among the entries, or {FORMULA}"
 
 
 def _avoided(scores: BarrierScores) -> float:
@@ -115,4 +140,14 @@ def require(card: Card, anyway: bool = False) -> None:
     raise UserError(
         f"The World of '{card.data.task}' is unfit to guard by: {'; '.join(verdict.reasons)}; "
         f"{' or '.join(verdict.remedies)}, or insist with anyway=True (--anyway)."
+    )
+
+
+def require_values(card: Card, anyway: bool = False) -> None:
+    """Refuse to climb values that are worse than none, unless it is insisted on."""
+    if card.values is None or not card.values.misleads or anyway:
+        return
+    raise UserError(
+        f"The World of '{card.data.task}' predicts returns-to-go worse than by their mean, and this guard climbs them; "
+        "take guard='shield', log more episodes, or insist with anyway=True (--anyway)."
     )

@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 from safetensors import safe_open
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load_file
 
 from ringfence.errors import UserError, unknown
 from ringfence.loading.run_worlds import GUARD, WORLD
 from ringfence.training.runs import Run, write_json
 from ringfence.utils.files import whole, writable
-from ringfence.utils.pytrees import digest_of, named_arrays
+from ringfence.utils.pytrees import digest_of, named_arrays, save_named
 from ringfence.world import World
 from ringfence.world import save as save_world
 
@@ -88,8 +88,7 @@ def put(run: Run, name: str, read: World | None, guards: World, folder: Path = F
         "zeros": {k: (v.shape, str(v.dtype)) for k, v in arrays.items() if k.startswith("opt/")},
     }
     made = [folder / f"{name}.safetensors"]
-    with whole(made[0]) as temporary:
-        save_file(kept, temporary, {"ringfence_policy": json.dumps(about)})
+    save_named(made[0], kept, {"ringfence_policy": json.dumps(about)})
     task = folder / name.split("/")[0]
     made += [_put_world(guards, task / "world.safetensors")]
     if read is not None and _content(read) != _content(guards):
