@@ -316,6 +316,44 @@ def test_ctrl_c_is_not_swallowed():
     assert done.stdout.split() == ["heard", "finished", "heard"]
 
 
+SWALLOWED = """
+def command():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except BaseException:
+        {then}
+app.COMMANDS["tasks"] = command
+sys.argv[1:] = ["tasks"]
+main()
+"""
+EARLY = """
+class Asked:
+    def find_spec(self, name, *_):
+        if name == "ringfence.cli.app":
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Asked())
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        EARLY,
+        "from ringfence.cli import app" + SWALLOWED.format(then="pass"),
+        "from ringfence.cli import app" + SWALLOWED.format(then="raise RuntimeError('of a library')"),
+    ],
+    ids=["while importing", "swallowed", "made another error"],
+)
+def test_ctrl_c_ends_a_command_in_a_word(code):
+    """And at once: what Python does at its end, such as `atexit`, does not meet native threads that still compute."""
+    start = "import atexit, signal, sys\nfrom ringfence.__main__ import main\natexit.register(print, 'torn down')\n"
+    start += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a suite in the background would ignore it
+    done = subprocess.run([sys.executable, "-c", start + code], capture_output=True, text=True)
+    assert done.returncode == 130 and done.stderr.startswith("interrupted") and "Traceback" not in done.stderr
+    assert "torn down" not in done.stdout
+
+
 @pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
 def test_who_may_read_a_file_follows_the_umask(umask, tmp_path):
     """Though safetensors writes 0600 whatever is asked for."""

@@ -6,10 +6,13 @@ and forgotten. Here it is remembered, and raised again at the next step of whate
 
 from __future__ import annotations
 
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
+STATUS = 130  # of a process that Ctrl-C ended
 _asked = False
 _held = 0
 
@@ -18,9 +21,28 @@ def listen() -> None:
     """Take over Ctrl-C in this process; a library that is imported leaves it to its user."""
     global _asked
     _asked = False
+    _handle(_heard)
+
+
+def leave_when_asked() -> None:
+    """Until `listen`, end this process at once: nothing was begun."""
+    _handle(lambda signum, frame: leave("interrupted"))
+
+
+def leave(said: str = "") -> None:
+    """End this process without taking the interpreter down, under which native threads may still compute."""
+    if said:
+        print(said, file=sys.stderr)
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(STATUS)
+
+
+def _handle(handler) -> None:
     with suppress(ValueError):  # not in the main thread
         if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as in the background, where nobody means us
-            signal.signal(signal.SIGINT, _heard)
+            signal.signal(signal.SIGINT, handler)
 
 
 def _heard(signum, frame) -> None:
@@ -28,6 +50,11 @@ def _heard(signum, frame) -> None:
     _asked = True
     if not _held:
         raise KeyboardInterrupt
+
+
+def asked() -> bool:
+    """Whether Ctrl-C was pressed, though somebody may have swallowed what it raised or made another error of it."""
+    return _asked
 
 
 def check() -> None:
