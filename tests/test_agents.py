@@ -120,6 +120,15 @@ def test_agents_in_another_order_are_refused_at_run_time(pair, tmp_path):
     assert metadata["names"]["agents"] == pair.card.agents
     state = {"x": np.zeros(2), "y": np.ones(2)}
     assert observe(pair.card, state, agents=pair.card.agents).shape == (2, 4)
+    for odd in (
+        np.ma.masked_array([1.0, 2.0], [True, False]),
+        np.array([1.0, 2j]),
+        [1.0, np.nan],
+        ["1", "2"],
+        [1, None],
+    ):
+        with pytest.raises(UserError, match=r"state\['x'\]"):
+            observe(pair.card, {**state, "x": odd}, agents=pair.card.agents)
     with pytest.raises(UserError, match=wrong):
         observe(pair.card, state, agents=swapped)
     with pytest.raises(UserError, match="Agent 1 is nobody here and robot_10 in the logs"):

@@ -253,6 +253,22 @@ def test_costs_of_a_simulator_are_copied():
     np.testing.assert_array_equal(episode.costs, [[1, 1], [2, 2]])
 
 
+@pytest.mark.parametrize("costs", [{"near": -1.0, "far": 0.0}, {"near": 1.0, "far": np.array([0.0, -2.0])}, -1.0])
+def test_nobody_is_paid_for_danger(costs):
+    with pytest.raises(UserError, match="has the cost -[12]; a cost is 0 or positive"):
+        Episode(Reusing(), Shape(), 0, 10).step(np.zeros((2, 2)), lambda infos: costs)
+
+
+@pytest.mark.parametrize("number", [1e308, -1e31, np.inf, np.nan])
+def test_rewards_beyond_all_bounds_are_refused(number):
+    """Their sums, and the squares of these, would be no numbers."""
+    env = Reusing()
+    step = env.step
+    env.step = lambda actions: (step(actions)[0], dict.fromkeys("ab", number), *step(actions)[2:])
+    with pytest.raises(UserError, match="Step 1 has a reward or cost that is not finite, or beyond 1e.30"):
+        Episode(env, Shape(), 0, 10).step(np.zeros((2, 2)))
+
+
 class Leaving(Reusing):
     """A simulator whose second agent leaves before the first, in every third episode."""
 

@@ -14,6 +14,7 @@ from ringfence.utils.given import NUMBERS, given_as, refuse_other_order
 
 Cost = Callable[[dict[str, dict]], float | Mapping[str, float]]
 ByAgent = Mapping[Any, Any]
+LARGEST = 1e30  # of rewards and costs: squares of their sums are numbers still
 EARLY_ENDS = ("refuse", "cut", "skip")  # what becomes of an episode that one agent leaves before the others
 
 
@@ -156,9 +157,11 @@ class Episode:
                 f"An episode of {self.name} has not ended after {self.max_steps} steps; let truncations end it, or "
                 "pass max_episode_steps=."
             )
-        numbers = [self.rewards[-1], *(np.ravel(c) for c in self.costs[-1:])]
-        if not np.isfinite(np.concatenate(numbers)).all():
-            raise UserError(f"Step {number} has a reward or cost that is not finite; repair the simulator.")
+        numbers = np.concatenate([self.rewards[-1], *(np.ravel(c) for c in self.costs[-1:])])
+        if not (np.abs(numbers) <= LARGEST).all():
+            raise UserError(
+                f"Step {number} has a reward or cost that is not finite, or beyond {LARGEST:g}; repair the simulator."
+            )
         self.running = not ended
         self.terminated = left is None and all(bool(step.terminations.get(a)) for a in self.agents)
         self.showed_end = bool(step.observations)
@@ -213,10 +216,6 @@ class Episode:
                 f"Step {len(self.rewards)} of {self.name} tells one cost, those before several; name them all."
             )
         self.costs.append(self._of_agents(charged, "cost=" if cost is not None else self.name))
-        if np.min(self.costs[-1]) < 0:
-            raise UserError(
-                f"Step {len(self.rewards)} has the cost {np.min(self.costs[-1]):g}; a cost is 0 or positive."
-            )
 
     def _take_constraints(self, costs: Mapping[Any, Any]) -> None:
         """The step's cost by each constraint's name."""
@@ -247,11 +246,13 @@ class Episode:
         return {k: self._team_cost({a: c[k] for a, c in by_agent.items() if k in c}) for k in constraints}
 
     def _of_agents(self, cost: Any, whose: str) -> float | np.ndarray:
-        """A number, or one of each agent."""
+        """A number, or one of each agent; 0 or more."""
         array = isinstance(cost, np.ndarray) and not isinstance(cost, np.ma.MaskedArray)
-        if array and cost.shape == (len(self.agents),) and cost.dtype.kind in NUMBERS:
-            return np.array(cost, np.float64)
-        return _number(cost, "cost", whose)
+        each = array and cost.shape == (len(self.agents),) and cost.dtype.kind in NUMBERS
+        found = np.array(cost, np.float64) if each else _number(cost, "cost", whose)
+        if np.min(found) < 0:
+            raise UserError(f"Step {len(self.rewards)} has the cost {np.min(found):g}; a cost is 0 or positive.")
+        return found
 
     def _check_all_in(self, what: str, by_agent: ByAgent, step: int) -> None:
         lacking = [str(a) for a in self.agents if a not in by_agent]

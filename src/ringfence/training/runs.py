@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import re
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -170,8 +172,7 @@ class Run:
 
     def add_result(self, variant: str, result: dict) -> None:
         """Keep a result beside the others, whoever else adds some at the same time."""
-        with alone(self.path / ".results.lock"):
-            write_json(self.path / "results.json", {**self.results, variant: result})
+        add_entry(self.path / "results.json", lambda: self.results, variant, result)
 
 
 def runs_below(folder: Path) -> list[Run]:
@@ -199,7 +200,30 @@ def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:
     return arrays
 
 
+def add_entry(path: Path, read: Callable[[], dict[str, Any]], name: str, entry: dict[str, Any]) -> None:
+    """One more entry of a JSON file that `read` reads, whoever else adds some at the same time."""
+    with alone(path.with_name(f".{path.stem}.lock")):
+        write_json(path, {**read(), name: entry})
+
+
 def write_json(path: Path, data: Any) -> None:
-    """Whole or not at all."""
+    """Whole or not at all; a number that is not finite, which nobody could read again, is refused by its name."""
+    try:
+        content = json.dumps(data, indent=1, allow_nan=False)
+    except ValueError:
+        name = next(_not_finite(data), "something")
+        raise UserError(f"'{path}' holds finite numbers alone, and {name} is none; nothing was added to it.") from None
     with whole(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=1))
+        temporary.write_text(content)
+
+
+def _not_finite(data: Any, name: str = "") -> Iterator[str]:
+    """Names of numbers that are not finite."""
+    if isinstance(data, dict):
+        for key, value in data.items():
+            yield from _not_finite(value, str(key))
+    if isinstance(data, list | tuple):
+        for value in data:
+            yield from _not_finite(value, name)
+    if isinstance(data, float) and not math.isfinite(data):
+        yield f"{name} = {data}"

@@ -15,7 +15,7 @@ from ringfence.logs.io.tracks import Tracks, nearest
 from ringfence.logs.schema import GivenCard, StoreCard
 from ringfence.problem.entries import Entries, Entry
 from ringfence.problem.others import others
-from ringfence.utils.given import refuse_other_order
+from ringfence.utils.given import given_as, refuse_other_order
 
 
 def observe(
@@ -33,8 +33,8 @@ def observe(
     """
     fields = card.to_dict() if isinstance(card, StoreCard) else card
     names: list[str] = list(fields.get("observation_names") or ())
-    columns = {name: np.asarray(column, np.float64) for name, column in state.items()}
-    goals = {name: np.asarray(column, np.float64) for name, column in (goal or {}).items()}
+    columns = {name: _numbers(f"state['{name}']", column) for name, column in state.items()}
+    goals = {name: _numbers(f"goal['{name}']", column) for name, column in (goal or {}).items()}
     for name in [name for name in columns if f"own.cos_{name}" in names]:
         angle = angle_of(name, columns[name])
         columns |= {f"cos_{name}": np.cos(angle), f"sin_{name}": np.sin(angle)}
@@ -49,6 +49,12 @@ def observe(
     now = _Now(columns, goals, whom, float(fields.get("sensing_radius", np.inf)))
     seen = np.stack([now.entry(name, known.get(d)) for d, name in enumerate(names)], 1)
     return seen if fields.get("observation_origins") else seen.astype(np.float32)
+
+
+def _numbers(name: str, column: Any) -> np.ndarray:
+    """(N,) finite numbers, in double precision."""
+    found = given_as(name, column, (None,), "observe()", "give one number of each agent", double=True)
+    return found.astype(np.float64)
 
 
 @dataclass(frozen=True, eq=False)
