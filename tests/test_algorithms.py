@@ -13,11 +13,11 @@ import pytest
 from ringfence import algos
 from ringfence.algos import icbf
 from ringfence.datasets import registry
+from ringfence.deploy.controller import Controller
 from ringfence.errors import CheckpointError, UserError
 from ringfence.evaluation import protocol, rollout
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.loading import resolve
-from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore

@@ -90,7 +90,7 @@ def test_a_damaged_program_is_compiled_again(tmp_path):
 
 
 def test_an_import_sets_nothing_up():
-    code = "import sys, ringfence; assert 'jax' not in sys.modules; import ringfence.loading.controller, jax; "
+    code = "import sys, ringfence; assert 'jax' not in sys.modules; import ringfence.deploy.controller, jax; "
     code += "assert jax.config.jax_compilation_cache_dir is None"
     inherited = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
     subprocess.run([sys.executable, "-c", code], env=inherited, check=True)

@@ -13,6 +13,7 @@ from ringfence import guard
 from ringfence.datasets import registry
 from ringfence.datasets.make import make
 from ringfence.datasets.recipes import crossing as recipe
+from ringfence.deploy.controller import Controller
 from ringfence.envs import Crossing
 from ringfence.envs.crossing import RADIUS, SIGHT, CrossingState
 from ringfence.envs.film import RED
@@ -21,7 +22,6 @@ from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import unsafe_starts
-from ringfence.loading.controller import Controller
 from ringfence.training import loop, worlds
 from ringfence.world import save
 from ringfence.world.logged import held_out

@@ -1,6 +1,8 @@
 """The log of a controller, and what tells that it was changed."""
 
+import hashlib
 import importlib.util
+import os
 from pathlib import Path
 
 import jax
@@ -9,10 +11,10 @@ import pytest
 
 from ringfence.cli.app import main
 from ringfence.deploy import zoo
+from ringfence.deploy.controller import Controller
 from ringfence.envs import Crossing
 from ringfence.errors import NoSafeAction, UserError
-from ringfence.faults.certificate import digest
-from ringfence.loading.controller import Controller
+from ringfence.evaluation.certificate import digest
 from ringfence.loading.resolve import load
 from ringfence.utils.chained import ChainedLog, LogError, check, records
 
@@ -71,6 +73,58 @@ def test_whatever_is_done_to_a_log_is_named_with_its_record(written):
     assert first_wrong(b"".join(lines[:-1]), last=last) == 5
     written.write_bytes(b"".join(lines[:-1]))
     assert not check(written).ended
+
+
+def test_a_log_goes_on_after_a_full_disk(written, monkeypatch):
+    """What was written of a record is taken back; where that fails, nothing is added any more."""
+    log = ChainedLog(written)
+    write = os.write
+    monkeypatch.setattr("os.write", lambda file, line: write(file, line[:9]))
+    with pytest.raises(UserError, match="the disk is full"):
+        log.add({"kind": "step"})
+    monkeypatch.undo()
+    assert check(written).records == 6
+    log.add({"kind": "step"})
+    assert check(written, last=log.last).records == 7
+    monkeypatch.setattr("os.write", lambda file, line: write(file, line[:9]))
+    monkeypatch.setattr("os.ftruncate", lambda *_: write(-1, b""))  # which no file has
+    with pytest.raises(UserError, match="the disk is full"):
+        log.add({"kind": "step"})
+    monkeypatch.undo()
+    with pytest.raises(UserError, match="was closed"):
+        log.add({"kind": "step"})
+    with pytest.raises(LogError, match="record 7 is cut"):
+        check(written)
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        {"kind": "step"},
+        {"kind": "step", "t": 1e300, "ms": 1.0, "executed": []},
+        {"kind": "step", "t": 0, "ms": "long", "executed": []},
+        {"kind": "step", "t": 0, "ms": 1.0, "executed": [[0.0]], "corrected": [{"agent": -1}]},
+        {"kind": "refused", "t": 0, "why": 7},
+        {"kind": "reset", "t": None},
+    ],
+)
+def test_a_chain_that_no_controller_wrote_is_refused(record, tmp_path, capsys):
+    log = ChainedLog(tmp_path / "forged")
+    log.add({"kind": "begin", "t": 0.0})
+    log.add(record)
+    log.close()
+    main(["log", "verify", str(log.path)])
+    with pytest.raises(SystemExit) as stop:
+        main(["log", "show", str(log.path)])
+    assert stop.value.code == 2 and "record 1 is none of a controller" in " ".join(capsys.readouterr().err.split())
+
+
+def test_deep_nesting_is_refused(tmp_path):
+    body = '{"n":0,"kind":"step","x":' + "[" * 10**5 + "]" * 10**5 + "}"
+    digest = hashlib.blake2b(f"ringfence log 1 {body}".encode(), digest_size=16).hexdigest()
+    (tmp_path / "deep").write_text(f"{digest} {body}\n")
+    with pytest.raises(LogError, match="record 0 is none .it is nested too deeply"):
+        check(tmp_path / "deep")
 
 
 def test_what_is_no_log_is_refused(tmp_path):
@@ -161,6 +215,9 @@ def test_callables_and_unguarded_runs_are_logged_too(run, tmp_path):
     controller = Controller(lambda seen, state: np.ones((len(seen), 2)), log=tmp_path / "a", **given)
     action = controller.act(seen)
     controller.close()
+    with pytest.raises(NoSafeAction, match="was closed") as refused:  # what is not recorded is not done
+        controller.act(seen)
+    np.testing.assert_array_equal(refused.value.last_action, action)
     begin, _, step, _ = records(tmp_path / "a")
     assert begin["policy"] is None and begin["world"] == digest(world)
     np.testing.assert_array_equal(np.float32(step["executed"]), action)

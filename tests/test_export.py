@@ -18,8 +18,9 @@ import pytest
 
 from ringfence.cli.app import main
 from ringfence.deploy import export as exporting
-from ringfence.errors import UserError
-from ringfence.loading.controller import Controller
+from ringfence.deploy.controller import Controller
+from ringfence.deploy.step import Entry, Step
+from ringfence.errors import NoSafeAction, UserError
 from ringfence.loading.resolve import load
 from ringfence.logs.store import EpisodeStore
 from ringfence.proposals.base import Constant
@@ -118,8 +119,7 @@ def test_cloning(run, small_store, tmp_path):
 
 
 def test_a_shield(run, small_store, small_world, tmp_path, capsys):
-    """Its rounds of correction are a loop that ends when nothing is missing. It remembers nothing, so the file does
-    not either."""
+    """Its rounds of correction are a loop that ends when nothing is missing. The file remembers what it did last."""
     pytest.importorskip("jax2onnx")
     from ringfence import world as worlds_files
 
@@ -139,7 +139,8 @@ def test_a_shield(run, small_store, small_world, tmp_path, capsys):
     main(["export", str(run.path), "--out", str(tmp_path / "s.onnx"), *words])
     assert capsys.readouterr().out.strip().endswith("s.onnx")
     call, told = of_onnx(tmp_path / "s.onnx")
-    assert [x["name"] for x in told["inputs"]] == ["observations", "state"] and not told["initial"]
+    assert [x["name"] for x in told["inputs"]] == ["observations", "state", "memory.action"]
+    assert told["initial"] == {"memory.action": 0.0}
     assert told["variant"].startswith("default+shield-learned") and told["guard_options"]["margin"] == 4.0
     steps = played(run, small_store, world=small_world, **SHIELD)
     assert apart(call, told, steps) <= 2e-5  # corrections add up what rounding does (docs/export.md)
@@ -152,9 +153,66 @@ def test_memory_costs_and_noise(run, small_store, small_world, tmp_path):
     steps = played(run, small_store, noisy=True, **options)
     call, told = of_stablehlo(exporting.export(run, tmp_path / "full", "stablehlo", **options))
     names = [x["name"] for x in told["inputs"]]
-    assert names == ["observations", "state", "cost", "noise.0", "memory.age", "memory.last", "memory.margin"]
+    assert names == [
+        "observations",
+        "state",
+        "cost",
+        "noise.0",
+        "memory.age",
+        "memory.last",
+        "memory.margin",
+        "memory.action",
+    ]
     assert apart(call, told, steps) <= 1e-5
     assert told["initial"]["memory.margin"] == 1.0
+
+
+@pytest.mark.parametrize("format", exporting.FORMATS)
+def test_what_is_not_finite_is_said_and_not_acted_upon(format, run, small_store, small_world, tmp_path):
+    """A controller refuses; a file gives the same last action, is as it was, and acts again when it sees."""
+    if format == "onnx":
+        pytest.importorskip("jax2onnx")
+    options = {**SHIELD, "adapt": 0.1, "world": small_world}
+    file = exporting.export(run, tmp_path / f"g.{format}", format, **options)
+    call, told = (of_onnx if format == "onnx" else of_stablehlo)(file)
+    controller = Controller(run, **options)
+    shapes = {x["name"]: x["shape"] for x in told["inputs"]}
+    start = {k: np.broadcast_to(np.asarray(v, np.float32), shapes[k]) for k, v in told["initial"].items()}
+
+    def at(t, memory):
+        given = {"observations": small_store.observations[t], "state": small_store.state[t], "cost": np.float32(np.nan)}
+        types = {x["name"]: x["dtype"] for x in told["inputs"]}
+        return {k: np.array((given | memory)[k], types[k]) for k in shapes}
+
+    def remembered(out):
+        return {f"memory.{k[5:]}": np.asarray(v) for k, v in out.items() if k.startswith("next.")}
+
+    for name in ("observations", "state"):
+        for bad in (np.nan, np.inf):
+            for place in (0, -1, slice(None)):
+                first = at(0, start)
+                first[name].flat[place] = bad
+                out = call(first)
+                assert (np.asarray(out["action"]) == 0).all() and out["info.infeasible"] and out["info.ood"]
+                assert np.isnan(out["info.clearance"]) and np.isnan(out["info.next_clearance"])
+    memory = remembered(call(at(0, start)))
+    action = controller.act(small_store.observations[0], small_store.state[0])
+    blind = at(1, memory)
+    blind["observations"][1, 0] = np.nan
+    with pytest.raises(NoSafeAction) as refused:
+        controller.act(blind["observations"], blind["state"])
+    out = call(blind)
+    np.testing.assert_array_equal(refused.value.last_action, action)
+    np.testing.assert_allclose(out["action"], action, atol=2e-5)
+    for key, value in remembered(out).items():
+        np.testing.assert_array_equal(value, memory[key])
+    out = call(at(2, remembered(out)))
+    np.testing.assert_allclose(
+        out["action"], controller.act(small_store.observations[2], small_store.state[2]), atol=2e-5
+    )
+    assert out["info.infeasible"] == controller.info["infeasible"] and out["info.ood"] == controller.info["ood"]
+    alone, _ = (of_onnx if format == "onnx" else of_stablehlo)(exporting.export(run, tmp_path / f"a.{format}", format))
+    assert np.isnan(alone({"observations": blind["observations"]})["action"]).all(), "nobody acts upon half of a team"
 
 
 def test_plans_are_drawn_from_the_noise_that_is_given(planner, small_store, tmp_path):
@@ -246,14 +304,23 @@ def test_bad_input_is_refused_in_a_sentence(run, tmp_path, capsys, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["both", "file"]
 
 
-def test_what_cannot_be_exported_is_named(run, tmp_path):
+def test_what_cannot_be_exported_is_named(run, tmp_path, monkeypatch):
     job, _ = load(run)
     with pytest.raises(UserError, match="draws more than normal noise"):
         exporting.step_of(job, Constant(job.spec, random=True))
     pytest.importorskip("jax2onnx")
-    one, two = (exporting.Entry(name, (3,), "float32") for name in ("observations", "action"))
+    one, two = (Entry(name, (3,), "float32") for name in ("observations", "action"))
     there = jax.ShapeDtypeStruct((3,), "float32")
-    odd = exporting.Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [], {})
+    odd = Step(lambda x: [jax.pure_callback(np.sin, there, x)], (one,), (two,), {}, lambda key: [], {})
+    with monkeypatch.context() as few, pytest.raises(UserError, match="has .* operations.*look less far ahead"):
+        few.setattr(exporting, "MAX_OPERATIONS", 3)
+        exporting.export(run, tmp_path / "x.onnx")
+    seen_then = []
+    with monkeypatch.context() as watched:
+        watched.setattr(exporting, "as_onnx", lambda step: seen_then.extend(tmp_path.iterdir()) or 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            exporting.export(run, tmp_path / "x.onnx")
+    assert not seen_then and not [*tmp_path.iterdir()], "who is killed while converting leaves nothing"
     with pytest.raises(UserError, match="cannot be written as ONNX .*pure_callback.*; write it as StableHLO"):
         exporting.as_onnx(odd)
 

@@ -14,8 +14,12 @@ import pytest
 
 from ringfence import algos
 from ringfence.algos import drivers, flow
+from ringfence.deploy.export import metadata_of
+from ringfence.deploy.step import Step
 from ringfence.errors import UserError
-from ringfence.loading.resolve import load
+from ringfence.evaluation.certificate import digest
+from ringfence.loading.resolve import load, resolve
+from ringfence.loading.spec import PolicySpec
 from ringfence.logs.store import EpisodeStore
 from ringfence.logs.windows import WindowData, at
 from ringfence.proposals.base import act_with
@@ -356,6 +360,12 @@ def test_plans_are_guided_to_the_margin(two_drifts, tmp_path, caplog):
     assert free.max() > 0.3 and guided.max() < -0.3
     far = Line(policy.spec, ood_threshold=1.0, edge=5.0)
     np.testing.assert_allclose(ends(dataclasses.replace(policy, world=far, guidance=1.0)), free, atol=1e-6)
+    step = Step(lambda: [], (), (), {}, lambda key: [])
+    told = [
+        metadata_of(resolve(PolicySpec.of(run, **how)), step) for how in ({}, {"barrier_guidance": 1.0, "anyway": True})
+    ]
+    digests = [None, digest(worlds.load(run.path / worlds.WORLD))]
+    assert [(one["guiding_world"], one["world"]) for one in told] == [(one, None) for one in digests]
 
 
 @pytest.mark.parametrize("name", ["madiff", "flow"])

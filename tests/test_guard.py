@@ -12,6 +12,7 @@ import pytest
 import ringfence
 from ringfence import world
 from ringfence.datasets import registry
+from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
 from ringfence.evaluation.evaluate import evaluate
 from ringfence.guards import BarrierSource, Guard, GuardOptions
@@ -20,7 +21,6 @@ from ringfence.guards.filter import pick
 from ringfence.guards.policy import build
 from ringfence.guards.shown import Shown
 from ringfence.loading import run_worlds
-from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
 from ringfence.problem import constraints
 from ringfence.proposals.base import Constant

@@ -19,13 +19,13 @@ from ringfence.envs.episode import Episode
 from ringfence.envs.pettingzoo import SimpleSpreadParallel
 from ringfence.errors import UserError
 from ringfence.evaluation import stress
+from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.certify import certify
 from ringfence.evaluation.own_trials import Foresight
 from ringfence.evaluation.play import play_tables
 from ringfence.evaluation.player import player_of_run, shape_of
 from ringfence.evaluation.simulators import simulator
 from ringfence.faults import Faults
-from ringfence.faults.certificate import Certificate
 from ringfence.loading import resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.logs.collect import collect

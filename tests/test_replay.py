@@ -9,7 +9,9 @@ from msgspec.structs import replace
 
 import ringfence
 from ringfence.cli import app
+from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
+from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.certify import certify
 from ringfence.evaluation.replay import judge
 from ringfence.evaluation.replay.judge import Body, Played, check_view, radius_of, rows_of
@@ -20,10 +22,8 @@ from ringfence.evaluation.replay.stage import Stage
 from ringfence.evaluation.replay.trials import Windowed
 from ringfence.evaluation.statistics import upper_bound
 from ringfence.faults import Faults
-from ringfence.faults.certificate import Certificate
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
-from ringfence.loading.controller import Controller
 from ringfence.logs.store import EpisodeStore
 from ringfence.problem.names import Names
 from ringfence.report import replay_page

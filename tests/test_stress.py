@@ -1,8 +1,11 @@
 """Faults of a closed loop, and guards that know them."""
 
 import dataclasses
+import hashlib
 import json
 import re
+import shutil
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -10,29 +13,33 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.stats import beta
 
 import ringfence
 from ringfence.cli.app import main
 from ringfence.deploy import zoo
+from ringfence.deploy.controller import Controller
+from ringfence.deploy.stamps import Stamps
 from ringfence.envs import Crossing
 from ringfence.envs.mujoco import SafeMuJoCo
 from ringfence.envs.pettingzoo import CrossingParallel
 from ringfence.errors import NoSafeAction, UserError
+from ringfence.evaluation.certificate import Certificate, digest
 from ringfence.evaluation.certify import certify, conformal, judged, shortfalls
 from ringfence.evaluation.compensation import compensated, compensation, own_acceleration
 from ringfence.evaluation.evaluate import evaluate
+from ringfence.evaluation.monitor import Monitor
 from ringfence.evaluation.rollout import rollout
 from ringfence.evaluation.statistics import upper_bound
+from ringfence.evaluation.stress import FILE
 from ringfence.faults import Faults
-from ringfence.faults.certificate import Certificate, digest
-from ringfence.faults.monitor import Monitor
 from ringfence.faults.policy import Faulty, under_faults
+from ringfence.guards.options import GuardOptions
 from ringfence.guards.policy import build
 from ringfence.guards.wrap import Nothing
-from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load, resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.loading.stamps import Stamps
+from ringfence.training.runs import Run, add_entry
 from ringfence.types import PolicyStep
 from ringfence.utils.chained import records
 from ringfence.utils.precision import full_products
@@ -346,6 +353,26 @@ def test_the_command_line_stresses(run, capsys):
         assert words in " ".join(capsys.readouterr().err.split())
 
 
+def test_what_others_keep_meanwhile_stays(run, tmp_path, monkeypatch):
+    copy = Run(shutil.copytree(run.path, tmp_path / "copy"))
+    file = copy.path / FILE
+    file.unlink(missing_ok=True)
+
+    def meanwhile(*_):
+        add_entry(file, lambda: {}, "other", {"of": "another process"})
+        return {"episodes": 1}, None
+
+    monkeypatch.setattr("ringfence.evaluation.stress.evaluate_policy", meanwhile)
+    ringfence.stress(copy, {"gain": 0.7}, episodes=1)
+    assert [*json.loads(file.read_text())] == ["other", "default behind gain0.7"]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda k: copy.add_result(f"variant{k}", {"return_mean": float(k)}), range(24)))
+    assert {f"variant{k}" for k in range(24)} <= copy.results.keys() and "more" not in copy.results
+    with pytest.raises(UserError, match="holds finite numbers alone, and return_interval = inf is none"):
+        copy.add_result("more", {"return_interval": (0.0, np.inf)})
+    assert {f"variant{k}" for k in range(24)} <= copy.results.keys() and "more" not in copy.results
+
+
 def test_compensating_and_saying_so_oneself_are_one_too_many(run):
     with pytest.raises(UserError, match="compensate and delay both tell the guard"):
         ringfence.stress(run, {"delay": 1}, guard="shield", delay=1, compensate=True)
@@ -444,9 +471,83 @@ def test_a_margin_is_calibrated_and_its_promise_kept_to_whom_it_was_made(run, fe
     assert any("95" in line for line in made.summary())
 
 
+def _promised(**changes):
+    """What a certificate's file holds, with its digest made anew, as whoever forges one would."""
+    found = {
+        "policy": "a",
+        "world": "b",
+        "task": "t",
+        "agents": 2,
+        "guard": dataclasses.asdict(GuardOptions(margin=1.0)),
+        "barrier": "learned",
+        "faults": dataclasses.asdict(Faults()),
+        "confidence": 0.95,
+        "bound": float(beta.ppf(0.95, 21, 10)),  # Clopper and Pearson's, by another function
+        "episodes": 30,
+        "violations": 20,
+        "rounds": [{"margin": 1.0, "quantile": 0.5, "episodes": 19}],
+        "agreed": True,
+        "held": 1.0,
+        "infeasible_rate": 0.0,
+        "replayed": None,
+        "simulator": "",
+        "format": 2,
+        "says": ["It is safe."],
+    } | changes
+    words = json.dumps(found, sort_keys=True)
+    return found | {"digest": hashlib.blake2b(words.encode(), digest_size=16).hexdigest()}
+
+
+def test_a_certificate_is_believed_only_where_its_counts_say_so(tmp_path):
+    file = tmp_path / "cert.json"
+    file.write_text(json.dumps(_promised()))
+    assert Certificate.load(file).violations == 20
+    options = _promised()["guard"]
+    last = {"margin": 1.0, "quantile": 0.5, "episodes": 19}
+    for changes, words in (
+        ({"bound": 0.0067}, "20 of 30 violations are a bound of 0.8"),
+        ({"bound": "0.03"}, "Expected `float`"),
+        ({"bound": None}, "Expected `float`"),
+        ({"violations": -5}, ">= 0"),
+        ({"violations": 31}, "31 of 30"),
+        ({"confidence": 7}, "< 1.0"),
+        ({"episodes": 0}, ">= 1"),
+        ({"guard": {}}, "does not say"),
+        ({"guard": options | {"margin": -5.0}}, "margin=-5.0 is not the one"),
+        ({"guard": options | {"margin": -5.0}, "rounds": [last | {"margin": -5.0}]}, ">= 0"),
+        ({"guard": options | {"horizon": 10**9}}, "horizon"),
+        ({"guard": options | {"horizon": "3"}}, "other types"),
+        ({"guard": options | {"turbo": 1}}, "turbo"),
+        ({"guard": [[]]}, "Expected `object`"),
+        ({"barrier": "hope"}, "which there is not"),
+        ({"faults": {"delay": 1}}, "does not say"),
+        ({"rounds": []}, "length"),
+        ({"agreed": False}, "last batch"),
+        ({"replayed": {"seconds": 1.0}}, "missing required field"),
+        ({"format": 1}, "format 1"),
+        ({"held": 2.0}, "<= 1.0"),
+    ):
+        file.write_text(json.dumps(_promised(**changes)))
+        with pytest.raises(UserError, match=words):
+            Certificate.load(file)
+    for name in _promised():  # without its digest made anew, whatever is changed
+        file.write_text(json.dumps(_promised() | {name: ["changed"]}))
+        with pytest.raises(UserError, match="is no certificate"):
+            Certificate.load(file)
+    for content in (b"[" * 10**5, b"[]", b"null", b"\xff", b"", b'{"format": NaN}'):
+        file.write_bytes(content)
+        with pytest.raises(UserError, match="is no certificate"):
+            Certificate.load(file)
+    with open(file, "wb") as large:
+        large.truncate(2**40)
+    with pytest.raises(UserError, match="is larger than 1 MiB"):
+        Certificate.load(file)
+
+
 @pytest.mark.parametrize(
     "given, words",
     [
+        ({"margin": -5.0}, "keeps no distance"),
         ({"confidence": 1.0}, "confidence=1.0 must lie between 0 and 1"),
         ({"calibration": 10}, "calibration=10 episodes tell no quantile of 0.95; give 19 or more"),
         ({"guard": "adapt"}, "An adapting margin cannot be frozen"),
@@ -494,12 +595,12 @@ def test_what_is_done_on_an_alarm_is_an_option(run, tmp_path):
         agents=8,
         guard=dataclasses.asdict(guard.options),
         barrier="learned",
-        faults={},
+        faults=dataclasses.asdict(Faults()),
         confidence=0.95,
-        bound=0.02,
+        bound=upper_bound(2, 300),
         episodes=300,
         violations=2,
-        rounds=(),
+        rounds=({"margin": guard.options.margin, "quantile": 0.0, "episodes": 100},),
         agreed=True,
         held=1.0,
         infeasible_rate=0.0,
@@ -529,8 +630,10 @@ def test_what_is_done_on_an_alarm_is_an_option(run, tmp_path):
     widens, _ = alarmed(on_alarm="widen")
     assert widens.policy.one.guard.options.margin == pytest.approx(1.5 * made.guard["margin"])
     widens.act(seen)
-    hands_over, _ = alarmed(on_alarm="hand_over", fallback=lambda seen: np.full((8, 2), 0.25))
-    np.testing.assert_array_equal(hands_over.act(seen), 0.25)
+    for wanted, done in ((0.25, 0.25), (1e6, 1.0), (-1e6, -1.0)):
+        hands_over, _ = alarmed(on_alarm="hand_over", fallback=lambda seen, wanted=wanted: np.full((8, 2), wanted))
+        np.testing.assert_array_equal(hands_over.act(seen), done)
+        hands_over.close()
     for wrong, words in (
         ({"on_alarm": "panic"}, "is none of its choices"),
         ({"on_alarm": "hand_over"}, "go together"),

@@ -9,9 +9,9 @@ import pytest
 
 from ringfence.cli import app
 from ringfence.deploy import zoo
+from ringfence.deploy.controller import Controller
 from ringfence.errors import UserError
 from ringfence.loading import run_worlds
-from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import load
 from ringfence.training import loop
 from ringfence.training.runs import Run

@@ -18,7 +18,7 @@ _WHERE = {
     "All": "ringfence.problem.constraints",
     "train": "ringfence.training.loop",
     "load": "ringfence.loading.resolve",
-    "Controller": "ringfence.loading.controller",
+    "Controller": "ringfence.deploy.controller",
     "play": "ringfence.evaluation.play",
     "stress": "ringfence.evaluation.stress",
     "Faults": "ringfence.faults",
@@ -32,7 +32,7 @@ _WHERE = {
     "World": "ringfence.world",
     "fit": "ringfence.training.worlds",
     "load_world": "ringfence.training.worlds:load",
-    "guard": "ringfence.loading.controller",
+    "guard": "ringfence.deploy.controller",
     "build_report": "ringfence.report",
     "UserError": "ringfence.errors",
 }

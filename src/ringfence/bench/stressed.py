@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 
 from ringfence.errors import UserError
 from ringfence.evaluation import compensation, stress
+from ringfence.evaluation.certificate import Certificate
 from ringfence.evaluation.protocol import PROTOCOL
 from ringfence.faults import Faults
-from ringfence.faults.certificate import Certificate
 from ringfence.loading.spec import PolicySpec
 from ringfence.training.runs import Run
 from ringfence.utils import csvs

@@ -6,7 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 from rich import box
@@ -473,7 +473,7 @@ def export(
     given = playing.arguments()
     from ringfence.deploy.export import export as write
 
-    print(write(_one_run(run), out_file, format, checkpoint, **given))
+    print(write(_one_run(run), out_file, format, checkpoint, quiet=False, **given))
 
 
 def ope(
@@ -637,19 +637,32 @@ def main(arguments: list[str] | None = None) -> None:
             description=description,
             args=arguments[len(group) :],
         )
-    except UserError as error:
-        complain(str(error))
-        sys.exit(2)
+        interrupts.check()  # a library may have swallowed it
     except KeyboardInterrupt as stopped:
-        said = str(stopped) or "interrupted; the same command goes on from the last checkpoint"
-        print(said, file=sys.stderr)
-        sys.exit(130)
-    except BrokenPipeError:
-        sys.exit(1)
-    except OSError as error:  # of a path that nobody looked at before
+        _say_interrupted(str(stopped))
+    except Exception as error:
+        if interrupts.asked():  # a library may have made another error of it
+            _say_interrupted()
+        sys.exit(_say_refused(error))
+
+
+def _say_refused(error: Exception) -> int:
+    """The exit status after an error, which is said in a sentence where it is a user's to mend."""
+    if isinstance(error, BrokenPipeError):
+        return 1
+    if isinstance(error, UserError):
+        complain(str(error))
+    elif isinstance(error, OSError):  # of a path that nobody looked at before
         what = f"'{error.filename}': {error.strerror}" if error.filename else str(error)
         complain(f"{what}; check that the path is what you mean and that you may use it.")
-        sys.exit(2)
+    else:
+        raise error
+    return 2
+
+
+def _say_interrupted(said: str = "") -> NoReturn:
+    print(said or "interrupted; the same command goes on from the last checkpoint", file=sys.stderr)
+    sys.exit(interrupts.STATUS)
 
 
 def _group_of(arguments: list[str]) -> tuple[list[str], dict[str, Any], str]:

@@ -18,7 +18,7 @@ from ringfence.utils.escape import terminal
 
 if TYPE_CHECKING:
     from ringfence.bench import Grid
-    from ringfence.faults.certificate import Certificate
+    from ringfence.evaluation.certificate import Certificate
 
 out = console()
 Positional = tyro.conf.Positional
@@ -138,7 +138,7 @@ def _grids(
 
 def _load_certificate(file: Path, suite: str) -> Certificate:
     """What is read by the suite that plays behind faults alone."""
-    from ringfence.faults.certificate import Certificate
+    from ringfence.evaluation.certificate import Certificate
 
     if suite != "stress":
         raise UserError(f"--certificate is read by the suite stress alone, and this is {suite}; leave it out.")

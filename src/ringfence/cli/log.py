@@ -44,13 +44,18 @@ def show(file: Positional[Path], first: int = 0, number: int = 20) -> None:
         first: record that is shown first.
         number: how many are shown.
     """
-    from ringfence.utils.chained import records
+    from ringfence.utils import schemas
+    from ringfence.utils.chained import LogError, records
 
     whole_number("first", first)
     whole_number("number", number)
     counts: Counter[str] = Counter()
     every = records(file)
     for record in every:
+        try:
+            schemas.check(record, schemas.RECORDS.get(record["kind"], schemas.Event))
+        except ValueError as error:
+            raise LogError(f"'{file}': record {record['n']} is none of a controller ({error}).", record["n"]) from None
         _count(counts, record)
         if first <= record["n"] < first + number:
             for line in in_words(record):
@@ -76,9 +81,11 @@ def in_words(record: dict[str, Any]) -> list[str]:
     found = [f"{head}  {record['ms']:.1f} ms" + "".join(f", {flag}" for flag in flags)]
     for one in record.get("corrected", ()):
         thing = f" of {one['thing']}" if one["thing"] else ""
+        executed = dict(enumerate(record["executed"])).get(one["agent"])
+        score = "no number of" if one["score"] is None else f"{one['score']:.3g}"
         found.append(
-            f"        agent {one['agent']}: {one['requested']} -> {record['executed'][one['agent']]}, since "
-            f"{one['constraint']}{thing} came to {one['score']:.3g} margins in row {one['row']}"
+            f"        agent {one['agent']}: {one['requested']} -> {executed}, since {one['constraint']}{thing} came to "
+            f"{score} margins in row {one['row']}"
         )
     return found
 

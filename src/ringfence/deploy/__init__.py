@@ -1,1 +1,1 @@
-"""Policies that leave: exported files, and those that come with the package."""
+"""Policies that leave: at run time, as exported files, and those that come with the package."""

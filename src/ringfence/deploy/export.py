@@ -5,9 +5,9 @@ The function in the file is one joint action of `evaluate.Controller`, of one en
     observations (N, O), state (S,), cost (), noise.K, memory.NAME  ->  action (N, A), info.NAME (), next.NAME
 
 Whatever nothing reads is left out: cloning under a shield takes observations (and the state, where its World sees it)
-and remembers nothing. `next.NAME` is `memory.NAME` of the step after; `cost` is what the last step cost, NaN where
-nobody gave; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random numbers
-differ between runtimes. What is carried begins with, names, shapes and the facts of the run are metadata of the file.
+and remembers its last action alone. `next.NAME` is `memory.NAME` of the step after; `cost` is what the last step cost,
+NaN where nobody gave; `noise.K` are standard normal numbers, drawn afresh for every step, since generators of random
+numbers differ between runtimes. What is carried begins with, names, shapes and the facts of the run are metadata.
 
 Observations and states of logs that were moved towards 0 (`origins` of the metadata) come in float64, as they were
 measured, and the file takes the origins from them.
@@ -16,13 +16,14 @@ measured, and the file takes the origins from them.
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import logging
 import math
+import sys
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,58 +31,27 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend import core
 
 from ringfence import __version__
-from ringfence.deploy.jaxpr import Interpreter, bind, draws, live, value, values_of
+from ringfence.deploy.jaxpr import operations
+from ringfence.deploy.step import Step, constraints_of, step_of
 from ringfence.errors import UserError, unknown
-from ringfence.guards import Guarded
+from ringfence.evaluation.certificate import digest
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem.bounds import stored
-from ringfence.problem.homogeneous import agent_policy
-from ringfence.proposals.base import with_cost
+from ringfence.proposals.guidance import TakesGuidance
 from ringfence.training import worlds
-from ringfence.training.job import Job
 from ringfence.training.runs import Run
-from ringfence.types import Array, Key, Policy
+from ringfence.types import Array
 from ringfence.utils.files import whole, writable
 from ringfence.utils.precision import float64, in_float32
-from ringfence.utils.pytrees import digest_of, named_arrays, named_leaves
+from ringfence.utils.progress import Progress
 
 FORMATS = ("onnx", "stablehlo")
 OPSET = 21  # of ONNX: onnxruntime 1.20 (2024) and younger read it
-INFO = ("clearance", "next_clearance", "infeasible", "ood", "chosen")  # of what a policy tells, what is one number
-
-
-@dataclass(frozen=True)
-class Entry:
-    """One input or output of the function."""
-
-    name: str
-    shape: tuple[int, ...]
-    dtype: str  # float32, int32 or bool; float64 of what is moved
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """One joint action as a function of arrays alone, in the order of `inputs`, and what its carry begins with."""
-
-    call: Callable[..., list[Array]]
-    inputs: tuple[Entry, ...]
-    outputs: tuple[Entry, ...]
-    initial: dict[str, np.ndarray]  # by the inputs' names
-    draw: Callable[[Key], list[Array]]  # the noise that `Controller` would draw by a key
-    origins: dict[str, np.ndarray] = field(default_factory=dict)  # what a file takes from inputs first, by their names
-
-    @property
-    def avals(self) -> list[jax.ShapeDtypeStruct]:
-        return [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in self.inputs]
-
-    @property
-    def measured(self) -> tuple[Entry, ...]:
-        """The inputs of a file."""
-        return tuple(dataclasses.replace(x, dtype="float64") if x.name in self.origins else x for x in self.inputs)
+MANY = 3000  # operations, which take half a minute
+MAX_OPERATIONS = 20_000  # that jax2onnx converts in a quarter of an hour; its time grows with their square
 
 
 @in_float32
@@ -91,6 +61,7 @@ def export(
     format: str = "onnx",
     checkpoint: int | None = None,
     planner: str = "default",
+    quiet: bool = True,
     **options: Any,
 ) -> Path:
     """Write the policy of a finished run to the file `out`: `onnx`, for onnxruntime and the like, needs the extra
@@ -105,161 +76,26 @@ def export(
     resolved = resolve(PolicySpec.of(run, checkpoint=checkpoint, planner=planner, **options))
     action = step_of(resolved.job, resolved.team)
     metadata = metadata_of(resolved, action)
-    write = _write_onnx if format == "onnx" else _write_stablehlo
-    with whole(file) as temporary:
-        write(action, metadata, temporary)
+    count = _operations(action) if format == "onnx" else 0
+    if not quiet and count > MANY:
+        print(f"ONNX of {count:,} operations takes some minutes.", file=sys.stderr)
+    with Progress(f"{file.name}{f', {count:,} operations' * bool(count)}", 1, 0, quiet) as bar:
+        content = _onnx(action, metadata) if format == "onnx" else _stablehlo(action, metadata)
+        bar.advance(1)
+    with whole(file) as temporary:  # at once: who is stopped while converting leaves nothing
+        temporary.write_bytes(content)
     return file
 
 
-def _constraints(policy: Policy) -> list[str]:
-    """The named ones that a guard's margins follow apart."""
-    inner = agent_policy(policy)
-    return list(inner.guard.barrier.limits) if isinstance(inner, Guarded) else []
-
-
-# --- the function ---
-
-
-@dataclass(frozen=True, eq=False)
-class _Traced:
-    """One joint action as programs: the one that draws, and the one that is given its noise instead."""
-
-    drawing: core.ClosedJaxpr  # (key, *seen, *carry) -> (*results, *carry)
-    given: core.ClosedJaxpr  # (key, *seen, *noise, *carry) -> (*results, *carry)
-    seen: dict[str, jax.ShapeDtypeStruct]
-    noise: dict[str, jax.ShapeDtypeStruct]
-    carry: dict[str, Array]  # what it begins with
-    results: list[str]  # the action and what is known of it
-
-    @property
-    def inputs(self) -> dict[str, Any]:
-        """Arrays or their shapes, by name; the key, which comes first, is no input of a file."""
-        return self.seen | self.noise | self.carry
-
-    @property
-    def outputs(self) -> list[str]:
-        return [*self.results, *(name.replace("memory.", "next.", 1) for name in self.carry)]
-
-
-def step_of(job: Job, policy: Policy) -> Step:
-    """One joint action of a policy in one environment, without what nothing reads."""
-    traced = _trace(job, policy)
-    program = traced.given.jaxpr
-    names = list(traced.inputs)
-    equations, used = live(program, ["key", *names], list(traced.carry), len(traced.results))
-    if "key" in used:
+def _operations(step: Step) -> int:
+    """How many an ONNX file has to hold; too many are refused."""
+    count = operations(jax.make_jaxpr(step.call)(*step.avals).jaxpr)
+    if count > MAX_OPERATIONS:
         raise UserError(
-            "This policy draws more than normal noise, and a file holds nothing that draws; play it with "
-            "ringfence.Controller."
+            f"This policy has {count:,} operations, and more than {MAX_OPERATIONS:,} take hours to write as ONNX; look "
+            "less far ahead (horizon=), or write it as StableHLO."
         )
-    used -= _constant_carry(traced)
-    inputs = [k for k, name in enumerate(names) if name in used]
-    outputs = [k for k, name in enumerate(traced.outputs) if k < len(traced.results) or _before(name) in used]
-    unread = {variable: traced.carry[name] for name, variable in zip(names, program.invars[1:]) if name in traced.carry}
-    constants = _shared(values_of(traced.given)) | unread
-
-    def call(*arrays: Array) -> list[Array]:
-        known = constants | {program.invars[1 + k]: array for k, array in zip(inputs, arrays)}
-        for equation in equations:
-            read = [value(variable, known) for variable in equation.invars]
-            known.update(zip(equation.outvars, bind(equation, read)))
-        return [value(program.outvars[k], known) for k in outputs]
-
-    shapes = list(traced.inputs.values())
-    avals = traced.given.out_avals
-    return Step(
-        call,
-        tuple(_entry(names[k], shapes[k]) for k in inputs),
-        tuple(_entry(traced.outputs[k], avals[k]) for k in outputs),
-        {name: np.asarray(array) for name, array in traced.carry.items() if name in used},
-        jax.jit(partial(_drawn, traced)),
-        {name: np.array(x) for name, x in dataclasses.asdict(job.origins).items() if x is not None and name in used},
-    )
-
-
-def _trace(job: Job, policy: Policy) -> _Traced:
-    """A policy's programs, before anything is left out."""
-    seen = _seen(job, policy)
-    carry = policy.initial_state(1)
-    leaves, structure = jax.tree.flatten(carry)
-    constraints = _constraints(policy)
-
-    def act(key: Key, seen_arrays: Sequence[Array], leaves: Sequence[Array]) -> tuple[dict[str, Array], list[Array]]:
-        read = dict(zip(seen, seen_arrays))
-        costs = {name: read["cost"][k : k + 1] for k, name in enumerate(constraints)}
-        carry = with_cost(policy, jax.tree.unflatten(structure, leaves), costs or read["cost"][None])
-        state = read["state"][None] if "state" in read else None
-        carry, step = policy.act(carry, read["observations"][None], state, key)
-        info = {f"info.{k}": step.info[k][0] for k in INFO if k in step.info and step.info[k].ndim == 1}
-        return {"action": step.action[0]} | info, jax.tree.leaves(carry)
-
-    key = jax.random.key(0)
-    drawing, (results, _) = jax.make_jaxpr(act, return_shape=True)(key, list(seen.values()), leaves)
-    noise = {f"noise.{k}": shape for k, shape in enumerate(draws(drawing.jaxpr))}
-
-    def act_given(key: Key, *arrays: Array) -> list[Array]:
-        """The action with noise given instead of drawn."""
-        given = iter(arrays[len(seen) : len(seen) + len(noise)])
-        interpreter = Interpreter(lambda *_: next(given), simplify=True)
-        return interpreter.run(drawing, (key, *arrays[: len(seen)], *arrays[len(seen) + len(noise) :]))
-
-    given = jax.make_jaxpr(act_given)(key, *seen.values(), *noise.values(), *leaves)
-    names = [f"memory.{name}" for name, _ in named_leaves(carry)]
-    return _Traced(drawing, given, seen, noise, dict(zip(names, leaves)), list(results))
-
-
-def _seen(job: Job, policy: Policy) -> dict[str, jax.ShapeDtypeStruct]:
-    """What a policy may be given of one environment at every step."""
-    width, state_width = job.widths
-    if width is None or state_width is None:
-        raise UserError(
-            "This run does not tell how wide its observations and state are, and a file has to; train it again."
-        )
-    num_constraints = len(_constraints(policy))
-    shapes: dict[str, tuple[int, ...]] = {"observations": (job.team, width)}
-    if state_width:
-        shapes["state"] = (state_width,)
-    shapes["cost"] = (num_constraints,) if num_constraints else ()
-    return {name: jax.ShapeDtypeStruct(shape, jnp.float32) for name, shape in shapes.items()}
-
-
-def _drawn(traced: _Traced, key: Key) -> list[Array]:
-    """The noise that the policy would draw by a key."""
-    noise: list[Array] = []
-
-    def keep(equation: core.JaxprEqn, inputs: list[Any]) -> Array:
-        noise.append(bind(equation, inputs)[0])
-        return noise[-1]
-
-    zeros = [jnp.zeros(shape.shape, shape.dtype) for shape in traced.seen.values()]
-    Interpreter(keep).run(traced.drawing, (key, *zeros, *traced.carry.values()))
-    return noise
-
-
-def _constant_carry(traced: _Traced) -> set[str]:
-    """Names of carry that no step changes: it is a constant."""
-    program = traced.given.jaxpr
-    before = program.invars[len(program.invars) - len(traced.carry) :]
-    after = program.outvars[len(traced.results) :]
-    return {name for name, old, new in zip(traced.carry, before, after) if new is old}
-
-
-def _before(name: str) -> str:
-    """The input that `next.NAME` is in the step after."""
-    return name.replace("next.", "memory.", 1)
-
-
-def _shared(constants: dict[Any, Any]) -> dict[Any, Any]:
-    """Arrays that are the same are kept once."""
-    kept: dict[tuple, Any] = {}
-    return {
-        variable: kept.setdefault((variable.aval.shape, str(variable.aval.dtype), np.asarray(array).tobytes()), array)
-        for variable, array in constants.items()
-    }
-
-
-def _entry(name: str, array: Any) -> Entry:
-    return Entry(name, tuple(array.shape), str(array.dtype))
+    return count
 
 
 # --- metadata ---
@@ -272,6 +108,7 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
     job = resolved.job
     guard = resolved.guard
     plan_options = resolved.plan_options
+    guiding = resolved.proposal.world if isinstance(resolved.proposal, TakesGuidance) else None
     config = spec.run.config
     data = config["data"]
     width, state_width = job.widths
@@ -294,10 +131,11 @@ def metadata_of(resolved: Resolved, step: Step) -> dict[str, Any]:
         "guard_options": dataclasses.asdict(guard.options) if guard else {},
         "barrier": spec.barrier if guard else "none",
         "execution": worlds.execution_of(job.task, "decentralized" if guard and guard.world.alone else None),
-        "world": digest_of(sorted(named_arrays(guard.world).items())) if guard else None,
+        "world": digest(guard.world) if guard else None,
+        "guiding_world": None if guiding is None else digest(guiding),
         "n_agents": job.team,
         "names": {k: list(x) for k, (x, count) in names.items() if x is not None and len(x) == count},
-        "constraints": _constraints(resolved.team),
+        "constraints": constraints_of(resolved.team),
         "action_low": stored(job.spec.action_low),
         "action_high": stored(job.spec.action_high),
         "inputs": [dataclasses.asdict(x) for x in step.measured],
@@ -335,7 +173,7 @@ def _json(metadata: dict[str, Any], indent: int | None = None) -> str:
 # --- formats ---
 
 
-def _write_stablehlo(step: Step, metadata: dict[str, Any], file: Path) -> None:
+def _stablehlo(step: Step, metadata: dict[str, Any]) -> bytes:
     """A ZIP of three: `metadata.json`, `policy.mlirbc` (the portable StableHLO program, for any runtime that reads it)
     and `policy.jax` (the same for `jax.export.deserialize`). Nothing in it depends on a platform."""
     jax_export = _packer()
@@ -350,9 +188,11 @@ def _write_stablehlo(step: Step, metadata: dict[str, Any], file: Path) -> None:
         "policy.mlirbc": program.mlir_module_serialized,
         "policy.jax": bytes(program.serialize()),
     }
+    file = io.BytesIO()
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as packed:
         for name, content in contents.items():
             packed.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), content, zipfile.ZIP_DEFLATED)
+    return file.getvalue()
 
 
 def _of_measured(step: Step, program: Any, pack: Callable[..., Any]) -> Any:
@@ -379,12 +219,12 @@ def _without_locations() -> Iterator[None]:
         jax.config.update(option, limit)
 
 
-def _write_onnx(step: Step, metadata: dict[str, Any], file: Path) -> None:
+def _onnx(step: Step, metadata: dict[str, Any]) -> bytes:
     model = as_onnx(step)
     _take_origins(model.graph, step.origins)
     for name, text in {"ringfence": _json(metadata), **_flat(step.initial)}.items():
         model.metadata_props.add(key=name, value=text)
-    file.write_bytes(model.SerializeToString())
+    return model.SerializeToString()
 
 
 def _take_origins(graph: Any, origins: dict[str, np.ndarray]) -> None:

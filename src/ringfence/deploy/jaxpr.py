@@ -189,6 +189,11 @@ def programs_in(equation: core.JaxprEqn) -> Iterator[core.ClosedJaxpr]:
                 yield closed(one)
 
 
+def operations(jaxpr: core.Jaxpr) -> int:
+    """How many equations there are, those of programs within them included."""
+    return sum(1 + sum(operations(one.jaxpr) for one in programs_in(equation)) for equation in jaxpr.eqns)
+
+
 def scan_counts(equation: core.JaxprEqn) -> tuple[int, int]:
     """(constants, carried) inputs of a `scan`: what is carried has the same shape inside and outside, rows of what is
     stacked have an axis less."""

@@ -24,6 +24,7 @@ from ringfence.datasets.task import Task
 from ringfence.envs.base import NativeEnv
 from ringfence.envs.episode import Cost
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.certificate import Certificate, Round, digest
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.own_trials import Own
 from ringfence.evaluation.replay.judge import Body
@@ -33,7 +34,6 @@ from ringfence.evaluation.statistics import upper_bound
 from ringfence.evaluation.stress import check_simulator
 from ringfence.evaluation.trials import Part, Trials, features, least_score, shortfall
 from ringfence.faults import Faults
-from ringfence.faults.certificate import Certificate, digest
 from ringfence.faults.policy import under_faults
 from ringfence.guards import Guard
 from ringfence.loading.resolve import Resolved, resolve
@@ -109,7 +109,7 @@ def certify(
     elif logs is not None:
         world = _guard(resolved).world
         trials = Windowed.of(logs, resolved.run, world, body, faults, calibration, episodes, least, quiet)
-    rounds: list[dict[str, float]] = []
+    rounds: list[Round] = []
     agreed = False
     while len(rounds) < MAX_ROUNDS and not agreed:
         margin = _guard(resolved).options.margin
@@ -203,6 +203,8 @@ def _resolved(run: Run | str, options: Mapping[str, Any]) -> Resolved:
         raise UserError("A certificate is of a guarded run; name a guard with guard=, e.g. shield.")
     if resolved.guard.options.adapt:
         raise UserError("An adapting margin cannot be frozen; certify a guard whose margin stays, e.g. shield.")
+    if resolved.guard.options.margin < 0:
+        raise UserError(f"margin={resolved.guard.options.margin} keeps no distance; certify a guard with 0 or more.")
     return resolved
 
 
@@ -214,7 +216,7 @@ def _guard(resolved: Resolved) -> Guard:
 def _promised(
     resolved: Resolved,
     faults: Faults,
-    rounds: list[dict[str, float]],
+    rounds: list[Round],
     agreed: bool,
     confidence: float,
     tested: Trials,

@@ -17,10 +17,9 @@ from ringfence.evaluation import protocol, recordings, rollout
 from ringfence.evaluation.compensation import compensated
 from ringfence.evaluation.evaluate import split_words
 from ringfence.evaluation.places import recording, watching
-from ringfence.evaluation.player import Player, RunPlayer, player_of
+from ringfence.evaluation.player import HasPolicy, Player, RunPlayer, player_of
 from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
-from ringfence.loading.controller import Controller
 from ringfence.problem.bounds import Bounds
 from ringfence.problem.names import Names
 from ringfence.proposals.base import with_cost
@@ -35,7 +34,7 @@ OF_A_BENCHMARK = ("return_norm", "cost_norm", "constants")  # parts of a summary
 
 
 def play(
-    run: Run | str | Controller,
+    run: Run | str | HasPolicy,
     make_env: Callable[[], Any],
     *,
     episodes: int = 20,
@@ -128,8 +127,8 @@ def _check_choices(early_ends: str, split: str) -> None:
         raise UserError(f"split='{split}' does not exist; use test or validation.")
 
 
-def _compensated(run: Run | str | Controller, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:
-    if isinstance(run, Controller):
+def _compensated(run: Run | str | HasPolicy, faults: Faults, options: dict[str, Any]) -> dict[str, Any]:
+    if isinstance(run, HasPolicy):
         raise UserError("compensate is of a run's guard; give delay, max_age and hold to ringfence.guard() itself.")
     return compensated(run, faults, options)
 

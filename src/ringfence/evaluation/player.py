@@ -6,7 +6,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -18,7 +18,6 @@ from ringfence.evaluation import evaluate
 from ringfence.faults import Faults
 from ringfence.faults.policy import behind
 from ringfence.guards.wrap import Callback
-from ringfence.loading.controller import Controller
 from ringfence.loading.resolve import Resolved, resolve
 from ringfence.loading.spec import PolicySpec
 from ringfence.problem import constraints
@@ -35,6 +34,15 @@ from ringfence.world import World
 
 NO_FAULTS = Faults()
 Unsafe = Callable[[np.ndarray, np.ndarray | None], np.ndarray]
+
+
+@runtime_checkable
+class HasPolicy(Protocol):
+    """A `Controller`: what acts, and has a policy to be played in whole batches."""
+
+    policy: Policy
+
+    def warm_up(self, observations: np.ndarray, state: np.ndarray | None = None) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +72,10 @@ class RunPlayer(Player):
 
 
 def player_of(
-    policy: Run | str | Controller, planner: str, split: str, options: dict[str, Any], faults: Faults = NO_FAULTS
+    policy: Run | str | HasPolicy, planner: str, split: str, options: dict[str, Any], faults: Faults = NO_FAULTS
 ) -> Player:
     """A run as planner and options say, or a function under guard, which takes neither; behind faults, if any."""
-    if isinstance(policy, Controller):
+    if isinstance(policy, HasPolicy):
         return _behind(_of_function(policy.policy, planner, options), faults)
     return player_of_run(resolve(PolicySpec.of(policy, planner=planner, **options)), split, faults)
 

@@ -9,19 +9,19 @@ from typing import Any
 
 from ringfence.envs.episode import Cost
 from ringfence.errors import UserError, whole_number
+from ringfence.evaluation.certificate import digest
 from ringfence.evaluation.compensation import compensated_spec
 from ringfence.evaluation.evaluate import Split, about
 from ringfence.evaluation.play import play
 from ringfence.evaluation.protocol import evaluate_policy
 from ringfence.evaluation.simulators import name_of
 from ringfence.faults import Faults
-from ringfence.faults.certificate import digest
 from ringfence.loading.resolve import load_job, resolve
 from ringfence.loading.spec import PolicySpec
-from ringfence.training.runs import Run, write_json
+from ringfence.training.runs import Run, add_entry
 from ringfence.utils import schemas
 from ringfence.utils.compilation import keep_programs
-from ringfence.utils.files import alone, writable
+from ringfence.utils.files import writable
 from ringfence.utils.precision import in_float32
 
 FILE = "stress.json"  # in the run folder, beside results.json: a table of results has no faults
@@ -84,6 +84,7 @@ def stress_spec(
     check_simulator(spec, STRESSED_ELSEWHERE)
     resolved = resolve(compensated_spec(spec, faults) if compensate else spec)
     file = writable(resolved.run.path / FILE)
+    results(resolved.run)  # a damaged file is refused before anything is played
     name = f"{resolved.variant(split)} behind {faults.name}" + (", which it knows" if compensate else "")
     seed = resolved.run.config["seed"]
     result, _ = evaluate_policy(
@@ -99,8 +100,7 @@ def stress_spec(
 def _added(file: Path, result: dict[str, Any], played: str, faults: Faults) -> dict[str, Any]:
     """The result, beside the others of a run by what was played."""
     name = f"{played} behind {faults.name}" + (", which it knows" if result["compensated"] else "")
-    with alone(file.with_name(".results.lock")):
-        write_json(file, results(Run(file.parent)) | {name: result})
+    add_entry(file, lambda: results(Run(file.parent)), name, result)
     return result
 
 

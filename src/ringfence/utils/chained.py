@@ -16,9 +16,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 from ringfence.errors import UserError
+from ringfence.utils import schemas
 from ringfence.utils.files import regular, writable
 
 BEFORE_ALL = "ringfence log 1"  # what the first record follows
@@ -32,6 +33,13 @@ class LogError(UserError):
     def __init__(self, message: str, record: int):
         super().__init__(message)
         self.record = record
+
+
+class Record(TypedDict):
+    """What every record has."""
+
+    n: int
+    kind: str
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,7 @@ class ChainedLog:
         except OSError as error:
             raise UserError(f"'{path}' could not be written ({error.strerror}); choose another place.") from error
         self._own()
+        self._size = os.fstat(self._file).st_size  # bytes of whole records
 
     def _own(self) -> None:
         """Hold the file, where the system has locks."""
@@ -90,10 +99,20 @@ class ChainedLog:
         except OSError as error:
             raise UserError(f"'{self.path}' could not be written ({error.strerror}); free some space.") from error
         if written < len(line):
+            self._take_back()
             raise UserError(f"'{self.path}' could not be written (the disk is full); free some space.")
+        self._size += written
         self.records += 1
         self.last = digest
         return digest
+
+    def _take_back(self) -> None:
+        """Cut off what was written of a record: the next one would stand behind it on its line."""
+        assert self._file is not None, "it was just written"
+        try:
+            os.ftruncate(self._file, self._size)
+        except OSError:
+            self.close()  # nothing can be added any more; what stands there says so
 
     def close(self) -> None:
         """Give the file back."""
@@ -125,7 +144,7 @@ def check(path: str | Path, last: str | None = None) -> Checked:
     held = last is None
     for record in records(path):
         count += 1
-        kind = str(record["kind"])
+        kind = record["kind"]
         digest = record["digest"]
         held = held or digest == last
     if not count:
@@ -145,15 +164,13 @@ def _read(path: str | Path, number: int, line: bytes, before: str) -> tuple[str,
         )
     try:
         digest, body = line[:-1].decode().split(" ", 1)
-        record = json.loads(body)
-        there = record["n"]
-        record["kind"] = str(record["kind"])
-    except (ValueError, KeyError, TypeError) as error:
+        record = schemas.decode(body, Record)
+    except ValueError as error:
         raise LogError(
             f"'{path}': record {number} is none ({error}); it was changed, or this is no log.", number
         ) from None
-    if there != number:
-        raise LogError(f"'{path}' lacks record {number}: record {there} stands in its place.", number)
+    if record["n"] != number:
+        raise LogError(f"'{path}' lacks record {number}: record {record['n']} stands in its place.", number)
     if digest != _digest(before, body):
         raise LogError(
             f"'{path}': record {number} is not what was written: it was changed, or the one before it.", number

@@ -12,6 +12,7 @@ from typing import Annotated, Any, NotRequired, TypedDict, TypeVar
 import msgspec
 
 from ringfence.errors import UserError
+from ringfence.utils.files import regular
 
 LARGEST = 2**27  # bytes of a JSON file; the largest that this package writes have some megabytes
 T = TypeVar("T")
@@ -245,6 +246,40 @@ class Environment(TypedDict, total=False):
     git: str | None
 
 
+class Event(TypedDict):
+    """A record of a controller's log."""
+
+    t: Annotated[float, msgspec.Meta(ge=0, lt=253_402_300_800)]  # s since 1970; calendars end with the year 9999
+
+
+class Corrected(TypedDict):
+    """An agent whose action is another than it requested."""
+
+    agent: Count
+    requested: list[float | None]
+    constraint: str
+    thing: str
+    row: Count
+    score: float | None
+
+
+class Acted(Event):
+    """A record of an action."""
+
+    ms: float
+    executed: list[list[float | None]]
+    corrected: NotRequired[list[Corrected]]
+
+
+class Refused(Event):
+    """A record of a refusal."""
+
+    why: str
+
+
+RECORDS: dict[str, Any] = {"step": Acted, "refused": Refused}  # by kind; of others only the time is read
+
+
 class Row(TypedDict):
     """A line of metrics.jsonl."""
 
@@ -264,22 +299,26 @@ def decode(raw: bytes | str, kind: Any) -> Any:
     return value
 
 
-def check(value: Any, kind: Any) -> None:
-    """ValueError where a value of Python's is not of the kind."""
+def check(value: Any, kind: Any) -> Any:
+    """A value of Python's as the kind; ValueError where it is not of it."""
     try:
-        msgspec.convert(value, kind)
+        return msgspec.convert(value, kind)
     except (msgspec.MsgspecError, UnicodeError) as error:
         raise ValueError(str(error)) from None
+
+
+def content(path: Path, largest: int = LARGEST) -> bytes:
+    """Of a file that is no larger; ValueError says what it is else."""
+    size = regular(path).stat().st_size
+    if size > largest:
+        raise ValueError(f"it is larger than {largest / 2**20:.0f} MiB")
+    return path.read_bytes()
 
 
 def read(path: Path, kind: type[T], problem: str) -> T:
     """What a JSON file holds, as `kind`; whatever else is there is `problem`, a sentence's end with the remedy."""
     try:
-        if not path.is_file():
-            raise ValueError("it is not there" if not path.exists() else "it is no regular file")
-        if path.stat().st_size > LARGEST:
-            raise ValueError(f"it is larger than {LARGEST / 2**20:.0f} MiB")
-        return decode(path.read_bytes(), kind)
+        return decode(content(path), kind)
     except (OSError, ValueError) as error:
         cause = error.strerror if isinstance(error, OSError) and error.strerror else error
         raise UserError(f"'{path.parent}' {problem} ({path.name}: {cause}).") from None

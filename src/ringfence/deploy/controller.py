@@ -13,14 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ringfence.deploy.evidence import Evidence, explaining
+from ringfence.deploy.stamps import Stamps
+from ringfence.deploy.watch import Fallback, Watch, widened
 from ringfence.errors import LAST_SEED, UserError, whole_number
-from ringfence.faults.certificate import Certificate
+from ringfence.evaluation.certificate import Certificate
 from ringfence.guards.policy import Guarded, Paid, acted, costs_of_one, no_safe_action
 from ringfence.guards.wrap import Callback, guarded_of, under_guard, with_guarded
-from ringfence.loading.evidence import Evidence, explaining
 from ringfence.loading.resolve import load
-from ringfence.loading.stamps import Stamps
-from ringfence.loading.watch import Fallback, Watch, widened
 from ringfence.problem.constraints import Hazard
 from ringfence.problem.homogeneous import PerAgent, team_policy
 from ringfence.proposals.base import act_with, with_cost
@@ -193,9 +193,10 @@ class Controller:
                 info["covered"] = ~(info["infeasible"] | info["ood"]) & (not self._watch.alarm)
                 info["alarm"] = np.array(self._watch.alarm)
             if self._watch.hands_over:
-                action = self._watch.taken_over(*self.job.origins.measured(*seen), action.shape)
-        if self.evidence is not None:
-            self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
+                measured = self.job.origins.measured(*seen)
+                action = self._watch.taken_over(*measured, self.job.spec, source.agents)
+            if self.evidence is not None:
+                self.evidence.step(seen, age, action, info, 1e3 * (time.perf_counter() - begun))
         self._carry, self._key, self.info, self.last_action = carry, key, info, action.copy()
         if observed_at is not None:
             self._stamps.acted()

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from ringfence.errors import UserError, known
-from ringfence.faults.certificate import Certificate
-from ringfence.faults.monitor import Monitor
+from ringfence.evaluation.certificate import Certificate
+from ringfence.evaluation.monitor import Monitor
 from ringfence.guards.wrap import guarded_of, with_guarded
+from ringfence.types import Spec
 from ringfence.utils.functions import of_both
 from ringfence.utils.given import given_as
 
@@ -63,11 +64,14 @@ class Watch:
         """Whether the fallback acts now."""
         return self.fallback is not None and self.alarm
 
-    def taken_over(self, observations: np.ndarray, state: np.ndarray | None, shape: tuple[int, ...]) -> np.ndarray:
-        """(N, A) the fallback's actions; they are not guarded."""
+    def taken_over(self, observations: np.ndarray, state: np.ndarray | None, spec: Spec, agents: int) -> np.ndarray:
+        """(N, A) the fallback's actions, within bounds; they are not guarded."""
         assert self.fallback is not None, "it acts now"
         wanted = self.fallback(observations.copy(), None if state is None else state.copy())
-        return given_as("the fallback's result", wanted, shape, "the task", "return one action for each agent")
+        shape = (agents, spec.action_dim)
+        action = given_as("the fallback's result", wanted, shape, "the task", "return one action for each agent")
+        low, high = (np.asarray(bound, np.float32) for bound in (spec.action_low, spec.action_high))
+        return np.clip(action, low, high)
 
 
 def widened(policy: Any) -> Any:

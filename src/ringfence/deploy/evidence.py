@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 import numpy as np
 
 import ringfence
-from ringfence.faults.certificate import Certificate, digest
+from ringfence.evaluation.certificate import Certificate, digest
 from ringfence.guards.policy import Guarded
 from ringfence.guards.wrap import Callback, guarded_of, with_guarded
 from ringfence.problem.homogeneous import agent_policy
@@ -121,7 +119,7 @@ def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certi
         "policy": None if isinstance(policy, Callback) else digest(proposal),
         "world": None,
         "guard": None,
-        "certificate": None if certificate is None else _digest_of_certificate(certificate),
+        "certificate": None if certificate is None else certificate.digest,
     }
     if guarded is not None:
         guard = guarded.guard
@@ -131,11 +129,6 @@ def _begun(policy: Any, guarded: Guarded | None, agents: int, certificate: Certi
             "guard": dataclasses.asdict(guard.options),
         }
     return found
-
-
-def _digest_of_certificate(certificate: Certificate) -> str:
-    content = json.dumps(dataclasses.asdict(certificate), sort_keys=True)
-    return hashlib.blake2b(content.encode(), digest_size=8).hexdigest()
 
 
 def _numbers(x: np.ndarray) -> Any:
