@@ -18,6 +18,7 @@ from ringfence.problem.homogeneous import local_features
 from ringfence.problem.slips import slips
 from ringfence.types import has_entry
 
+Formula = tuple[FeatureMap, constraints.BoundHazard]
 DISAGREE = 0.2  # of the steps: a robot's mean speed over a step and that at its end differ on up to 13 %
 
 
@@ -128,10 +129,11 @@ def _speeds(store: EpisodeStore) -> dict[str, str]:
 
 def _danger(store: EpisodeStore, task: Task) -> tuple[dict[str, str], list[str]]:
     """(facts, warnings) of what the hazard's formula says of the data; nothing where it has none."""
-    starts = _labels(store, task, store.first_rows)
-    share = disagreement(store, task)
-    if starts is None or share is None:
+    formula = _formula(store, task)
+    if formula is None:
         return {}, _unread(store, task)
+    starts = _labels(store, task, formula, store.first_rows)
+    share = _disagreement(store, task, formula)
     facts = {
         "episodes starting unsafe": f"{100 * starts.mean():.2f} %",
         "cost and hazard disagree": f"{100 * share:.2f} % of steps",
@@ -235,20 +237,24 @@ def _of_constraint(store: EpisodeStore, name: str) -> str:
     return f"{costs.mean():.3f} per episode, at most {costs.max():g}; {within}"
 
 
-def _labels(store: EpisodeStore, task: Task, rows: np.ndarray) -> np.ndarray | None:
-    """(K,) whether the hazard's formula calls these rows unsafe for anyone; None where it has none."""
+def _formula(store: EpisodeStore, task: Task) -> Formula | None:
+    """The hazard's formula and what it reads; None where it has none."""
     try:
         view, bound = _bound(store, task)
     except UserError:
         return None
-    if not bound.has_formula:
-        return None
+    return (view, bound) if bound.has_formula else None
+
+
+def _labels(store: EpisodeStore, task: Task, formula: Formula, rows: np.ndarray) -> np.ndarray:
+    """(K,) whether the hazard's formula calls these rows unsafe for anyone."""
+    view, bound = formula
     state = None if store.state is None or task.homogeneous else store.state[rows]
     unsafe, _ = bound.labels(local_features(view, task.homogeneous, store.observations[rows], state))
     return np.any(np.asarray(unsafe).reshape(len(rows), -1), axis=-1)
 
 
-def _bound(store: EpisodeStore, task: Task) -> tuple[FeatureMap, constraints.BoundHazard]:
+def _bound(store: EpisodeStore, task: Task) -> Formula:
     """What the formula of danger reads, and the formula; refused where the logs have no such entries."""
     logs = task.logs(store) if task.env is None else store
     view = task.feature_map("pruned" if logs.state is not None else "decentralized", logs)
@@ -257,8 +263,13 @@ def _bound(store: EpisodeStore, task: Task) -> tuple[FeatureMap, constraints.Bou
 
 def disagreement(store: EpisodeStore, task: Task) -> float | None:
     """Share of steps (at most a hundred thousand, evenly spread) whose cost is not what the formula says of the state
-    that they end in."""
+    that they end in; None where there is no formula."""
+    formula = _formula(store, task)
+    return None if formula is None else _disagreement(store, task, formula)
+
+
+def _disagreement(store: EpisodeStore, task: Task, formula: Formula) -> float:
     steps = np.unique(np.linspace(0, store.steps - 1, 100_000).astype(int))
     episode = np.searchsorted(store.episode_ends, steps, side="right")
-    labels = _labels(store, task, steps + episode + 1)
-    return None if labels is None else float((labels != (store.team_costs[steps] > 0)).mean())
+    labels = _labels(store, task, formula, steps + episode + 1)
+    return float((labels != (store.team_costs[steps] > 0)).mean())

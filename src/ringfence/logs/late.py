@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ringfence.errors import StoreError, whole_number
+from ringfence.errors import StoreError, of_kind, whole_number
 from ringfence.logs.store import EpisodeStore
 
 VERSION = 1  # of how delays are found: Worlds that were judged by another are judged again
@@ -25,6 +25,7 @@ LITTLE = 0.05  # of one entry's change: what explains less is nobody's command
 MUCH = 0.3  # of one entry's change, which a late command has to explain: chance does less, in short logs, too
 STEPS = 4_000  # of each agent that are looked at, at most
 AGENTS = 4  # that are looked at, at most
+ENTRIES = 100  # of observations and of commands that are looked at, at most
 PRODUCTS = 400  # of entries and commands, at most; where there are more, commands are looked at alone
 NOTHING = 1e-6  # of an entry's variance: where less is left without commands, none explains it
 FLAT = 1e-6  # of its size: an entry that varies by less does not
@@ -79,6 +80,7 @@ def undelay(store: EpisodeStore, delay: int) -> EpisodeStore:
     """The logs as they would be if commands took effect at once: each step has the command that was sent `delay` steps
     before. The first `delay` steps of each episode, whose commands nobody knows, are left out, and so are episodes that
     are no longer. The card's `action_delay` says so, and a guard by a World of these logs decides for so much later."""
+    of_kind("store", store, EpisodeStore, "give an EpisodeStore")
     whole_number("delay", delay, 1, LONGEST)
     if store.card.action_delay:
         raise StoreError(
@@ -139,12 +141,12 @@ class _Explained:
     def of(cls, store: EpisodeStore, agent: int, steps: np.ndarray) -> _Explained:
         episode = store.episode_of_step[steps]
         rows = steps + episode
-        before, now, after = (store.observations[rows + k, agent].astype(np.float64) for k in (-1, 0, 1))
+        before, now, after = (_some_entries(store.observations[rows + k, agent].astype(np.float64)) for k in (-1, 0, 1))
         x, last = _standardised(now), _standardised(now - before)
         known = np.concatenate([np.ones((len(steps), 1)), x, last], 1)
         blocks = episode if len(np.unique(episode)) >= 2 * HELD_OUT else np.arange(len(steps)) * 30 // len(steps)
         _, blocks = np.unique(blocks, return_inverse=True)
-        actions = store.actions[steps[:, None] - np.arange(LONGEST + 1), agent].astype(np.float64)
+        actions = _some_entries(store.actions[steps[:, None] - np.arange(LONGEST + 1), agent].astype(np.float64))
         out = blocks % HELD_OUT == HELD_OUT - 1
         return cls(known, x, _standardised(after - now), actions, out)
 
@@ -167,6 +169,11 @@ class _Explained:
     def _told(self, late: int) -> list[np.ndarray]:
         action = _standardised(self.actions[:, late])
         return [action, *_products(action, self.x)]
+
+
+def _some_entries(x: np.ndarray) -> np.ndarray:
+    """At most so many entries (..., D), evenly spread."""
+    return x if x.shape[-1] <= ENTRIES else x[..., np.linspace(0, x.shape[-1] - 1, ENTRIES).astype(int)]
 
 
 def _products(action: np.ndarray, x: np.ndarray) -> list[np.ndarray]:

@@ -33,6 +33,7 @@ View = Literal["pruned", "centralized", "decentralized"]
 Source = Literal["state", "observations"]
 VIEWS = ("pruned", "centralized", "decentralized")
 _TABLES = ("plus", "minus", "origin", "order")  # fields of a map that are arrays
+FIRST = 1000  # rows by which columns are told apart before all of them are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -449,10 +450,13 @@ def _some(kept: list[int]) -> list[int]:
 def _telling(columns: list[np.ndarray], known: set[int]) -> list[int]:
     """The columns that vary, are not `known` and repeat no earlier one."""
     kept: list[int] = []
+    alike: dict[bytes, list[np.ndarray]] = {}  # by their first rows: there may be thousands
     for d, column in enumerate(columns):
         if d in known or _constant(column):
             continue
-        if not any(_same(column, columns[earlier]) for earlier in kept):
+        earlier = alike.setdefault((column[:FIRST].astype(np.float64) + 0.0).tobytes(), [])  # -0 is 0
+        if not any(_same(column, one) for one in earlier):
+            earlier.append(column)
             kept.append(d)
     return kept
 

@@ -22,6 +22,7 @@ from ringfence.problem.entries import Entries
 
 ROWS = 2000  # that are compared
 FEWEST = 50  # below which nothing is said
+ENTRIES = 300  # that are compared, each with each
 MOST = 20_000_000  # numbers that are compared; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 LIKE = 0.05  # of a change: what a velocity predicts is off by less
@@ -81,7 +82,9 @@ class Steps:
 
     @classmethod
     def of(cls, observations: np.ndarray, first_rows: np.ndarray | None) -> Self | None:
-        """None where there are too few."""
+        """None where there are too few, or more entries than can be compared with each other."""
+        if observations.shape[2] > ENTRIES:
+            return None
         many = min(ROWS, MOST // (observations[0].size or 1))
         rows = np.unique(np.linspace(0, max(len(observations) - 2, 0), many).astype(int))
         if first_rows is not None:

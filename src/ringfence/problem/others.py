@@ -14,7 +14,8 @@ LEAST = 1e-5  # of an entry: less is no change
 
 def others(n: int) -> np.ndarray:
     """(N, N-1) who the others of each agent are: the team but itself, in order."""
-    return np.array([[j for j in range(n) if j != i] for i in range(n)], int).reshape(n, n - 1)
+    before = np.arange(n - 1)
+    return (before + (before >= np.arange(n)[:, None])).astype(int)
 
 
 def order_in(change: np.ndarray, how: Mapping[int, tuple[int, int]]) -> np.ndarray | None:
@@ -26,7 +27,7 @@ def order_in(change: np.ndarray, how: Mapping[int, tuple[int, int]]) -> np.ndarr
     order = usual.copy()
     for agent, place in np.ndindex(*order.shape):
         told = [(entry, own) for entry, own, other in about if other == place]
-        if _off(change, agent, told, [usual[agent, place]]).min() <= LIKE:
+        if _off(change, agent, told, [int(usual[agent, place])]).min() <= LIKE:
             continue
         off = _off(change, agent, told, range(change.shape[1]))
         order[agent, place] = off.argmin()

@@ -18,6 +18,7 @@ from ringfence.types import Array
 
 VERSION = 1  # of what is found
 ROWS = 500  # that are compared
+ENTRIES = 300  # that are compared, each with each
 MOST = 200_000_000  # numbers that are; of wide logs fewer rows
 EXACT = 1e-4  # of an entry's deviation: what is rounded is off by less
 REPEATED = 3  # times that a number may occur: places in a list that nobody has are filled with one number
@@ -41,7 +42,7 @@ def found_in(x: np.ndarray) -> tuple[Mirrored, ...]:
     """What agents see of each other among the entries of features (W, N, D); of as many places each."""
     _, agents, width = x.shape
     rows = min(ROWS, MOST // max(1, (agents * width) ** 2))
-    if agents < 2 or rows < 1:
+    if agents < 2 or rows < 1 or width > ENTRIES:
         return ()
     x = np.asarray(x[np.unique(np.linspace(0, len(x) - 1, rows).astype(int))], np.float64)
     told = [e for e in range(width) if x[..., e].std() > 0]

@@ -10,6 +10,8 @@ import itertools
 from collections.abc import Iterable, Mapping
 
 NEAR = 0.75  # how alike two names are, of difflib's ratio: `othr0` and `other0` 0.91, `goal` and `own` 0.29
+LONGEST = 60  # letters of a name that are
+MOST = 200  # names that are compared: each with each
 DIGITS = "0123456789"
 TWINS = {"x": "y", "y": "x"}  # the last letter of what is told along each axis
 
@@ -19,7 +21,7 @@ Bodies = Mapping[str, set[str]]  # what each is told of
 def slips(names: Iterable[str]) -> list[str]:
     """A sentence for each pair of names that a letter or two keep apart."""
     bodies: dict[str, set[str]] = {}
-    for name in names:
+    for name in itertools.islice(names, MOST):
         body, dot, what = name.partition(".")
         if dot:
             bodies.setdefault(body, set()).add(what)
@@ -55,4 +57,4 @@ def _two_words(bodies: Bodies) -> list[tuple[str, str]]:
 
 
 def _near(one: str, other: str) -> bool:
-    return difflib.SequenceMatcher(None, one, other).ratio() >= NEAR
+    return difflib.SequenceMatcher(None, one[:LONGEST], other[:LONGEST]).ratio() >= NEAR
