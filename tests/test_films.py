@@ -88,7 +88,7 @@ def test_a_report_shows_where_agents_were_in_a_simulator_of_ones_own(tmp_path):
 
     page = build_report([run], tmp_path / "page.html").read_text()
     again = html.unescape(page)
-    assert f"--env {__name__}:Field --episodes 6 --num-envs 3" in again and "--early-ends" not in again
+    assert "--env THEIR.py:SIMULATOR --episodes 6 --num-envs 3" in again and "--early-ends" not in again
     film = shown(page)
     assert film["speeds"] == {"slow": 1.25, "real time": 5.0, "fast": 20.0} and film["radius"] is None
     for e, (episode, steps) in enumerate(zip(film["episodes"], lengths)):

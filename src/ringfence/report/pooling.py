@@ -155,12 +155,23 @@ def _violations(result: Result) -> int:
 
 def normal_return(x: Number, constants: dict[str, float]) -> Number:
     """0 at return_min, 1 at return_max."""
-    return (x - constants["return_min"]) / (constants["return_max"] - constants["return_min"])
+    return (x - constants["return_min"]) / return_span(constants)
 
 
 def normal_cost(x: Number, constants: dict[str, float]) -> Number:
     """1 at the limit."""
-    return (x + constants["cost_offset"]) / (constants["cost_limit"] + constants["cost_offset"])
+    return (x + constants["cost_offset"]) / _span(constants["cost_limit"] + constants["cost_offset"])
+
+
+def return_span(constants: dict[str, float]) -> float:
+    """What lies between normalised returns of 0 and 1."""
+    return _span(constants["return_max"] - constants["return_min"])
+
+
+def _span(size: float) -> float:
+    if not size:
+        raise UserError("A result's constants say that 0 and 1 are the same return or cost; evaluate its run again.")
+    return size
 
 
 def mean_of(results: Iterable[Mapping[str, Any]], key: str) -> float | None:

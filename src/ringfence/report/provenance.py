@@ -16,6 +16,7 @@ from ringfence.training.runs import Run
 from ringfence.utils import schemas
 from ringfence.utils.escape import shell
 
+THEIRS = "THEIR.py:SIMULATOR"
 LONGEST = 400  # letters of a fact; the file itself lies in the run folder
 PLAYED = ("eval", "play")  # commands that make results
 
@@ -103,8 +104,24 @@ def _playing(section: Section) -> list[str]:
             raise UserError(f"{row.where} was made by '{words[0]}', which plays nothing; evaluate it again.")
         later = [] if row.last or "--checkpoint" in words else ["--checkpoint", str(row.result["step"])]
         played.setdefault((*words, *later), []).append(str(row.file.parent))
-    lines = [_line([words[0], *dict.fromkeys(runs), *words[1:]]) for words, runs in played.items()]
+    lines = []
+    for words, runs in played.items():
+        known, theirs = _without_code(words)
+        lines.append(_line([known[0], *dict.fromkeys(runs), *known[1:]]) + theirs)
     return lines + [f"# of {shell(row.where)} no command was recorded" for row in untold]
+
+
+def _without_code(words: tuple[str, ...]) -> tuple[list[str], str]:
+    """The words with `THEIRS` for a simulator, and a comment that names it: nobody is to run a stranger's code by
+    copying a line."""
+    known, named = [], []
+    for before, word in zip(("", *words), words):
+        option, equals, value = word.partition("=")
+        if before == "--env" or (option == "--env" and equals):
+            named.append(shell(value if option == "--env" else word))
+            word = f"--env={THEIRS}" if option == "--env" else THEIRS
+        known.append(word)
+    return known, f"  # {THEIRS} is {', '.join(named)} of whoever played: read that code first" if named else ""
 
 
 # --- settings and machines ---

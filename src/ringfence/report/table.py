@@ -13,7 +13,7 @@ from ringfence.algos import ALGORITHMS
 from ringfence.errors import UserError
 from ringfence.evaluation import reference
 from ringfence.evaluation.table import SPLITS, Row, check, of_reference, of_references, of_run
-from ringfence.report.pooling import Numbers, mean_of, pool
+from ringfence.report.pooling import Numbers, mean_of, pool, return_span
 from ringfence.training.runs import LOGS, Run, runs_below
 from ringfence.utils.config import fields_of
 
@@ -108,8 +108,7 @@ class Line(Numbers):
     @property
     def returns_norm_sd(self) -> float | None:
         constants = self.rows[0].result["constants"]
-        span = constants["return_max"] - constants["return_min"]
-        return None if self.returns_sd is None else self.returns_sd / span
+        return None if self.returns_sd is None else self.returns_sd / return_span(constants)
 
 
 @dataclass

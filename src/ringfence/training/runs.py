@@ -33,6 +33,7 @@ from ringfence.utils.pytrees import as_tree, digest_of, named_arrays, save_named
 _log = logging.getLogger(__name__)
 
 KEEP = 2  # checkpoints
+LARGEST = 1e30  # size of a metric that is drawn
 LOGS = "logs.json"
 
 
@@ -116,7 +117,8 @@ class Run:
             raise UserError(f"'{file}' cannot be read ({error}); delete it.") from None
         for line in lines:
             with suppress(ValueError):
-                rows.append(schemas.decode(line, schemas.Row))
+                row = schemas.decode(line, schemas.Row)
+                rows.append({name: value for name, value in row.items() if _can_be_drawn(value)})
         return rows
 
     def checkpoints(self) -> list[tuple[int, Path]]:
@@ -124,7 +126,7 @@ class Run:
         found = []
         for file in (self.path / "ckpt").glob("step-*.safetensors"):
             match = re.fullmatch(r"step-(\d+)\.safetensors", file.name)
-            if match:
+            if match and file.is_file():
                 found.append((int(match[1]), file))
         return sorted(found)
 
@@ -181,6 +183,11 @@ def runs_below(folder: Path) -> list[Run]:
         return [Run(folder)]
     files = sorted(folder.rglob("config.json")) if folder.is_dir() else []
     return [Run(f.parent) for f in files if not any(p.startswith(".") for p in f.relative_to(folder).parts)]
+
+
+def _can_be_drawn(value: object) -> bool:
+    """Whether a value is a number of a size that an axis can have."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
 
 
 def sound_arrays(file: Path, step: int) -> dict[str, np.ndarray]:

@@ -41,7 +41,7 @@ class Spec(TypedDict, total=False):
     task: Name
     n_agents: Few
     action_dim: Few
-    feature_names: list[str]
+    feature_names: Annotated[list[str], msgspec.Meta(min_length=1)]
     action_low: Bound
     action_high: Bound
     episode_length: Positive

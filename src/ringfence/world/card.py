@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from ringfence.errors import plain
 from ringfence.utils.config import build_config
 from ringfence.utils.numbers import percent, significant
 from ringfence.world.causes import Cause, Edge, Found
@@ -149,7 +150,7 @@ class Verdict(Part, frozen=True):
     def __str__(self) -> str:
         if not self.reasons:
             return self.word
-        return f"{self.word}: {'; '.join(self.reasons)}; {' or '.join(self.remedies)}"
+        return plain(f"{self.word}: {'; '.join(self.reasons)}; {' or '.join(self.remedies)}")
 
 
 class BarrierScores(Part, frozen=True):
@@ -259,7 +260,8 @@ def summary(card: Card) -> list[str]:
     """The card as a person reads it, line by line."""
     if not card.data.task:
         return ["an empty card"]
-    return [*_of_data(card), *_of_prediction(card), *_of_barrier(card), *_of_verdict(card)]
+    lines = [*_of_data(card), *_of_prediction(card), *_of_barrier(card), *_of_verdict(card)]
+    return [plain(line) for line in lines]  # which a file of anybody's may hold
 
 
 def _of_data(card: Card) -> Iterator[str]:
